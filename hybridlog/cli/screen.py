@@ -116,16 +116,28 @@ def _forms() -> list[tuple[Callable[[pa.DataType], bool], Callable[[pa.Scalar], 
 
     return [
         (types.is_floating, lambda value: f"{value.as_py():.6g}"),
-        (types.is_timestamp, lambda value: format_time(value.value)),
+        (types.is_timestamp, lambda value: format_time(_nanoseconds(value))),
         (types.is_duration, lambda value: format_duration(value.value)),
+        (types.is_map, _map),
         (is_list, _list),
         (types.is_struct, _struct),
         (is_binary, lambda value: f"{len(value.as_py())} bytes"),
     ]
 
 
+def _nanoseconds(value: pa.Scalar) -> int:
+    import pyarrow as pa
+
+    return int(value.cast(pa.timestamp("ns", value.type.tz)).value)
+
+
 def _struct(value: pa.Scalar) -> str:
     inside = (f"{name}: {_cell(item)}" for name, item in value.items())
+    return _cut("{" + ", ".join(inside) + "}", _MAX_LINE)
+
+
+def _map(value: pa.Scalar) -> str:
+    inside = (f"{_cell(item['key'])}: {_cell(item['value'])}" for item in value.values)
     return _cut("{" + ", ".join(inside) + "}", _MAX_LINE)
 
 

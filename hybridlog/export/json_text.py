@@ -25,7 +25,7 @@ def json_column(array: pa.Array) -> pa.Array:
         `pa.string()`, without nulls (a null is the text `null`).
 
     Raises:
-        pa.ArrowNotImplementedError: The type has no JSON form here (a map, a union).
+        pa.ArrowNotImplementedError: The type has no JSON form here (a union).
     """
     text = _values(array)
     return pc.fill_null(text, "null") if text.null_count else text
@@ -39,7 +39,7 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         return array.cast(pa.string())
     if pa.types.is_dictionary(kind):
         return _values(array.dictionary_decode())
-    if pa.types.is_boolean(kind) or pa.types.is_integer(kind):
+    if pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind):
         return array.cast(pa.string())
     if pa.types.is_floating(kind):
         return _floats(array)
@@ -53,10 +53,27 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         return pa.array(quoted, pa.string()).take(words.indices)
     if pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or _is_fixed_binary(kind):
         return pc.binary_join_element_wise('"', base64_column(array), '"', "")
+    if pa.types.is_temporal(kind):  # dates, times of day, intervals
+        texts = [None if value is None else _temporal(value) for value in array.to_pylist()]
+        return pa.array(texts, pa.string())
+    return _nested(array)
+
+
+def _temporal(value: object) -> str:
+    if isinstance(value, pa.MonthDayNano):
+        names = ("months", "days", "nanoseconds")
+        return json.dumps({name: getattr(value, name) for name in names})
+    return json.dumps(str(value))
+
+
+def _nested(array: pa.Array) -> pa.Array:
+    kind = array.type
     if _is_list(kind):
         return _lists(array)
     if pa.types.is_struct(kind):
         return _structs(array)
+    if pa.types.is_map(kind):
+        return _maps(array)
     raise pa.ArrowNotImplementedError(f"no JSON form of {kind}")
 
 
@@ -99,6 +116,20 @@ def _structs(array: pa.Array) -> pa.Array:
         parts.append(f"{', ' if index else '{'}{json.dumps(name)}: ")
         parts.append(json_column(array.field(index)))
     return _with_nulls(pc.binary_join_element_wise(*parts, "}", ""), array)
+
+
+def _maps(array: pa.MapArray) -> pa.Array:
+    """Maps as objects; keys that are no strings are their JSON as a string."""
+    entries = array.cast(pa.list_(pa.struct(list(array.type.field(0).type)))).flatten()
+    keys, values = json_column(entries.field(0)), json_column(entries.field(1))
+    if not pa.types.is_string(array.type.key_type):
+        keys = pa.array([json.dumps(key) for key in keys.to_pylist()], pa.string())
+    lengths = [0 if item is None else len(item) for item in array.to_pylist()]
+    offsets = np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+    pairs = pc.binary_join_element_wise(keys, values, ": ")
+    lists = pa.LargeListArray.from_arrays(pa.array(offsets), pairs)
+    text = pc.binary_join_element_wise("{", pc.binary_join(lists, ", "), "}", "")
+    return _with_nulls(text, array)
 
 
 def _with_nulls(text: pa.Array, array: pa.Array) -> pa.Array:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -14,10 +16,15 @@ from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
 from hybridlog.sql.source import source_of
-from hybridlog.sql.store_tables import store_table
+from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
-from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
+from hybridlog_storage.errors import (
+    HybridlogError,
+    MissingDependencyError,
+    TopicError,
+    UsageError,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,6 +40,7 @@ _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
 )
+_NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 _MAX_TRIES: Final = 10  # tables that may be damaged in one query
 _T = TypeVar("_T")
 
@@ -110,13 +118,22 @@ class SqlConnection:
         """Names of all views and tables of the store."""
         return list(self.engine.content().names)
 
-    def columns(self, view: str) -> list[str]:
-        """Names of the columns of a view; empty without such a view."""
+    def topics(self, text: str) -> list[str]:
+        """Topics of the views that a query may read by name."""
+        names = self.engine.content().names
+        found = (names.topic(name) for name in names.named(text))
+        return list(dict.fromkeys(topic for topic in found if topic is not None))
+
+    def schema(self, view: str) -> pa.Schema:
+        """Columns of a view or table of the store; none without such a view."""
+        import pyarrow as pa
+
         content = self.engine.content()
         topic = content.names.topic(view)
         if topic is not None:
-            return list(content.view(topic).schema.names)
-        return list(store_table(view, content).schema.names) if view in TABLES else []
+            return content.view(topic).schema
+        name = view.casefold()
+        return store_schema(name) if name in TABLES else pa.schema([])
 
     def query(self, text: str, params: Params = None, timeout: float | None = None) -> SqlAnswer:
         """Prepare a query; of several statements, all but the last are run.
@@ -308,8 +325,16 @@ class SqlAnswer:
 
     def _prepare(self) -> None:
         self._connection.register()
-        with self._explained():
-            self._relation = self._connection.cursor.sql(self._text, params=self._params)
+        try:
+            with self._explained():
+                self._relation = self._connection.cursor.sql(self._text, params=self._params)
+        except UsageError as error:
+            found = _NO_TABLE.match(str(error))
+            if found is None:
+                raise
+            near = get_close_matches(found[1], self._connection.names())
+            hint = f"did you mean {', '.join(near)}?" if near else "`show tables` lists all."
+            raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
 
     def _computed(self, call: Callable[[], _T]) -> _T:
         worker = Worker(self._connection.cursor, self._timeout)

@@ -89,6 +89,11 @@ def store_table(name: str, content: StoreContent) -> pa.Table:
     return pa.Table.from_pylist(list(rows(content)), schema=schema)
 
 
+def store_schema(name: str) -> pa.Schema:
+    """The columns of such a table."""
+    return _TABLES[name][1]
+
+
 def _recordings(content: StoreContent) -> Iterator[Mapping[str, Any]]:
     for summary in content.snapshot.summaries:
         yield {

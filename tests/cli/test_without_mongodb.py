@@ -35,6 +35,7 @@ COMMANDS = {
     "info": ["info", "robot"],
     "info --json": ["info", "robot", "--json"],
     "losses": ["losses"],
+    "sql": ["sql", "select avg(ranges[1]) from scan where ranges_summary.min < 1"],
     "losses of one": ["losses", "robot"],
     "schema": ["schema", "/imu/data"],
     "count": ["fetch", "-t", "/imu/data", "--count"],

@@ -22,6 +22,7 @@ from hybridlog_storage.errors import (
     ResourceError,
     SegmentError,
     StoreError,
+    TopicError,
     UsageError,
 )
 from tests.sql.conftest import LARGE, SCANS
@@ -105,8 +106,10 @@ def test_a_query_reaches_nothing_else(
 def test_errors_say_what_to_do(store: hl.Store, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"views of this store alone.*Cannot access file"):
         store.sql(f"copy (select 1) to '{tmp_path / 'x'}'").rows()
-    with pytest.raises(UsageError, match='scn does not exist!\nDid you mean "scan"'):
-        store.sql("select * from scn join scan using (t)")
+    with pytest.raises(TopicError, match=r"There is no view 'scn'; did you mean scan"):
+        store.sql("select * from scn")
+    with pytest.raises(TopicError, match="There is no view 'xyzzy'; `show tables` lists all"):
+        store.sql("select * from xyzzy")
     with pytest.raises(UsageError, match='syntax error at or near "selec"'):
         store.sql("selec 1")
     with pytest.raises(UsageError, match="The query is empty"):

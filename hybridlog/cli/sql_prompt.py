@@ -1,0 +1,218 @@
+"""The prompt of `hybridlog sql`, with history and completion of views, columns and fields."""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.cli.output import note, say
+from hybridlog.cli.sql_answer import print_remarks, write_answer
+from hybridlog.consent import state_directory
+from hybridlog_storage.errors import HybridlogError
+
+if TYPE_CHECKING:
+    from hybridlog.cli.table_output import TableChoices
+    from hybridlog.sql.engine import SqlConnection
+
+_PROMPT: Final = "sql> "
+_MORE: Final = "...> "
+_ENDS: Final = frozenset({"exit", "quit", ".exit", ".quit", "\\q"})
+_DELIMITERS: Final = " \t\n,;()[]<>=!+-*/'"
+_HISTORY: Final = "sql_history"
+_MAX_HISTORY: Final = 1000
+_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_WORDS: Final = (
+    "as",
+    "asof",
+    "avg",
+    "between",
+    "by",
+    "count",
+    "describe",
+    "distinct",
+    "from",
+    "group",
+    "having",
+    "in",
+    "is",
+    "join",
+    "like",
+    "limit",
+    "max",
+    "min",
+    "not",
+    "null",
+    "on",
+    "or",
+    "order",
+    "select",
+    "show",
+    "sum",
+    "tables",
+    "union",
+    "using",
+    "where",
+    "with",
+)
+
+
+def run_prompt(
+    connection: SqlConnection,
+    choices: TableChoices,
+    timeout: float | None,
+    check: Callable[[str], None],
+) -> None:
+    """Read statements, which end with a semicolon, and print their answers.
+
+    Ctrl-C stops a query, or clears what was typed; Ctrl-D ends the prompt.
+
+    Args:
+        connection: Runs the statements.
+        choices: How answers are printed.
+        timeout: Seconds that one may take; None for no limit.
+        check: Refuses a statement whose answer would not be complete.
+    """
+    say("Statements end with a semicolon; `show tables;` lists views, Ctrl-D ends.")
+    completer = Completer(connection)
+    with _keys(), _line_editing(completer):
+        while (text := _statement(completer)) is not None:
+            if not text.strip():
+                continue
+            try:
+                check(text)
+                answer = connection.query(text, timeout=timeout)
+                write_answer(answer, choices)
+                sys.stdout.flush()
+                print_remarks(answer)
+            except HybridlogError as error:
+                for line in str(error).splitlines():
+                    note(line)
+            except KeyboardInterrupt:
+                note("The query was stopped.")
+
+
+def _statement(completer: Completer) -> str | None:
+    """The next statement; None at the end."""
+    lines: list[str] = []
+    while True:
+        completer.before = "\n".join(lines)
+        try:
+            line = input(_MORE if lines else _PROMPT)
+        except KeyboardInterrupt:
+            say()
+            lines.clear()
+            continue
+        except EOFError:
+            say()
+            return None
+        if not lines and line.strip().rstrip(";").lower() in _ENDS:
+            return None
+        lines.append(line)
+        if line.rstrip().endswith(";") or not any(map(str.strip, lines)):
+            return "\n".join(lines)
+
+
+class Completer:
+    """Candidates for the word before the cursor.
+
+    Args:
+        connection: Knows views and columns.
+
+    Attributes:
+        before: Lines of the statement before the current one.
+    """
+
+    def __init__(self, connection: SqlConnection) -> None:
+        self._connection = connection
+        self._found: list[str] = []
+        self.before = ""
+
+    def __call__(self, text: str, state: int) -> str | None:
+        """A candidate, as `readline` asks for it."""
+        if state == 0:
+            import readline
+
+            self._found = []
+            with suppress(HybridlogError):
+                line = f"{self.before}\n{readline.get_line_buffer()}"
+                self._found = self.candidates(line, text)
+        return self._found[state] if state < len(self._found) else None
+
+    def candidates(self, line: str, text: str) -> list[str]:
+        """Views, columns, fields and words that begin with a text, sorted.
+
+        Args:
+            line: The statement so far; columns are those of the views in it.
+            text: The word that is being typed, such as `pose.po`.
+        """
+        names = self._connection.names()
+        words = {word.casefold() for word in _PLAIN.findall(line)}
+        views = [name for name in names if name.casefold() in words and name != text]
+        columns: dict[str, None] = {}
+        for view in views:
+            schema = self._connection.schema(view)
+            above, _, _ = text.rpartition(".")
+            columns.update(dict.fromkeys(_below(schema, above)))
+            if above:
+                alias, _, rest = above.partition(".")
+                found = _below(schema, rest) if alias not in schema.names else []
+                columns.update(dict.fromkeys(f"{alias}.{path}" for path in found))
+        known = [*columns] if "." in text else [*map(_spelled, names), *columns, *_WORDS]
+        return sorted({name for name in known if name.casefold().startswith(text.casefold())})
+
+
+def _below(schema: Any, path: str) -> list[str]:
+    """Paths of the fields below a path; of the columns below an empty one."""
+    fields = list(schema)
+    for name in path.split(".") if path else ():
+        found = [f for f in fields if f.name.casefold() == name.casefold()]
+        if not found or not hasattr(found[0].type, "get_field_index"):
+            return []
+        fields = list(found[0].type)
+    return [f"{path}.{field.name}" if path else field.name for field in fields]
+
+
+def _spelled(name: str) -> str:
+    """A name as SQL takes it."""
+    return name if _PLAIN.fullmatch(name) else '"' + name.replace('"', '""') + '"'
+
+
+@contextmanager
+def _keys() -> Iterator[None]:
+    """Ctrl-C stops a query, not the command."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _line_editing(completer: Completer) -> Iterator[None]:
+    """Line editing with history, where Python has it."""
+    try:
+        import readline
+    except ImportError:
+        yield
+        return
+    path: Path | None = None
+    with suppress(HybridlogError, OSError):
+        path = state_directory() / _HISTORY
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.exists():
+            readline.read_history_file(path)
+    readline.set_history_length(_MAX_HISTORY)
+    readline.set_completer_delims(_DELIMITERS)
+    readline.set_completer(completer)
+    readline.parse_and_bind("tab: complete")
+    try:
+        yield
+    finally:
+        if path is not None:
+            with suppress(OSError):
+                readline.write_history_file(path)

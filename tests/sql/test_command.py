@@ -1,0 +1,226 @@
+"""`hybridlog sql`: outputs, standard input, the prompt with history and completion."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import secrets
+import select
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from click.testing import CliRunner, Result
+
+import hybridlog as hl
+from hybridlog.cli.app import app
+from hybridlog.cli.sql_prompt import Completer
+from hybridlog_storage.errors import HybridlogError, ResourceError, UsageError
+from tests.cli.running import COMMAND, environment
+from tests.sql.conftest import LARGE
+from tests.sql.test_engine import ENDLESS
+from tests.tables.logs import BASE, payload, write_log
+
+NESTED = (
+    "select t, header, many, tags, 1.5::decimal(4, 2) as d, date '2020-01-02' as day, "
+    "interval 3 day as i, time '10:00:01' as clock, null as nothing, "
+    "map {1: 'a'} as numbered from large order by t, seq limit 2"
+)
+
+
+def run(root: Path, *arguments: object, stdin: str | None = None, code: int = 0) -> Result:
+    given = ["sql", "--store", str(root), *map(str, arguments)]
+    done = CliRunner().invoke(app, given, input=stdin)
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == code, done.output
+    return done
+
+
+def test_json_lines(root: Path) -> None:
+    first, second = map(json.loads, run(root, NESTED).stdout.splitlines())
+    assert first["header"]["frame_id"] == "map"
+    assert first["header"]["stamp"] == second["header"]["stamp"] - 1
+    assert (first["many"], first["tags"], first["d"]) == ([], {"site": "hall"}, 1.5)
+    assert second["many"] == ["Infinity"]
+    assert (first["day"], first["clock"], first["nothing"]) == ("2020-01-02", "10:00:01", None)
+    assert first["i"] == {"months": 0, "days": 3, "nanoseconds": 0}
+    assert first["numbered"] == {"1": "a"}
+
+
+def test_files(root: Path, tmp_path: Path) -> None:
+    query = "select t, name, header, tags, words, 1.5::decimal(4, 2) as d from large order by t"
+    tables = {}
+    for suffix in ("parquet", "arrow", "csv"):
+        path = tmp_path / f"answer.{suffix}"
+        run(root, query, "-o", path)
+        read = {
+            "parquet": pa.parquet.read_table,
+            "csv": pa.csv.read_csv,
+            "arrow": lambda p: pa.ipc.open_file(p).read_all(),
+        }[suffix]
+        tables[suffix] = read(path)
+        with pytest.raises(UsageError, match="exists; --force overwrites it"):
+            run(root, query, "-o", path)
+    assert {table.num_rows for table in tables.values()} == {LARGE + 40}
+    assert tables["parquet"].to_pylist()[5:9] == tables["arrow"].to_pylist()[5:9]
+    assert tables["csv"].column("t").to_pylist() == tables["arrow"].column("t").to_pylist()
+    assert json.loads(tables["csv"].column("header")[3].as_py())["frame_id"] == "map"
+    printed = run(root, "select 1 as a, 'x,y' as b", "-F", "csv").stdout
+    assert printed == '"a","b"\n1,"x,y"\n'
+
+
+def test_tables_and_notes(root: Path) -> None:
+    done = run(root, "select recording, count(*) n from large group by all", "-F", "table")
+    assert [line.split() for line in done.stdout.splitlines()] == [
+        ["recording", "n"],
+        ["first", str(LARGE)],
+        ["second", "40"],
+    ]
+    shown = run(root, "select t, tags from large", "-F", "table")
+    assert "{site: hall}" in shown.stdout
+    times = run(root, "select log_time, header from large order by t limit 1", "-F", "table")
+    assert "2023-11-14T22:13:20Z  {seq: 0, stamp: 2023-11-14T22:13:19Z" in times.stdout
+    assert "The first 20 rows." in shown.stderr
+    assert len(run(root, "select t from large", "-n", 30).stdout.splitlines()) == 30
+    assert "No row." in run(root, "select t from large limit 0", "-F", "table").stderr
+    assert run(root, "create table x as select 1").exit_code == 0
+
+
+def test_standard_input(root: Path) -> None:
+    done = run(root, stdin="create table a as select 1 as x; select x + 1 as y from a;")
+    assert done.stdout == '{"y": 2}\n'
+    with pytest.raises(UsageError, match="The query is empty"):
+        run(root, stdin="")
+
+
+def test_limits(root: Path) -> None:
+    with pytest.raises(ResourceError, match=r"stopped after 0\.2 s"):
+        run(root, ENDLESS, "--timeout", "200ms")
+    large = "select a.range, list(b.range) from range(9000) a, range(20000) b group by all"
+    with pytest.raises(ResourceError, match="more than 64 MiB"):
+        run(root, large, "--memory", "64MiB")
+    with pytest.raises(UsageError, match="is no size"):
+        run(root, "select 1", "--memory", "much")
+
+
+def test_unreadable_messages_are_told(tmp_path: Path, server: str) -> None:
+    said = [(BASE + n, "/large", payload(n)[: 40 if n == 3 else None]) for n in range(6)]
+    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
+    with hl.open(tmp_path / "store", create=True, mongo=mongo) as opened:
+        opened.record(write_log(tmp_path / "log.mcap", said), name="odd")
+        answer = opened.sql("select t, i8, error, state from large where i8 is null")
+        ((time, _, error, state),) = answer.rows()
+        assert (time, state) == (BASE + 3, "unreadable")
+        assert "does not fit" in error
+        assert answer.remarks.unreadable == {"/large": 1}
+    done = run(tmp_path / "store", "select count(*) from large", "-F", "csv")
+    assert done.stdout.splitlines()[1] == "6"
+    assert "/large: 1 message does not fit its definition; the fields are null" in done.stderr
+
+
+def test_completion(store: hl.Store) -> None:
+    completer = Completer(store.sql_engine.connect())
+
+    def candidates(line: str, text: str | None = None) -> list[str]:
+        word = line.rpartition(" ")[2] if text is None else text
+        return completer.candidates(line, word)
+
+    assert candidates("select * from sca") == ["scan"]
+    assert candidates("select b") == ["base__scan", "between", "by"]
+    assert "recordings" in candidates("select * from rec")
+    assert candidates("from scan select ang") == ["angle"]
+    assert candidates("from scan select ranges_summary.m") == [
+        "ranges_summary.max",
+        "ranges_summary.mean",
+        "ranges_summary.min",
+    ]
+    assert candidates("from scan s select s.echo.far_summary.m")[0] == "s.echo.far_summary.max"
+    assert candidates("from scan s select s.ang") == ["s.angle"]
+    assert candidates("from recordings select first_") == ["first_t", "first_time"]
+    assert candidates("from scan select nothing.x") == []
+    assert "select" in candidates("SEL")
+    assert all(text.startswith('"') for text in candidates('from "a', '"a'))
+
+
+class Person:
+    """Types into a command on a terminal, and reads what it shows."""
+
+    def __init__(self, *arguments: object, **env: str) -> None:
+        self.terminal, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            [*COMMAND, *map(str, arguments)],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            env=environment(TERM="xterm", **env),
+            start_new_session=True,
+        )
+        os.close(theirs)
+        self.shown = b""
+        self._read = 0
+
+    def reads(self, text: str) -> None:
+        """Wait until a text is shown."""
+        deadline = time.monotonic() + 120
+        while (found := self.shown.find(text.encode(), self._read)) < 0:
+            assert time.monotonic() < deadline, (text, self.shown)
+            if select.select([self.terminal], [], [], 0.05)[0]:
+                self.shown += os.read(self.terminal, 1 << 16)
+        self._read = found + len(text)
+
+    def types(self, text: str) -> None:
+        os.write(self.terminal, text.encode())
+
+    def leaves(self) -> int:
+        try:
+            return self.process.wait(60)
+        finally:
+            os.close(self.terminal)
+            if self.process.poll() is None:
+                self.process.kill()
+
+
+def test_the_prompt(root: Path, tmp_path: Path) -> None:
+    person = Person("sql", "--store", root, XDG_STATE_HOME=str(tmp_path))
+    person.reads("sql> ")
+    person.types("create table few as select * from scan limit 3;\r")
+    person.reads("sql> ")
+    person.types("select count(*) + 100 as n\r")
+    person.reads("...> ")
+    person.types("from few;\r")
+    person.reads("103")
+    person.reads("sql> ")
+    person.types("selec 1;\r")
+    person.reads("syntax error")
+    person.reads("LINE 1: selec 1;")
+    person.reads("sql> ")
+    person.types("select max(ranges_summary.max) as most from base__s\t;\r")
+    person.reads("998")
+    person.reads("sql> ")
+    person.types(f"{ENDLESS};\r")
+    person.reads("\n")
+    while b"stopped" not in person.shown:  # it may not have begun yet
+        os.kill(person.process.pid, signal.SIGINT)
+        if select.select([person.terminal], [], [], 0.2)[0]:
+            person.shown += os.read(person.terminal, 1 << 16)
+    person.types("\rselect 6 * 7 as answer;\r")
+    person.reads("42")
+    person.types("quit\r")
+    assert person.leaves() == 0
+    history = (tmp_path / "hybridlog" / "sql_history").read_text()
+    assert "from few;" in history
+    assert "base__scan" in history
+
+
+def test_errors_have_exit_codes(root: Path) -> None:
+    for query, expected in (("selec 1", 2), ("select * from nothing", 2)):
+        with pytest.raises(HybridlogError) as caught:
+            run(root, query)
+        assert caught.value.exit_code == expected
