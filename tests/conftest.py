@@ -65,6 +65,11 @@ for number, handler in (
 
 SLOW = frozenset(
     (
+        "across/test_align.py",
+        "across/test_lost.py",
+        "across/test_near.py",
+        "across/test_rates.py",
+        "across/test_sync.py",
         "benchmarks/test_backends.py",
         "benchmarks/test_harness.py",
         "benchmarks/test_live.py",
@@ -88,6 +93,7 @@ SLOW = frozenset(
         "live/sources/test_ros2_live.py",
         "live/test_killed.py",
         "live/test_recording.py",
+        "live/test_rehearsal.py",
         "query/test_chunk_counts.py",
         "query/test_counting.py",
         "query/test_engines.py",

@@ -18,7 +18,7 @@ from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import UNKNOWN, match
 from hybridlog.frames import answer
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
-from tests.cli.running import run
+from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs, Said
 

@@ -15,7 +15,7 @@ from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
-from tests.cli.running import run
+from tests.cli.within import answer as run
 
 BASE = 1_750_000_000 * 10**9
 SECOND = 10**9

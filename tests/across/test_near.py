@@ -22,7 +22,7 @@ from hybridlog.query.predicate.across import (
     parse_across,
 )
 from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
-from tests.cli.running import run
+from tests.cli.within import answer as run
 from tests.independent import read_mcap
 
 from .conftest import MS, Logs, Said

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
-from tests.cli.running import run
+from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs
 

@@ -20,7 +20,7 @@ from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger
 from hybridlog.losses import Ledger
 from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel
-from tests.cli.running import run
+from tests.cli.within import answer as run
 
 MS = 10**6
 BASE = 1_748_937_600 * 10**9
