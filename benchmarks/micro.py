@@ -16,12 +16,14 @@ from typing import Any
 
 import bson
 import numpy as np
+import pyarrow as pa
 import pytest
 from rosbags.rosbag1 import Reader
 
 import hybridlog as hl
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
+from hybridlog.across.match import HOWS, How, match
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
@@ -396,6 +398,30 @@ def bench_first(case: str, store: Any, benchmark: Any) -> None:
     answer = ask(store)
     found = benchmark.pedantic(ask, (store,), setup=forget, rounds=30, warmup_rounds=1)
     assert found == answer
+
+
+@pytest.mark.parametrize("how", HOWS)
+def bench_join(how: How, benchmark: Any) -> None:
+    """Of a million rows, those that belong to 20,000 times: a column of doubles is taken."""
+    rng = np.random.default_rng(1)
+    rows = np.cumsum(rng.integers(500_000, 1_500_000, 1_000_000))
+    times = np.sort(rng.integers(rows[0], rows[-1], 20_000))
+    table = pa.table({"x": rng.normal(size=len(rows))})
+
+    def join() -> int:
+        found = match(times, rows, how, 20_000_000)
+        return table.take(pa.array(found.before)).num_rows
+
+    assert benchmark(join) == len(times)
+
+
+def bench_align(store: Any, benchmark: Any) -> None:
+    """Scans with the messages of an IMU that were current, from the tables of an open store."""
+    aligned = store.align(
+        "/scan", "/imu/data", fields={"/scan": ["range_max"], "/imu/data": ["angular_velocity.z"]}
+    )
+    rows = store.topic("/scan").count()
+    assert benchmark(aligned.to_arrow).num_rows == rows
 
 
 DECODED = {

@@ -158,13 +158,16 @@ def _beginning(block: Block) -> tuple[int, int]:
 
 def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
     """The order of the rows by log time; None if they are in order."""
+    blocks = [block for block in blocks if len(block.log_time)]
     if not blocks:
         return None
-    time = np.concatenate([block.log_time for block in blocks])
-    order = np.concatenate([block.order for block in blocks])
+    time = blocks[0].log_time
+    if len(blocks) > 1:
+        time = np.concatenate([block.log_time for block in blocks])
     later = time[1:] > time[:-1]
     if later.all():
         return None
+    order = np.concatenate([block.order for block in blocks])
     if bool((later | ((time[1:] == time[:-1]) & (order[1:] >= order[:-1]))).all()):
         return None
     return np.lexsort((order, time))
