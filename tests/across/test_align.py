@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,9 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybridlog.across import align
 from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import UNKNOWN, match
-from hybridlog.frames import answer
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from tests.cli.within import answer as run
 
@@ -25,9 +26,17 @@ from .conftest import BASE, MS, Logs, Said
 TOLERANCE_MS = 7
 
 
-@pytest.fixture(params=[65_536, 11], ids=["whole", "in blocks"])
+@pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
 def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer, "_BLOCK_ROWS", request.param)
+    """Topics are read in blocks of so many rows, also with messages of one time in two of them."""
+    read, size = align._Reader.tables, request.param
+
+    def tables(reader: align._Reader, *arguments: Any) -> Iterator[Any]:
+        for times, table in read(reader, *arguments):
+            for begin in range(0, len(times), size):
+                yield times[begin : begin + size], table.slice(begin, size)
+
+    monkeypatch.setattr(align._Reader, "tables", tables)
 
 
 def naive(

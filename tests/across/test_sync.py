@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
+import random
 from collections import deque
 from collections.abc import Iterator
 from itertools import pairwise
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
@@ -101,6 +102,8 @@ times = st.lists(st.integers(0, 60).map(lambda n: 10 * n), max_size=12).map(sort
     st.none() | st.integers(0, 100),
     st.randoms(use_true_random=False),
 )
+@example([[0, 1950], [1000]], None, random.Random(0))  # later, and not shorter by a tenth
+@example([[0, 1900], [1000]], None, random.Random(0))
 def test_sets_are_those_of_message_filters(rows: list[list[int]], longest: int | None, rng) -> None:  # type: ignore[no-untyped-def]
     policy = ApproximateTime(len(rows), float("inf") if longest is None else longest)
     # The order of arrival across topics does not matter.
