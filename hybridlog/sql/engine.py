@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import partial
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.sql.content import StoreContent, current_content
@@ -21,7 +20,6 @@ from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog_storage.errors import (
     HybridlogError,
-    MissingDependencyError,
     TopicError,
     UsageError,
 )
@@ -303,11 +301,9 @@ class SqlAnswer:
             MissingDependencyError: polars is not installed.
             ResourceError: it needs more memory or time than it may.
         """
-        try:
-            polars = import_module("polars")
-        except ImportError as error:
-            raise MissingDependencyError("This needs polars: pip install polars") from error
-        return polars.from_arrow(self.to_arrow())
+        from hybridlog.frames.polars import to_polars
+
+        return to_polars(self.to_arrow())
 
     def rows(self) -> list[tuple[Any, ...]]:
         """The whole answer as tuples of Python values."""

@@ -8,11 +8,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.query.answers.field_statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from tests.cli.within import answer as run
 
@@ -161,6 +164,17 @@ def test_statistics_are_those_of_pandas(logs: Logs) -> None:
     assert with_arrays["list"].mean == pytest.approx(
         statistics.fmean(v for one in lists for v in one)
     )
+
+
+def test_blocks_of_different_means_are_joined() -> None:
+    values = np.concatenate([np.full(7, 1.0), np.arange(1000.0, 1013.0), np.full(400, -5.5)])
+    running = _Running()
+    for block in np.split(values, [7, 20, 21]):
+        running.add(pa.chunked_array([pa.array(block)]))
+    found = running.result("/n", "v")
+    assert (found.count, found.min, found.max) == (len(values), -5.5, 1012.0)
+    assert found.mean == pytest.approx(values.mean())
+    assert found.std == pytest.approx(values.std(ddof=1))
 
 
 def test_numbers_of_statistics_are_exact(tmp_path: Path) -> None:
