@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.query.times import format_time
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch
+
+
+_PICTURES = {"sensor_msgs/Image", "sensor_msgs/CompressedImage"}
+_MOST_SHOWN = 64 << 20  # bytes of a payload that a thumbnail is made of
 
 
 class Message:
@@ -74,6 +79,33 @@ class Message:
 
     def __repr__(self) -> str:
         return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
+
+    def _repr_html_(self) -> str:
+        """The message in a notebook: its fields, and a thumbnail of an image."""
+        from hybridlog.notebook import message_html
+
+        title = f"{self.topic} {self.type} {format_time(self.log_time_ns)}, {len(self._view)} B"
+        problem = ""
+        fields: dict[str, object] | None = None
+        try:
+            fields = self.fields
+        except HybridlogError as error:
+            problem = str(error)
+        return message_html(title, fields, problem, self._thumbnail())
+
+    def _thumbnail(self) -> bytes:
+        """A small PNG of an image; empty for other messages, and for what cannot be shown."""
+        kind = self.type.replace("/msg/", "/")
+        if kind not in _PICTURES or len(self._view) > _MOST_SHOWN or self._is_reduced:
+            return b""
+        from hybridlog.arrays import to_numpy
+        from hybridlog.thumbnail import thumbnail
+
+        try:
+            message = self.decode()
+            return thumbnail(to_numpy(self.type, message), getattr(message, "encoding", "rgb8"))
+        except HybridlogError:
+            return b""
 
     @property
     def raw(self) -> bytes:

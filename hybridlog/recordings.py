@@ -40,13 +40,17 @@ class Recordings(Sequence["RecordingEntry"]):
         return len(self.summaries)
 
     @overload
-    def __getitem__(self, index: int) -> RecordingEntry: ...
+    def __getitem__(self, index: int | str) -> RecordingEntry: ...
 
     @overload
     def __getitem__(self, index: slice) -> Recordings: ...
 
-    def __getitem__(self, index: int | slice) -> RecordingEntry | Recordings:
-        """The entry of a recording, or some of the recordings."""
+    def __getitem__(self, index: int | str | slice) -> RecordingEntry | Recordings:
+        """The entry of a recording by position or label, or some of the recordings."""
+        if isinstance(index, str):
+            if index not in self.labels:
+                raise TopicError(f"{index!r} is not one of {listed(self.labels)}.")
+            index = self.labels.index(index)
         if isinstance(index, slice):
             return Recordings(self._session, self.summaries[index], self._problem)
         return self._session.entry_of(self.summaries[index])
@@ -64,7 +68,17 @@ class Recordings(Sequence["RecordingEntry"]):
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        return f"<Recordings {listed(one.label for one in self.summaries)}>"
+        return f"<Recordings {listed((one.label for one in self.summaries), 5)}>"
+
+    def _repr_html_(self) -> str:
+        """The recordings in a notebook."""
+        from hybridlog.notebook import recordings_html
+
+        return recordings_html(f"{len(self)} recordings", self.summaries)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Labels, for `recordings["…"]`."""
+        return list(self.labels)
 
     @property
     def ids(self) -> tuple[str, ...]:

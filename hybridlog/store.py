@@ -185,6 +185,22 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {self.directory.path}>"
 
+    def _repr_html_(self) -> str:
+        """The store in a notebook: its latest recordings."""
+        from hybridlog.notebook import recordings_html
+
+        summaries = self.summaries()
+        title = f"Store {self.directory.path}: {len(summaries)} recordings"
+        return recordings_html(title, summaries)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Topics, for `store["…"]`."""
+        return self.topics()
+
+    def __getitem__(self, topics: str | tuple[str, ...]) -> Query:
+        """`store["/scan"]` is `store.topic("/scan")`."""
+        return self.topic(*((topics,) if isinstance(topics, str) else topics))
+
     @property
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas, in a local file."""

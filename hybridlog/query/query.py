@@ -28,6 +28,7 @@ from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     DefinitionError,
+    HybridlogError,
     IncompleteError,
     IndexChangedError,
     PayloadError,
@@ -78,13 +79,55 @@ class Query:
         self._session = session
 
     def __repr__(self) -> str:
-        names = ", ".join(self.topics[:3]) + (", …" if len(self.topics) > 3 else "")
-        parts = [names, f"{len(self._session.chosen(self.question))} recordings"]
-        if self.question.bounds is not None:
-            parts.append(f"between {self.question.bounds[0]} and {self.question.bounds[1]}")
-        if self.question.predicate is not None:
-            parts.append(f"where {self.question.predicate}")
-        return f"<Query {'; '.join(parts)}>"
+        return f"<Query {'; '.join(self._described().values())}>"
+
+    def _repr_html_(self) -> str:
+        """The question in a notebook; no message is read for it."""
+        from hybridlog.notebook import properties_html
+
+        return properties_html("Query", self._described())
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Fields, for `query["…"]`."""
+        return list(self.field_types() or ())
+
+    def _described(self) -> dict[str, str]:
+        """The parts of the question in words."""
+        question = self.question
+        found = {"topics": listed(self.topics, 3)}
+        try:
+            places = self._session.chosen(question).tolist()
+        except HybridlogError as error:
+            found["recordings"] = str(error)
+        else:
+            summaries = self._session.snapshot().summaries
+            labels = listed((summaries[place].label for place in places[:4]), 3)
+            several = f"{len(places)} recordings"
+            found["recordings"] = several if len(places) != 1 else f"recording {labels}"
+        if question.bounds is not None:
+            begin, end = question.bounds
+            clock = "" if question.clock == "log" else f" by {question.clock} time"
+            found["time"] = f"between {begin} and {end}{clock}"
+        if question.during is not None:
+            found["during"] = f"during {len(question.during)} intervals"
+        if question.predicate is not None:
+            from hybridlog.query.predicate.tree import spelled
+
+            text = spelled(question.predicate.root)
+            found["predicate"] = f"where {text if len(text) <= 200 else text[:200] + '…'}"
+        if question.fields is not None:
+            found["fields"] = f"fields {listed(question.fields, 5)}"
+        if question.every > 1:
+            found["every"] = f"every {question.every}th"
+        if question.limit is not None:
+            found["limit"] = f"at most {question.limit}"
+        if question.reverse:
+            found["order"] = "latest first"
+        return found
+
+    def __getitem__(self, fields: str | tuple[str, ...]) -> Query:
+        """`query["header.stamp", "ranges.min"]` is `query.fields("header.stamp", "ranges.min")`."""
+        return self.fields(*((fields,) if isinstance(fields, str) else fields))
 
     def __eq__(self, other: object) -> bool:
         """True if both are the same question to the same open store."""

@@ -160,7 +160,7 @@ def _values(item: ChannelEntry | ChannelStats) -> dict[str, Any]:
     return {name: getattr(item, name) for name in item.__slots__}
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, repr=False)
 class ChannelEntry:
     """One channel of a recording."""
 
@@ -177,13 +177,16 @@ class ChannelEntry:
     is_indexed: bool = True
     """False if its messages get no documents in MongoDB."""
 
+    def __repr__(self) -> str:
+        return f"<Channel {self.topic} {self.type}; {self.stats.messages} messages>"
+
     @property
     def unindexed(self) -> str | None:
         """Reason why MongoDB has no fields of its messages, None if it has."""
         return self.reason if self.is_indexed else "recorded with --no-index"
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, repr=False)
 class RecordingEntry:
     """One recording.
 
@@ -229,6 +232,9 @@ class RecordingEntry:
     digests: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
     payloads: list[dict[str, Any]] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"<Recording {self.label}; {len(self.channels)} channels, {self.messages} messages>"
 
     @property
     def key(self) -> str:

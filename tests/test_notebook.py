@@ -1,0 +1,231 @@
+"""What notebooks show, and what they complete."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import struct
+from base64 import b64decode
+from collections.abc import Iterator
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from PIL import Image
+
+import hybridlog as hl
+from hybridlog.message import Message
+from hybridlog.notebook import message_html, recordings_html, shown
+from hybridlog.thumbnail import SIDE, thumbnail
+from hybridlog_storage.errors import TopicError
+from tests.test_snapshot import summary
+
+HOSTILE = "<script>alert('x')</script>&\"\x1b[31m"
+IMAGE = b"""std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+================================================================================
+MSG: std_msgs/Header
+uint32 seq
+time stamp
+string frame_id
+"""
+COMPRESSED = IMAGE.replace(
+    b"uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n",
+    b"string format\n",
+)
+HEADER = struct.pack("<IIII", 0, 0, 0, 0)
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def image(encoding: str, array: np.ndarray) -> bytes:
+    step = array.strides[0]
+    size = struct.pack("<II", *array.shape[:2]) + text(encoding) + struct.pack("<BI", 0, step)
+    return HEADER + size + struct.pack("<I", array.nbytes) + array.tobytes()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """Messages of hostile names and values, and pictures."""
+    path = tmp_path_factory.mktemp("notebook")
+    picture = io.BytesIO()
+    Image.fromarray(np.full((300, 400, 3), (200, 10, 10), np.uint8)).save(picture, "PNG")
+    colours = np.zeros((300, 400, 3), np.uint8)
+    colours[:, :, 0] = 255  # blue, as OpenCV has it
+    with (path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1")
+        odd = {HOSTILE: HOSTILE, "nested": {"list": list(range(100))}, "long": "x" * 1000}
+        many = {f"f{n}": n for n in range(50)}
+        raw = writer.register_schema("sensor_msgs/Image", "ros1msg", IMAGE)
+        packed = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", COMPRESSED)
+        data = HEADER + text("png") + struct.pack("<I", picture.getbuffer().nbytes)
+        for topic, encoding, schema, payload in (
+            (f"/{HOSTILE}", "json", 0, json.dumps(odd).encode()),
+            ("/many", "json", 0, json.dumps(many).encode()),
+            ("/image", "ros1", raw, image("bgr8", colours)),
+            ("/wrong", "ros1", raw, image("bgr8", colours)[:-5]),
+            ("/unknown", "ros1", raw, image("hsv99", colours)),
+            ("/packed", "ros1", packed, data + picture.getvalue()),
+        ):
+            channel = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channel, 10**18, payload, 10**18)
+        writer.finish()
+    with hl.open(path / "store", create=True) as opened:
+        opened.record(path / "log.mcap", name=HOSTILE, tags={HOSTILE: HOSTILE})
+        yield opened
+
+
+class Parsed(HTMLParser):
+    """The tags of HTML, its text, and the sources of its images."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.images: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        if tag == "img":
+            self.images.append(dict(attrs)["src"] or "")
+        else:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+PLAIN = {"div", "p", "b", "table", "thead", "tr", "th", "td", "img"}
+
+
+def only(store: hl.Store, topic: str) -> Message:
+    message = store.topic(topic).first()
+    assert message is not None
+    return message
+
+
+def test_names_and_values_are_text(store: hl.Store) -> None:
+    recordings = store.recordings()
+    hostile = only(store, f"/{HOSTILE}")
+    for thing in (store, recordings, store.topic(f"/{HOSTILE}"), hostile):
+        parsed = Parsed(thing._repr_html_())
+        assert set(parsed.tags) <= PLAIN
+        assert "alert('x')" in parsed.text or thing is recordings
+    parsed = Parsed(hostile._repr_html_())
+    assert HOSTILE in parsed.text
+    assert "nested.list" in parsed.text
+    assert "x" * 200 not in parsed.text
+    assert "and" in Parsed(only(store, "/many")._repr_html_()).text
+
+
+def test_output_is_bounded() -> None:
+    made = [summary(n, (n, n), ["/a"], tags={"t": "v" * 10_000})[0] for n in range(1000)]
+    html = recordings_html("many", made)
+    assert len(html) < 20_000
+    assert "and 980 earlier ones" in html
+    assert ">r999<" in html
+    assert ">r979<" not in html
+    deep = {"deep": ["y" * 10_000] * 10_000}
+    fields = {f"f{n}": deep for n in range(10_000)}
+    html = message_html("m" * 10_000, fields, "", b"")
+    assert len(html) < 20_000
+    assert " and 9998 more]" in html
+    assert html.count("<tr>") == 20
+    assert shown("a\n  b" + "c" * 300, 10) == "a b" + "c" * 6 + "…"
+
+
+def test_representations_are_short(store: hl.Store) -> None:
+    path = store.directory.path
+    assert repr(store) == f"<Store {path}>"
+    (entry,) = store.recordings()
+    assert repr(store.recordings()) == f"<Recordings {entry.label}>"
+    assert repr(entry) == f"<Recording {entry.label}; 6 channels, 6 messages>"
+    assert repr(entry.channels[1]) == "<Channel /many ; 1 messages>"
+    query = store.topic("/many").between("+0s", "end").where("f1 > 0").limit(3)
+    assert repr(query) == (
+        f"<Query /many; recording {entry.label}; between +0s and end; where f1 > 0; at most 3>"
+    )
+    assert "at most 3" in Parsed(query._repr_html_()).text
+    wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))
+    assert len(repr(wide)) < 450
+    assert "and 3 more" in repr(wide)
+
+
+def test_images_have_a_thumbnail(store: hl.Store) -> None:
+    for topic, colour in (("/image", (0, 0, 255)), ("/packed", (200, 10, 10))):
+        (source,) = Parsed(only(store, topic)._repr_html_()).images
+        assert source.startswith("data:image/png;base64,")
+        with Image.open(io.BytesIO(b64decode(source.partition(",")[2]))) as seen:
+            assert max(seen.size) <= SIDE
+            assert seen.size == (134, 100)
+            assert seen.getpixel((50, 50)) == colour
+
+
+@pytest.mark.parametrize("topic", ["/wrong", "/unknown"])
+def test_what_is_no_picture_has_none(store: hl.Store, topic: str) -> None:
+    parsed = Parsed(only(store, topic)._repr_html_())
+    assert parsed.images == []
+    assert "sensor_msgs/Image" in parsed.text
+
+
+def test_a_large_image_is_not_decoded(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hybridlog.message._MOST_SHOWN", 1000)
+    assert Parsed(only(store, "/image")._repr_html_()).images == []
+
+
+def seen(array: np.ndarray, encoding: str) -> np.ndarray:
+    with Image.open(io.BytesIO(thumbnail(array, encoding))) as picture:
+        return np.asarray(picture)
+
+
+def test_thumbnails_of_all_encodings() -> None:
+    ramp = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert np.array_equal(seen(ramp, "mono8"), ramp)
+    colours = np.stack([ramp, ramp + 50, ramp + 100, ramp + 150], axis=2)
+    assert np.array_equal(seen(colours, "rgba8"), colours[:, :, :3])
+    assert np.array_equal(seen(colours, "BGRA8 "), colours[:, :, 2::-1])
+    assert np.array_equal(seen(colours[:, :, :2], "yuv422"), ramp + 50)
+    assert np.array_equal(seen(colours[:, :, :2], "yuyv"), ramp)
+    assert np.array_equal(seen(ramp, "nv12"), ramp[:2])
+    depth = np.array([[np.nan, 1.0, 2.0, np.inf]], np.float32)
+    assert seen(depth, "32FC1").tolist() == [[0, 0, 255, 0]]
+    assert seen(np.array([[0, 500, 1000]], ">u2"), "16UC1").tolist() == [[0, 127, 255]]
+    assert seen(np.full((2, 2), np.nan), "64FC1").tolist() == [[0, 0], [0, 0]]
+    huge = np.array([[-1.7e308, 1.7e308]])
+    assert seen(huge, "64FC1").tolist() == [[0, 255]]
+    assert seen(np.zeros((1, 1000), np.uint8), "mono8").shape == (1, 143)
+    assert thumbnail(np.empty((0, 5), np.uint8), "mono8") == b""
+
+
+def test_topics_fields_and_labels_are_completed(store: hl.Store) -> None:
+    assert store._ipython_key_completions_() == store.topics()
+    assert store["/image"] == store.topic("/image")
+    assert store["/image", "/many"] == store.topic("/image", "/many")
+    query = store["/image"]
+    assert "header.frame_id" in query._ipython_key_completions_()
+    assert query["encoding"] == query.fields("encoding")
+    assert query["encoding", "step"] == query.fields("encoding", "step")
+    assert store["/many"]._ipython_key_completions_() == []  # no definition fixes its fields
+    recordings = store.recordings()
+    (label,) = recordings._ipython_key_completions_()
+    assert recordings[label] == recordings[0]
+    with pytest.raises(TopicError, match="'x' is not one of"):
+        recordings["x"]
+    assert re.fullmatch(r"<Message /image .* 360041 B>", repr(only(store, "/image")))
