@@ -16,6 +16,7 @@ KEEP_ALL: Final = 1 << 62
 """Depth of a publisher that keeps all of its messages."""
 
 _TRANSIENT_LOCAL = re.compile(r"durability\W+(?:1|\w*transient_local)\b", re.IGNORECASE)
+_MAX_TEXT = 32 << 10  # characters; profiles of more than a hundred publishers are counted only
 _POLICIES = frozenset({"durability", "history", "depth"})
 
 
@@ -45,6 +46,8 @@ def _offered_depth(text: str) -> int:
     """The sum of the depths of the transient-local profiles in a YAML list."""
     if "durability" not in text:
         return 0
+    if len(text) > _MAX_TEXT:
+        return len(_TRANSIENT_LOCAL.findall(text))
     try:
         profiles = parse_yaml(text, _POLICIES)
         if isinstance(profiles, str):  # the list itself was quoted

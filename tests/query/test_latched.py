@@ -64,7 +64,8 @@ ALL = profile(history="keep_all", depth=0, reliability="reliable", durability="t
         ('[{"history": "keep_last", "depth": 6, "durability": "transient_local"}]', 6),
         (repr(TEN + ONE).replace("'", '"'), 11),
         (ONE.removeprefix("- ").replace("\n  ", "\n"), 1),
-        # What is no YAML: one a publisher.
+        # What is very long or no YAML: one a publisher.
+        (TEN * 400, 400),
         (TEN + "}{\n" + TEN, 2),
     ],
 )
