@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.coverage import gaps
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
 
@@ -46,8 +49,27 @@ def print_gaps(query: Query, between: tuple[str, str] | None) -> None:
         query: The query that was answered.
         between: Its time range as typed, by the log clock; None for all times.
     """
-    for line in gaps(query.doubtful(), query.topics, between):
+    doubtful = query.doubtful()
+    for line in gaps(doubtful, query.topics, between):
         output.note(line)
+    for label in (entry.label for entry in doubtful if entry.status == "open"):
+        messages = _not_indexed(query.directory, label)
+        if messages:
+            are = "is" if messages == 1 else "are"
+            output.note(
+                f"{label}: {output.counted(messages, 'recorded message')} {are} not indexed yet."
+            )
+
+
+def _not_indexed(store: Path, recording: str) -> int:
+    """Number of messages of a running recorder that no answer has yet; 0 if it does not say."""
+    from hybridlog.live.control_server import request
+
+    try:
+        messages = request(store, recording, "state").get("lag")
+    except HybridlogError:  # it has just ended, or belongs to another user
+        return 0
+    return messages if isinstance(messages, int) else 0
 
 
 def print_lost(query: Query, count: int) -> None:

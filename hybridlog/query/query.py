@@ -37,6 +37,8 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -143,6 +145,11 @@ class Query:
     def topics(self) -> tuple[str, ...]:
         """Full names of the topics."""
         return self.question.topics
+
+    @property
+    def directory(self) -> Path:
+        """The store's directory."""
+        return self._session.directory.path
 
     @property
     def recordings(self) -> tuple[str, ...]:

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.live.control_server import ControlServer
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
-from .running import run
+from .running import run, wait_for
 
 BEGIN_NS = 1_750_000_000_000_000_000
 SECOND_NS = 10**9
@@ -123,3 +124,25 @@ def test_info_shows_notes_and_marks(damaged: Path) -> None:
     assert [(mark["text"], mark["time"]) for mark in told["marks"]] == [
         ("bump", BEGIN_NS + SECOND_NS)
     ]
+
+
+def test_messages_that_are_not_indexed_yet_are_counted(tmp_path: Path) -> None:
+    def is_known() -> bool:
+        store.refresh()
+        return "/kept" in store.topics()
+
+    settings = SegmentSettings(chunk_size=1 << 10, segment_size=1)
+    with (
+        hl.open(tmp_path / "store", create=True) as store,
+        store.start("now", settings=settings) as recording,
+    ):
+        for second in range(3):
+            recording.write(KEPT, PAYLOAD, log_time=BEGIN_NS + second * SECOND_NS)
+        wait_for(is_known)
+        recorder = ControlServer(tmp_path / "store", "now", {"state": lambda _: {"lag": 12}})
+        try:
+            done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
+        finally:
+            recorder.close()
+    assert "now is still being recorded" in done.err
+    assert "now: 12 recorded messages are not indexed yet." in done.err
