@@ -37,22 +37,22 @@ def compare_every_output(query: Query, wanted: list[Any], raw: list[bytes], fold
     flat = [flattened(message) for message in wanted]
     for table in (query.to_arrow(), parquet(query), arrow_file(query)):
         compare_rows(rows_of(table), flat)
-    for count in (1, 3):
+    for count in (1, 3) if flat[0] else ():
         names = sorted(flat[0])[::count]
         chosen = query.fields(*names).to_arrow()
         compare_rows(rows_of(chosen), [{name: row[name] for name in names} for row in flat])
     frame = query.to_pandas()
-    compare_rows(
-        [dict(zip(frame.columns, row, strict=True)) for row in frame.itertuples(index=False)],
-        flat,
-    )
+    assert len(frame) == len(flat)
+    if flat[0]:
+        cells = frame.itertuples(index=False)
+        compare_rows([dict(zip(frame.columns, row, strict=True)) for row in cells], flat)
     lines = [json.loads(line) for line in written(query, "jsonl").decode().splitlines()]
     compare_rows(lines, flat)
     csv.field_size_limit(1 << 30)
-    cells = list(csv.DictReader(io.StringIO(written(query, "csv").decode(), newline="")))
+    rows = list(csv.DictReader(io.StringIO(written(query, "csv").decode(), newline="")))
     texts = [
         {name: of_cell(cell, want.get(name)) for name, cell in row.items()}
-        for row, want in zip(cells, flat, strict=True)
+        for row, want in zip(rows, flat, strict=True)
     ]
     compare_rows(texts, flat)
     compare_rows(of_npz(query), flat)

@@ -118,6 +118,7 @@ def plain_of(store: Typestore, name: str, message: Any) -> Any:
     return {
         key: _plain(store, desc, getattr(message, key))
         for key, desc in zip(names, descs, strict=True)
+        if key != "structure_needs_at_least_one_member"  # what rosbags has of an empty message
     }
 
 

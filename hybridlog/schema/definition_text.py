@@ -174,6 +174,11 @@ def _event(kind: str, base: str) -> list[RawField]:
     ]
 
 
+def interface_of(name: str) -> str:
+    """The service or action of a derived type: `pkg/srv/Name` of `pkg/srv/Name_Event`."""
+    return _PART_SUFFIX.sub("", name)
+
+
 _PART_SUFFIX = re.compile(
     r"(?:_(?:SendGoal|GetResult))?_(?:Event|Request|Response)\Z|_(?:Goal|Result|Feedback|FeedbackMessage)\Z"
 )
@@ -204,7 +209,7 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
     if len(parts) not in {2, 3}:
         raise DefinitionError(f"{name}: {len(parts)} parts; a service has 2 and an action 3")
     folder, _, leaf = name.rpartition("/")
-    base = _PART_SUFFIX.sub("", leaf)
+    base = interface_of(leaf)
     if folder:
         folder += "/"
     parsed = [parse_msg(name, "\n".join(part), defaults=True) for part in parts]

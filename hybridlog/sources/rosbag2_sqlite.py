@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from hybridlog.schema.definition_text import interface_of
 from hybridlog.sources.base import (
     BATCH_BYTES,
     BATCH_MESSAGES,
@@ -165,7 +166,8 @@ class SqliteSource(Source):
         )
         for number, name, kind, encoding, qos, type_hash in self._db.execute(query):
             type_name = str(kind or "")
-            found = definitions.get(type_name, ("", b""))
+            # Services and actions are recorded by their events, and defined by themselves.
+            found = definitions.get(type_name) or definitions.get(interface_of(type_name))
             metadata = {}
             if "offered_qos_profiles" in columns:
                 metadata["offered_qos_profiles"] = str(qos or "")
@@ -176,7 +178,7 @@ class SqliteSource(Source):
                 Channel(
                     topic=str(name),
                     message_encoding=str(encoding or ""),
-                    schema=Schema(type_name, *found),
+                    schema=Schema(type_name, *(found or ("", b""))),
                     metadata=metadata,
                     has_publish_time=self._has_publish_time,
                 )

@@ -121,11 +121,18 @@ def test_what_channels_say() -> None:
 
     with open_source(DATA / "odd/rosbag2/topics_and_services.db3") as source:
         list(source.batches())
-        events = {channel.topic: channel for channel in source.channels}["/parameter_events"]
+        channels = {channel.topic: channel for channel in source.channels}
+    events, services = channels["/parameter_events"], channels["/add_two_ints/_service_event"]
     assert events.schema is not None
     assert events.schema.data.startswith(b"# This message contains a parameter event.")
     assert events.metadata["offered_qos_profiles"].startswith("- history")
     assert events.metadata["topic_type_hash"].startswith("RIHS01_")
+    assert services.schema is not None
+    assert (services.schema.encoding, services.schema.name) == (
+        "ros2msg",
+        "example_interfaces/srv/AddTwoInts_Event",
+    )
+    assert b"---" in services.schema.data
 
 
 @needs_data
