@@ -214,6 +214,8 @@ def describe(
         lost += summary.losses
         entry.stored_bytes += summary.size
         entry.chunks += len(summary.table.chunks)
+        entry.attachments += len(summary.attachments)
+        entry.metadata_records += len(summary.metadata)
     entry.segments = len(inventory.summaries)
     entry.stored_bytes += sum(file["bytes"] for file in entry.payloads)
     entry.end = dict(end) if end is not None else {}

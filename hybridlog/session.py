@@ -485,14 +485,22 @@ class Session:
         return self.snapshot().topics
 
     def channels(self, recording: RecordingEntry) -> list[RecordedChannel]:
-        """The channels of a recording, with their codecs."""
+        """The channels of a recording, with their codecs.
+
+        Where a topic has messages, its channels without any are left out: they must not change
+        the columns of an answer.
+        """
         found = self._channels.get(recording.id)
         if found is None:
-            by_id = self._read_channels(recording)
+            by_id = self.definitions(recording)
             known = {c.id: (c.stats, c.reason) for c in recording.channels}
+            counts = recording.messages_by_topic()
             found = [
                 RecordedChannel(recording, i, channel, *known.get(i, (ChannelStats(), None)))
                 for i, channel in sorted(by_id.items())
+                if recording.status == "open"
+                or not counts[channel.topic]
+                or (i in known and known[i][0].messages)
             ]
             self._channels[recording.id] = found
         return found
@@ -603,7 +611,8 @@ class Session:
         self._resolved = lru_cache(_MAX_MEANINGS)(self._resolve)
         self._parsed = lru_cache(_MAX_MEANINGS)(self._parse)
 
-    def _read_channels(self, recording: RecordingEntry) -> Mapping[int, Channel]:
+    def definitions(self, recording: RecordingEntry) -> Mapping[int, Channel]:
+        """All channels of a recording by id, also those without messages."""
         wanted = {c.schema for c in recording.channels if c.schema is not None}
         if not wanted <= self._schemas.keys():
             with suppress(CatalogError):

@@ -41,6 +41,7 @@ from hybridlog_storage.settings import (
 if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
+    from hybridlog.attachments import StoredAttachment, StoredMetadata
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
@@ -335,6 +336,34 @@ class Store:
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
         return self.session.topics()
+
+    def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
+        """The attachments of a recording's log, in their order.
+
+        Args:
+            recording: Its label, name or id, the beginning of one, or its entry.
+
+        Raises:
+            TopicError: It does not exist.
+            SegmentError: A segment is damaged.
+        """
+        from hybridlog.attachments import attachments_of
+
+        return [each for e in self.select([recording]) for each in attachments_of(self.session, e)]
+
+    def metadata(self, recording: str | RecordingEntry) -> list[StoredMetadata]:
+        """The metadata records of a recording's log, in their order.
+
+        Args:
+            recording: Its label, name or id, the beginning of one, or its entry.
+
+        Raises:
+            TopicError: It does not exist.
+            SegmentError: A segment is damaged.
+        """
+        from hybridlog.attachments import metadata_of
+
+        return [each for e in self.select([recording]) for each in metadata_of(self.session, e)]
 
     # Questions.
 

@@ -518,6 +518,7 @@ def public(thing: type) -> dict[str, Any]:
 def documented_classes() -> list[type]:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
+    from hybridlog.attachments import StoredAttachment
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.imports import ImportReport
@@ -536,7 +537,7 @@ def documented_classes() -> list[type]:
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
     answers = [Rehearsal, Lost, FieldStatistics, Aligned, Synced, Intervals, Interval]
-    asking = [Recordings, hl.Query, hl.Message, *answers]
+    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 

@@ -37,6 +37,7 @@ COMMANDS: Final = (
     "stats",
     "sql",
     "export",
+    "attachments",
     "index",
     "reindex",
     "verify",

@@ -19,6 +19,7 @@ from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.attachments import Extras
     from hybridlog.choice import Choice
     from hybridlog.query.query import Query
 
@@ -45,6 +46,9 @@ _EXACT = {"mcap", "bag"}
 @options.between
 @options.no_latched
 @options.original_times
+@click.option(
+    "--no-attachments", is_flag=True, help="Leave out attachments; they are in MCAP files only."
+)
 @options.tag_columns
 @options.force
 @options.mongo
@@ -59,6 +63,7 @@ def command(
     between: tuple[str, str] | None,
     no_latched: bool,
     original_times: bool,
+    no_attachments: bool,
     tags: str | None,
     force: bool,
     mongo: str | None,
@@ -81,7 +86,10 @@ def command(
         if tags is not None:
             query = query.tags(*parse_fields(tags, "--tags"))
         if form in _EXACT:
-            _write_file(query, form, target, front, force=force, quiet=quiet)
+            extras = query.extras()
+            if no_attachments:
+                extras = extras._replace(attachments=[], left_out=0)
+            _write_file(query, form, target, front, extras, force=force, quiet=quiet)
         else:
             _write_directory(query, form, target, force=force, quiet=quiet)
         if not quiet:
@@ -101,11 +109,25 @@ def _form(target: Path) -> str:
 
 
 def _write_file(
-    query: Query, form: str, target: Path, front: Front, *, force: bool, quiet: bool
+    query: Query,
+    form: str,
+    target: Path,
+    front: Front,
+    extras: Extras,
+    *,
+    force: bool,
+    quiet: bool,
 ) -> None:
     with if_stopped(f"{target} is not written."), replacing(target, form=form, force=force):
-        write_answer(query, form, target, front=front, quiet=quiet)
-    _print_written(target, query, 0, quiet=quiet)
+        write_answer(query, form, target, front=front, extras=extras, quiet=quiet)
+    counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
+    beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
+    _print_written(target, query, 0, "" if form == "bag" else beside, quiet=quiet)
+    if beside and form == "bag":
+        output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
+    if extras.left_out and form == "mcap":
+        left_out = output.counted(extras.left_out, "attachment")
+        output.note(f"{left_out} from behind the time range: left out.")
 
 
 def _write_directory(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
@@ -153,12 +175,14 @@ def _make(directory: Path) -> None:
         raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
 
 
-def _print_written(path: Path, query: Query, missing: int, *, quiet: bool) -> None:
+def _print_written(
+    path: Path, query: Query, missing: int, beside: str = "", *, quiet: bool
+) -> None:
     """Print a line about a file; --quiet leaves it out, unless messages are missing."""
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
     if missing or not quiet:
         output.note(
             f"{path}: {output.counted(query.counters.messages, 'message')}{left_out}"
-            f"{latched(query.counters)}, "
+            f"{latched(query.counters)}{beside}, "
             f"{output.size(path.stat().st_size)}"
         )

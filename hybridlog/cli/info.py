@@ -12,13 +12,20 @@ import click
 
 from hybridlog.choice import Choice
 from hybridlog.cli import coverage, options, output, recording_summary, sizes_table
+from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
+from hybridlog.wording import MOST_LISTED
+from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
+    from hybridlog.attachments import StoredAttachment, StoredMetadata
     from hybridlog.maintenance.sizes import Size, Sizes
+    from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
+
+_MAX_LINE = 100  # characters of a name and what follows it
 
 
 @click.command()
@@ -58,8 +65,9 @@ def command(
         is_one = choice == Choice.of(what) and opened.is_one(choice.name)
         index = opened.index_place
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
+        extras = {entry.id: _extras(opened, entry) for entry in chosen}
     if as_json:
-        full = [_as_dict(entry) for entry in chosen]
+        full = [_as_dict(entry, *extras[entry.id]) for entry in chosen]
         for about, entry in zip(full, chosen, strict=True):
             if entry.label in found:
                 about["sizes"] = [sizes_table.as_dict(row) for row in found[entry.label].rows]
@@ -70,11 +78,25 @@ def command(
     for number, entry in enumerate(chosen):
         if number:
             output.say()
-        _print_recording(entry, index)
+        _print_recording(entry, index, *extras[entry.id])
         if entry.label in found:
             output.say()
             of_one = found[entry.label]
             sizes_table.print_sizes(of_one.rows, of_one.total, topics=True)
+
+
+def _extras(
+    store: Store, entry: RecordingEntry
+) -> tuple[list[StoredAttachment], list[StoredMetadata]]:
+    """Attachments and metadata records of a recording; none of those that cannot be read."""
+    attachments: list[StoredAttachment] = []
+    metadata: list[StoredMetadata] = []
+    try:
+        attachments = store.attachments(entry)
+        metadata = store.metadata(entry)
+    except SegmentError as error:
+        output.note(f"{entry.label}: {error}")
+    return attachments, metadata
 
 
 def _sizes(of_all: Sizes) -> dict[str, Sizes]:
@@ -91,7 +113,9 @@ def _is_segment(what: str) -> bool:
     return looks and Path(what).exists()
 
 
-def _as_dict(entry: RecordingEntry) -> dict[str, Any]:
+def _as_dict(
+    entry: RecordingEntry, attachments: list[StoredAttachment], metadata: list[StoredMetadata]
+) -> dict[str, Any]:
     from hybridlog.entries import summary_of
 
     return {
@@ -101,6 +125,8 @@ def _as_dict(entry: RecordingEntry) -> dict[str, Any]:
         "losses": coverage.losses_of(entry),
         "notes": entry.notes,
         "marks": entry.marks,
+        "attachments": [attachment_as_dict(each) for each in attachments],
+        "metadata_records": [each._asdict() for each in metadata],
         "channels": [
             {
                 "topic": c.topic,
@@ -142,7 +168,12 @@ def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
     }
 
 
-def _print_recording(entry: RecordingEntry, index: str | None) -> None:
+def _print_recording(
+    entry: RecordingEntry,
+    index: str | None,
+    attachments: list[StoredAttachment],
+    metadata: list[StoredMetadata],
+) -> None:
     from hybridlog.entries import summary_of
     from hybridlog.query.times import format_duration, format_time
 
@@ -172,6 +203,8 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
         *(("", coverage.line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
+        *_cut("attachment", [f"{a.name} ({_content(a)})" for a in attachments]),
+        *_cut("metadata", [f"{m.name} ({', '.join(m.values)})" for m in metadata]),
         ("index", index or "MongoDB is unavailable"),
     ]
     output.print_table([("recording", "left"), (entry.label, "left")], rows)
@@ -196,6 +229,21 @@ def _print_recording(entry: RecordingEntry, index: str | None) -> None:
             for c in sorted(entry.channels, key=lambda c: c.topic)
         ],
     )
+
+
+def _content(attachment: StoredAttachment) -> str:
+    size = output.size(attachment.size)
+    return f"{attachment.media_type}, {size}" if attachment.media_type else size
+
+
+def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
+    """Rows of a table; the last one counts the lines that are left out."""
+    rows = [
+        (name, line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…")
+        for line in lines[:MOST_LISTED]
+    ]
+    more = len(lines) - len(rows)
+    return [*rows, (name, f"and {more} more")] if more else rows
 
 
 def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> list[str]:

@@ -453,6 +453,9 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
         "messages_surplus": sum(c.stats.surplus for c in entry.channels),
         "messages_skipped": report.skipped,
+        "attachments": entry.attachments,
+        "attachments_left_out": report.attachments_left_out,
+        "metadata_records": entry.metadata_records,
         "messages_latched": report.latched,
         "bytes_in": entry.source["bytes"],
         "bytes_stored": entry.stored_bytes,
@@ -484,6 +487,7 @@ def _print_one(path: Path, report: RecordReport) -> None:
             ("source", f"{path} ({entry.source['kind']})"),
             ("topics", str(_topics(report))),
             ("messages", f"{entry.messages}{left_out}"),
+            *_attachments(report),
             ("bytes in", output.size(taken)),
             ("bytes stored", output.size(entry.stored_bytes)),
             ("ratio", f"{_ratio(taken, entry.stored_bytes):.2f}"),
@@ -491,6 +495,14 @@ def _print_one(path: Path, report: RecordReport) -> None:
             ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
         ],
     )
+
+
+def _attachments(report: RecordReport) -> list[tuple[str, str]]:
+    """A row of the table, if the log has attachments."""
+    kept, left_out = report.entry.attachments, report.attachments_left_out
+    if not kept and not left_out:
+        return []
+    return [("attachments", f"{kept} ({left_out} left out)" if left_out else str(kept))]
 
 
 class _Figures(NamedTuple):

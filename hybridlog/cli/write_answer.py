@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.progress import progress_bar
+from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
-    from hybridlog.export.base import Target
+    from hybridlog.attachments import Extras
+    from hybridlog.export.base import LogWriter, Target
     from hybridlog.query.query import Query
 
 Progress = Callable[[], None]
@@ -30,7 +32,13 @@ class Front:
 
 
 def write_answer(
-    query: Query, form: str, target: Target, *, front: Front = Front(), quiet: bool = False
+    query: Query,
+    form: str,
+    target: Target,
+    *,
+    front: Front = Front(),
+    extras: Extras | None = None,
+    quiet: bool = False,
 ) -> int:
     """Write the answer of a query, all of it or nothing.
 
@@ -39,6 +47,7 @@ def write_answer(
         form: A format of `hybridlog.export.FORMATS`.
         target: Path or binary stream.
         front: The latched messages in front of the answer.
+        extras: What an MCAP file or a bag has beside messages; None for nothing.
         quiet: No progress bar.
 
     Returns:
@@ -54,17 +63,32 @@ def write_answer(
             bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
         if FORMATS[form].kind == "exact":
-            _write_exact(query, form, target, front, progress)
+            _write_exact(query, form, target, progress, front=front, extras=extras)
             return 0
         written = _write_rows(query, form, target, progress)
         return counters.messages - counters.reduced - written
 
 
-def _write_exact(query: Query, form: str, target: Target, front: Front, progress: Progress) -> None:
-    from hybridlog.export import open_batch_writer
+def _write_exact(
+    query: Query,
+    form: str,
+    target: Target,
+    progress: Progress,
+    *,
+    front: Front,
+    extras: Extras | None,
+) -> None:
+    from hybridlog.export import open_batch_writer, open_log_writer
 
     before = query.copy()
-    with open_batch_writer(form, target, profile=_profile(query)) as exact:
+    profile = _profile(query)
+    if extras is None:
+        writer = open_batch_writer(form, target, profile=profile)
+    else:
+        writer = log = open_log_writer(form, target, profile=profile)
+    with writer as exact:
+        if extras is not None:
+            _write_extras(log, extras)
         if form != "raw" and front.latched:
             for batch, channels in before.latched(original_times=front.original_times):
                 exact.write(batch, [c.channel for c in channels])
@@ -72,6 +96,21 @@ def _write_exact(query: Query, form: str, target: Target, front: Front, progress
             exact.write(batch, [c.channel for c in channels])
             progress()
     query.counters.add(before.counters)
+
+
+def _write_extras(log: LogWriter, extras: Extras) -> None:
+    log.declare(extras.channels)
+    for metadata in extras.metadata:
+        log.add_metadata(metadata.name, metadata.values)
+    for problem in extras.problems:
+        output.note(f"A metadata record is left out: {problem}")
+    for attachment in extras.attachments:
+        try:
+            checked = attachment.open()
+        except SegmentError as error:
+            output.note(f"The attachment {output.quoted(attachment.name)} is left out: {error}")
+            continue
+        log.add_attachment(checked)
 
 
 def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> int:

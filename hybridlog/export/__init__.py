@@ -1,7 +1,7 @@
 """Writers of files for other tools.
 
-`FORMATS` lists the formats; `open_batch_writer`, `open_table_writer` and `open_row_writer`
-open a writer by name, and import its module then.
+`FORMATS` lists the formats; `open_batch_writer`, `open_log_writer`, `open_table_writer` and
+`open_row_writer` open a writer by name, and import its module then.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from hybridlog.export.base import BatchWriter, RowWriter, TableWriter, Target
+    from hybridlog.export.base import BatchWriter, LogWriter, RowWriter, TableWriter, Target
 
 Kind = Literal["exact", "table", "rows"]
 
@@ -59,19 +59,33 @@ def open_batch_writer(name: str, target: Target, *, profile: str = "") -> BatchW
     Raises:
         UsageError: No such format, or the target cannot be written.
     """
-    if name == "mcap":
-        from hybridlog.export.mcap import McapWriter
-
-        return McapWriter(target, profile=profile)
-    if name == "bag":
-        from hybridlog.export.bag import BagWriter
-
-        return BagWriter(target)
     if name == "raw":
         from hybridlog.export.raw import open_raw_writer
 
         return open_raw_writer(target)
+    if name in {"mcap", "bag"}:
+        return open_log_writer(name, target, profile=profile)
     raise _no_such_format(name, "exact")
+
+
+def open_log_writer(name: str, target: Target, *, profile: str = "") -> LogWriter:
+    """Open a writer of logs.
+
+    Args:
+        name: `mcap` or `bag`.
+        target: Path, or a binary stream such as standard output.
+        profile: MCAP profile (`ros1`, `ros2` or empty); bags have none.
+
+    Raises:
+        UsageError: The target cannot be written.
+    """
+    if name == "bag":
+        from hybridlog.export.bag import BagWriter
+
+        return BagWriter(target)
+    from hybridlog.export.mcap import McapWriter
+
+    return McapWriter(target, profile=profile)
 
 
 def open_table_writer(name: str, target: Target, *, schema: pa.Schema | None = None) -> TableWriter:

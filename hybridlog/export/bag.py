@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal, cast
@@ -22,6 +22,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
+    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Channel, Schema
 
 _TIME_LIMIT = 2**32 * 10**9
@@ -100,6 +101,19 @@ class BagWriter(FileWriter):
                 strict=True,
             ):
                 write(connections[channel], log_time, view[start : start + length])
+
+    def declare(self, channels: Sequence[Channel]) -> None:
+        """Add channels, which need have no messages; those that fit into no bag are left out."""
+        with failures(self._name):
+            for channel in channels:
+                if channel.message_encoding == "ros1" and channel.schema is not None:
+                    self._connection(channel)
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Do nothing: a bag has no metadata records."""
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Do nothing: a bag has no attachments."""
 
     def _connection(self, channel: Channel) -> Connection:
         connection = self._known.get(channel)

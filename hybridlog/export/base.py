@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
+    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Buffer, Channel
 
 Target: TypeAlias = "str | os.PathLike[str] | BinaryIO"
@@ -76,6 +77,19 @@ class BatchWriter(Writer, Protocol):
             channels: `batch.channel` indexes these. Channels of equal content, in one
                 call or several, become one.
         """
+
+
+class LogWriter(BatchWriter, Protocol):
+    """A writer of logs, which have more than payloads."""
+
+    def declare(self, channels: Sequence[Channel]) -> None:
+        """Add channels, which need have no messages."""
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Add an attachment, piece by piece."""
 
 
 class TableWriter(Writer, Protocol):

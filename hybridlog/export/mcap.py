@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import IO, TYPE_CHECKING, Any, Literal, cast
 
 from mcap.writer import CompressionType, Writer
 
 from hybridlog.export.base import FileWriter, Sink, Target
+from hybridlog_storage.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Batch, Channel, Schema
+    from mcap.records import AttachmentIndex, Statistics
 
-OWN_METADATA = "hybridlog."
-"""Prefix of the store's channel metadata keys, which are not exported."""
+    from hybridlog_storage.attachments import Attachment
+    from hybridlog_storage.messages import Batch, Channel, Schema
 
 _ChannelKey = tuple[str, str, int, tuple[tuple[str, str], ...]]
 
 
 def source_metadata(channel: Channel) -> dict[str, str]:
     """A channel's metadata without the keys added by the store."""
-    return {
-        key: value for key, value in channel.metadata.items() if not key.startswith(OWN_METADATA)
-    }
+    return {key: value for key, value in channel.metadata.items() if not key.startswith(OUR_NAMES)}
+
+
+class _Writer(Writer):
+    """The writer of the mcap package, which otherwise needs an attachment in memory.
+
+    Its private names begin with its own name, and so do those of this class.
+    """
+
+    __attachment_indexes: list[AttachmentIndex]
+    __statistics: Statistics
+
+    def note_attachment(self, index: AttachmentIndex) -> None:
+        """List an attachment whose record was written into the output just now."""
+        self.__attachment_indexes.append(index)
+        self.__statistics.attachment_count += 1
 
 
 class McapWriter(FileWriter):
@@ -49,7 +63,7 @@ class McapWriter(FileWriter):
         self._ids: dict[_ChannelKey, int] = {}
         self._known: dict[Channel, int] = {}
         try:
-            self._writer = Writer(
+            self._writer = _Writer(
                 cast("IO[Any]", self._sink),
                 chunk_size=chunk_size,
                 compression=CompressionType[compression.upper()],
@@ -80,6 +94,27 @@ class McapWriter(FileWriter):
             # The writer copies the bytes into its chunk at once.
             payload = cast("bytes", view[start : start + length])
             add(ids[channel], log_time, payload, publish_time, sequence)
+
+    def declare(self, channels: Sequence[Channel]) -> None:
+        """Add channels, which need have no messages."""
+        for channel in channels:
+            self._channel(channel)
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+        self._writer.add_metadata(name, dict(values))
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Add an attachment, piece by piece.
+
+        Raises:
+            SegmentError: Its file is shorter than before.
+            DiskFullError: No space left.
+        """
+        offset = self._sink.tell()
+        for piece in attachment.record():
+            self._sink.write(piece)
+        self._writer.note_attachment(attachment.index(offset, self._sink.tell() - offset))
 
     def _channel(self, channel: Channel) -> int:
         number = self._known.get(channel)

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.across.align import Aligned
+    from hybridlog.attachments import Extras
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.message import Message
     from hybridlog.query.answers.field_statistics import FieldStatistics
@@ -491,6 +492,16 @@ class Query:
         self.counters.reset()
         return in_force(self._session, self.question, self.counters, original_times=original_times)
 
+    def extras(self) -> Extras:
+        """What belongs to the answer as a slice of the recordings, beside its messages.
+
+        Raises:
+            SegmentError: A segment is damaged.
+        """
+        from hybridlog.attachments import extras_of
+
+        return extras_of(self._session, self.question)
+
     def count(self) -> int:
         """Number of messages."""
         with self.counters.timed():
@@ -779,7 +790,8 @@ class Query:
     def encodings(self) -> set[str]:
         """The encodings of the messages."""
         examples = Planner(self._session, self.question, self.counters).examples
-        return {channel.channel.message_encoding for channel in examples}
+        spoken = [channel for channel in examples if channel.stats.messages]
+        return {channel.channel.message_encoding for channel in spoken or examples}
 
     def doubtful(self) -> list[RecordingEntry]:
         """The recordings that have losses, have not ended, or are not proved to be whole."""

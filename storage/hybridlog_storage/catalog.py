@@ -205,6 +205,8 @@ class RecordingEntry:
         stored_bytes: Size of its segments and of its columns of payloads.
         segments: Number of segments.
         chunks: Number of chunks.
+        attachments: Number of attachments of its log.
+        metadata_records: Number of metadata records of its log.
         notes: Notes of users: `at` (ns) and `text`.
         marks: Marks set after it ended: `time` (ns), `text`, `tags`.
         spans: Number, first and last log time (ns) of each segment that has messages.
@@ -226,6 +228,8 @@ class RecordingEntry:
     stored_bytes: int = 0
     segments: int = 0
     chunks: int = 0
+    attachments: int = 0
+    metadata_records: int = 0
     notes: list[dict[str, Any]] = field(default_factory=list)
     marks: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[int, int, int]] = field(default_factory=list)

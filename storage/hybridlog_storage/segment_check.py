@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Self
 
 from hybridlog_storage.errors import SegmentError
@@ -9,7 +10,7 @@ from hybridlog_storage.mcap_scan import ScanDamage, ScannedChunk, scan
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from hybridlog_storage.chunk_table import ChunkTable
@@ -58,7 +59,7 @@ class SegmentCheck:
                 Byte and description, in file order; a damaged summary comes first.
         """
         if self._table is not None:
-            problems = list(damaged_pieces(self._reader, self._table, progress))
+            problems = list(damaged_pieces(self._reader, self._table, progress, self._names()))
             yield from problems
             if self.summary is None and not problems:
                 yield self._table.end, self._problem
@@ -76,9 +77,19 @@ class SegmentCheck:
                 if progress is not None:
                     progress(offset)
 
+    def _names(self) -> dict[int, str]:
+        """Descriptions of the records of the source, by their offset."""
+        if self.summary is None:
+            return {}
+        named = {m.offset: f"the metadata record {m.name!r}" for m in self.summary.metadata}
+        return named | {a.offset: f"the attachment {a.name!r}" for a in self.summary.attachments}
+
 
 def damaged_pieces(
-    reader: SegmentReader, table: ChunkTable, progress: Callable[[int], None] | None = None
+    reader: SegmentReader,
+    table: ChunkTable,
+    progress: Callable[[int], None] | None = None,
+    names: Mapping[int, str] = MappingProxyType({}),
 ) -> Iterator[tuple[int, str]]:
     """Find the parts of a segment that differ from their checksums.
 
@@ -86,11 +97,12 @@ def damaged_pieces(
         reader: The segment.
         table: The chunk table of its summary.
         progress: Called with the byte up to which the segment has been read.
+        names: Descriptions of records outside of chunks, by their offset.
 
     Yields:
         Byte and description, in file order.
     """
-    for start, length, crc, what in _pieces(table):
+    for start, length, crc, what in _pieces(table, names):
         try:
             if reader.checksum(start, length) != crc:
                 yield start, f"{what} changed: the checksum of {length} bytes differs"
@@ -100,16 +112,16 @@ def damaged_pieces(
             progress(start + length)
 
 
-def _pieces(table: ChunkTable) -> list[tuple[int, int, int, str]]:
+def _pieces(table: ChunkTable, names: Mapping[int, str]) -> list[tuple[int, int, int, str]]:
     """Start, length, checksum and description of every part in a table."""
     found: list[tuple[int, int, int, str]] = []
-    names = ("offset", "length", "trailer", "crc", "trailer_crc")
-    columns = (table.chunks[name].tolist() for name in names)
+    fields = ("offset", "length", "trailer", "crc", "trailer_crc")
+    columns = (table.chunks[name].tolist() for name in fields)
     rows = zip(*columns, strict=True)
     for number, (offset, length, trailer, crc, trailer_crc) in enumerate(rows):
         found.append((offset, length, crc, f"chunk {number}"))
         what = f"the message indexes or arrival numbers of chunk {number}"
         found.append((offset + length, trailer, trailer_crc, what))
     for offset, length, crc in table.others.tolist():
-        found.append((offset, length, crc, "bytes between chunks"))
+        found.append((offset, length, crc, names.get(offset, "bytes between chunks")))
     return sorted(found)

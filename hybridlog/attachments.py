@@ -1,0 +1,245 @@
+"""Attachments and metadata records of recorded logs, read from the segments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from hybridlog.export.base import Sink
+from hybridlog.query.ranges import RangeResolver
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import REDUCED
+
+if TYPE_CHECKING:
+    import os
+
+    from mcap.records import AttachmentIndex, MetadataIndex
+
+    from hybridlog.query.question import Question
+    from hybridlog.session import Session
+    from hybridlog_storage.attachments import Attachment
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segment_reader import SegmentSummary
+
+
+@dataclass(frozen=True, slots=True)
+class StoredAttachment:
+    """An attachment of a recording: a file that lay in the log beside its messages.
+
+    Attributes:
+        recording: Label of the recording.
+        name: Its name in the log; need be no valid file name, and need not be unique.
+        media_type: Its media type, such as `text/plain`.
+        size: Bytes of its content.
+        log_time_ns: Time at which it was recorded, ns; 0 if unknown.
+        create_time_ns: Time at which it was created, ns; 0 if unknown.
+    """
+
+    recording: str
+    name: str
+    media_type: str
+    size: int
+    log_time_ns: int
+    create_time_ns: int
+    open: Callable[[], Attachment] = field(repr=False, compare=False)
+    """Checks its bytes, and gives the record with them."""
+
+    def pieces(self) -> Iterator[bytes]:
+        """Its content, checked, in pieces of at most 4 MiB.
+
+        Raises:
+            SegmentError: It is damaged; nothing was given then.
+        """
+        return self.open().pieces()
+
+    def read(self) -> bytes:
+        """Its whole content, checked.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        return b"".join(self.pieces())
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write its content to a file, which appears when it is complete.
+
+        Raises:
+            SegmentError: It is damaged.
+            UsageError: The file cannot be written.
+            DiskFullError: No space.
+        """
+        pieces = self.pieces()
+        sink = Sink(path)
+        try:
+            for piece in pieces:
+                sink.write(piece)
+            sink.commit()
+        except BaseException:
+            sink.abort()
+            raise
+        return Path(path)
+
+
+class StoredMetadata(NamedTuple):
+    """A metadata record of a recording.
+
+    Attributes:
+        name: Its name; need not be unique.
+        values: Its values by key.
+    """
+
+    name: str
+    values: dict[str, str]
+
+
+class Extras(NamedTuple):
+    """What the recordings of a question have beside their messages.
+
+    Attributes:
+        channels: Channels of its topics, also those without messages.
+        attachments: Those from before the end of the time range, in the order of the log.
+        metadata: All metadata records.
+        left_out: Number of attachments from behind the time range.
+        problems: Reason for each metadata record that cannot be read.
+    """
+
+    channels: list[Channel]
+    attachments: list[StoredAttachment]
+    metadata: list[StoredMetadata]
+    left_out: int
+    problems: list[str]
+
+
+def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttachment]:
+    """The attachments of a recording, in the order of the log.
+
+    Raises:
+        SegmentError: A segment is damaged.
+    """
+    if not entry.attachments:
+        return []
+    found: list[StoredAttachment] = []
+    for number, summary in _summaries(session, entry):
+        for index in summary.attachments:
+            source = partial(_open, session, entry.id, number, summary.table, index)
+            found.append(
+                StoredAttachment(
+                    recording=entry.label,
+                    name=index.name,
+                    media_type=index.media_type,
+                    size=index.data_size,
+                    log_time_ns=index.log_time,
+                    create_time_ns=index.create_time,
+                    open=source,
+                )
+            )
+    return found
+
+
+def metadata_of(session: Session, entry: RecordingEntry) -> list[StoredMetadata]:
+    """The metadata records of a recording's log, in their order.
+
+    Raises:
+        SegmentError: A segment is damaged.
+    """
+    return [read() for read in _metadata_records(session, entry)]
+
+
+def extras_of(session: Session, question: Question) -> Extras:
+    """What a slice has beside its messages.
+
+    Raises:
+        SegmentError: A segment is damaged.
+        TimeError: The range is empty, or outside all recordings.
+    """
+    found = Extras([], [], [], 0, [])
+    left_out = 0
+    topics = set(question.topics)
+    for summary, bounds, _ in RangeResolver(session, question).resolve():
+        entry = session.entry_of(summary)
+        found.channels.extend(
+            channel
+            for _, channel in sorted(session.definitions(entry).items())
+            if channel.topic in topics and channel.message_encoding != REDUCED
+        )
+        for read in _metadata_records(session, entry):
+            try:
+                found.metadata.append(read())
+            except SegmentError as error:
+                found.problems.append(str(error))
+        end = None if bounds is None or question.clock != "log" else bounds[1]
+        for attachment in attachments_of(session, entry):
+            if end is None or attachment.log_time_ns < end:
+                found.attachments.append(attachment)
+            else:
+                left_out += 1
+    return found._replace(left_out=left_out)
+
+
+def _metadata_records(
+    session: Session, entry: RecordingEntry
+) -> Iterator[Callable[[], StoredMetadata]]:
+    """A function for each metadata record of a recording, which reads it."""
+    if entry.metadata_records:
+        for number, summary in _summaries(session, entry):
+            for index in summary.metadata:
+                yield partial(_read, session, entry.id, number, summary.table, index)
+
+
+def _summaries(session: Session, entry: RecordingEntry) -> Iterator[tuple[int, SegmentSummary]]:
+    for number in sorted(map(int, entry.digests)):
+        yield number, session.segment(entry.id, number).summary()
+
+
+def _open(
+    session: Session, recording: str, number: int, table: ChunkTable, index: AttachmentIndex
+) -> Attachment:
+    return session.segment(recording, number).attachment(table, index)
+
+
+def _read(
+    session: Session, recording: str, number: int, table: ChunkTable, index: MetadataIndex
+) -> StoredMetadata:
+    record = session.segment(recording, number).metadata(table, index)
+    return StoredMetadata(record.name, dict(record.metadata))
+
+
+def file_names(attachments: list[StoredAttachment]) -> list[str]:
+    """A file name for each attachment, made from its name.
+
+    They are valid on all systems, hide no file, leave no directory, and differ also where case
+    does not count.
+    """
+    taken: set[str] = set()
+    next_number: dict[str, int] = {}
+    found: list[str] = []
+    for attachment in attachments:
+        name = plain = _file_name(attachment.name)
+        stem, suffix = Path(plain).stem, Path(plain).suffix
+        number = next_number.get(plain.casefold(), 2)
+        while name.casefold() in taken:
+            name = f"{stem}-{number}{suffix}"
+            number += 1
+        next_number[plain.casefold()] = number
+        taken.add(name.casefold())
+        found.append(name)
+    return found
+
+
+_LONGEST = 200  # bytes of a file name
+_FORBIDDEN = frozenset('/\\:*?"<>|')
+
+
+def _file_name(name: str) -> str:
+    plain = "".join("_" if c in _FORBIDDEN or not c.isprintable() else c for c in name)
+    plain = plain.strip(" ").lstrip(".").rstrip(".") or "attachment"
+    if len(plain.encode()) <= _LONGEST:
+        return plain
+    suffix = Path(plain).suffix[:20]
+    room = _LONGEST - len(suffix.encode())
+    return plain.encode()[:room].decode(errors="ignore") + suffix
