@@ -11,9 +11,12 @@ import os
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from hybridlog.losses import Cause, extent_of, joined, topics_of
 from hybridlog_storage import journal
@@ -24,9 +27,11 @@ from hybridlog_storage.catalog import (
     channel_entry,
     channel_totals,
 )
+from hybridlog_storage.directory import PAYLOADS
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import Sealed, sealed_channels
+from hybridlog_storage.segment_format import MOVED_SIZE
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
@@ -35,7 +40,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.directory import Listing, StoreDirectory
-    from hybridlog_storage.journal import JournalState, SealedSegment
+    from hybridlog_storage.journal import JournalState, PayloadFile, SealedSegment
 
     Stamps = Callable[[RecordingEntry, int, ChunkTable], NDArray[Any] | None]
     Reason = Callable[[int, Channel], str | None]
@@ -85,6 +90,8 @@ class Inventory:
         listing: Names of its files.
         state: State of the journal; None without one.
         summaries: Summaries of valid segments, by number.
+        stored: Digest and size of the files of segments with moved chunks, by number. Their
+            summaries have the digest of the segment as it was before.
         misfits: Files that differ from the journal.
         lost: Listed segments that are missing or changed.
     """
@@ -93,6 +100,7 @@ class Inventory:
     listing: Listing
     state: JournalState | None
     summaries: dict[int, SegmentSummary] = field(default_factory=dict)
+    stored: dict[int, tuple[str, int]] = field(default_factory=dict)
     misfits: list[Misfit] = field(default_factory=list)
     lost: list[SealedSegment] = field(default_factory=list)
 
@@ -103,6 +111,22 @@ class Inventory:
             return self.state.id
         ids = Counter(str(s.recording.get("id", "")) for s in self.summaries.values())
         return ids.most_common(1)[0][0] if ids else ""
+
+    @property
+    def payloads(self) -> dict[str, PayloadFile]:
+        """Files of columns of payloads, as the journal and the segments list them."""
+        found: dict[str, PayloadFile] = {}
+        for summary in self.summaries.values():
+            if summary.compacted is not None:
+                with suppress(KeyError, TypeError, ValueError):
+                    files = cast("Iterable[Mapping[str, Any]]", summary.compacted["files"])
+                    found.update({file.file: file for file in journal.payload_files(files)})
+        return found | (self.state.payloads if self.state is not None else {})
+
+    def stored_file(self, number: int) -> tuple[str, int]:
+        """Digest and size of the file of a valid segment."""
+        summary = self.summaries[number]
+        return self.stored.get(number, (summary.digest, summary.size))
 
     @property
     def end(self) -> Mapping[str, Any] | None:
@@ -135,6 +159,8 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
     found = Inventory(label, listing, state)
     listed = state.sealed if state is not None else {}
     numbers = {sealed.digest: number for number, sealed in listed.items()}
+    for number, written in (state.thinned if state is not None else {}).items():
+        numbers.update(dict.fromkeys((digest for digest, _ in written), number))
     for number, name in listing.sealed.items():
         try:
             found.summaries[number] = read_summary(path / name, number)
@@ -143,7 +169,7 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
     recording = found.id
     for number, summary in list(found.summaries.items()):
         name = listing.sealed[number]
-        problem = _difference(summary, number, listed.get(number), recording)
+        problem = _difference(found, summary, number, recording)
         if problem is not None:
             del found.summaries[number]
             belongs = numbers.get(summary.digest)
@@ -162,17 +188,47 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
 
 
 def _difference(
-    summary: SegmentSummary, number: int, sealed: SealedSegment | None, recording: str
+    inventory: Inventory, summary: SegmentSummary, number: int, recording: str
 ) -> str | None:
-    """The difference of a whole segment from the journal; None if it matches."""
+    """The difference of a whole segment from the journal; None if it matches.
+
+    A segment with moved chunks gets the digest that it had before.
+    """
     its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
     if its_id != recording:
         return f"it is a segment of another recording, {its_id}"
     if its_number != number:
         return f"it is segment {its_number} of this recording"
-    if sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
+    state = inventory.state
+    sealed = state.sealed.get(number) if state is not None else None
+    before = _before_thinning(state, summary, number)
+    if before is not None:
+        inventory.stored[number] = summary.digest, summary.size
+        inventory.summaries[number] = replace(summary, digest=before)
+    elif sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
         return "it is not the segment that the journal lists: an older or a changed one"
     return None
+
+
+def _before_thinning(
+    state: JournalState | None, summary: SegmentSummary, number: int
+) -> str | None:
+    """The digest of a segment with moved chunks before that; None for others.
+
+    Where lines of the journal are lost, the segment itself says it.
+    """
+    if summary.compacted is None:
+        return None
+    said = summary.compacted.get("digest")
+    sealed = state.sealed.get(number) if state is not None else None
+    is_listed = state is not None and (summary.digest, summary.size) in state.thinned.get(
+        number, ()
+    )
+    if not is_listed and state is not None and state.is_proof:
+        return None
+    if not isinstance(said, str) or (sealed is not None and sealed.digest != said):
+        return None
+    return said
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -221,6 +277,7 @@ def describe(
     entry.end = dict(end) if end is not None else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_crash(inventory)
+    ours += _losses_of_columns(inventory)
     ours += _losses_of_chunks(inventory, damage)
     entry.status = _status(inventory, end, is_open=is_open, has_losses=bool(ours))
     if lost or ours:
@@ -317,7 +374,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
     if state is not None:
         entry.notes = list(state.notes)
         entry.marks = list(state.marks)
-        entry.payloads = [asdict(file) for file in state.payloads.values()]
+    entry.payloads = [asdict(file) for file in inventory.payloads.values()]
     return entry
 
 
@@ -356,6 +413,36 @@ def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
                 reason = "a crash took what was written last"
                 rows.append(_loss(before.file, reason, {**channel, "messages": count}))
     return rows
+
+
+def _losses_of_columns(inventory: Inventory) -> list[dict[str, Any]]:
+    """Rows for missing or changed files of columns, if segments do not hold the messages."""
+    rows = []
+    for file in inventory.payloads.values():
+        size = inventory.listing.payloads.get(file.file)
+        if size == file.bytes:
+            continue
+        spans = [span for s in inventory.summaries.values() if (span := _moved_span(s, file.topic))]
+        if spans:
+            problem = "is missing" if size is None else "has another size"
+            lost = {
+                "topic": file.topic,
+                "messages": file.messages,
+                "first": min(first for first, _ in spans),
+                "last": max(last for _, last in spans),
+            }
+            name = f"{PAYLOADS}/{file.file}"
+            rows.append(_loss(name, f"a file of columns {problem}", lost, length=file.bytes))
+    return rows
+
+
+def _moved_span(summary: SegmentSummary, topic: str) -> tuple[int, int] | None:
+    """First and last log time of the messages of a topic in moved chunks; None without any."""
+    table = summary.table
+    is_moved = np.repeat(table.chunks["length"] == MOVED_SIZE, table.chunks["parts"])
+    channels = [number for number, channel in summary.channels.items() if channel.topic == topic]
+    parts = table.parts[is_moved & np.isin(table.parts["channel"], channels)]
+    return (int(parts["first"].min()), int(parts["last"].max())) if len(parts) else None
 
 
 def _losses_of_chunks(
@@ -450,9 +537,13 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
             journal.event(journal.NOTED, text=n["text"]) | {"at": n["at"]} for n in state.notes
         ]
         lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
-        if state.payloads:
-            listed_files = [asdict(file) for file in state.payloads.values()]
-            lines.append(journal.event(journal.COMPACTED, files=listed_files))
+    if inventory.payloads:
+        files = [asdict(file) for file in inventory.payloads.values()]
+        segments = [
+            {"segment": number, "digest": digest, "bytes": size}
+            for number, (digest, size) in inventory.stored.items()
+        ]
+        lines.append(journal.event(journal.COMPACTED, files=files, segments=segments))
     if inventory.end is not None:
         lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
     return lines
@@ -468,7 +559,10 @@ def sealed_line(inventory: Inventory, number: int) -> journal.Event:
     summary = inventory.summaries[number]
     channels = sealed_channels(summary.table, summary.channels)
     file = inventory.listing.sealed[number]
-    return sealed_event(Sealed(number, file, summary.size, summary.digest, channels))
+    size = summary.size
+    if number in inventory.stored and summary.compacted is not None:
+        size = int(cast(int, summary.compacted.get("bytes", size)))
+    return sealed_event(Sealed(number, file, size, summary.digest, channels))
 
 
 def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:

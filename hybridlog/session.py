@@ -20,6 +20,7 @@ from hybridlog.maintenance.opening import (
     repair_on_open,
 )
 from hybridlog.maintenance.report import Progress, RepairReport
+from hybridlog.payloads.contents import MovedContents, open_segment
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
@@ -42,9 +43,12 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from hybridlog.guarded import Belief, GuardedIndex
+    from hybridlog.payloads.reader import PayloadReader
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
     from hybridlog.snapshot import Snapshot
@@ -107,6 +111,7 @@ class Session:
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, list[RecordedChannel]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
+        self._contents: dict[Path, MovedContents] = {}
         self._chunk_lists = ChunkLists()
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and made if missing
         self._lock = threading.Lock()
@@ -684,9 +689,26 @@ class Session:
             if reader is None:
                 _make_room(self._segments)
                 path = self.directory.recording(self.entry(recording).label)
-                reader = SegmentReader(path / f"{number:06d}.mcap", number)
+                reader = open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path))
                 self._segments[key] = reader
             return reader
+
+    def payload_readers(self, recording: RecordingEntry, topic: str) -> list[PayloadReader] | None:
+        """Files of columns of a topic in order of time; None if they cannot be used."""
+        with self._lock:
+            contents = self._contents_of(self.directory.recording(recording.label))
+        try:
+            return contents.payloads().ordered(topic)
+        except StoreError:
+            return None
+
+    def _contents_of(self, recording: Path) -> MovedContents:
+        """The content of moved chunks, shared by the segments of a recording."""
+        found = self._contents.get(recording)
+        if found is None:
+            _make_room(self._contents)
+            found = self._contents[recording] = MovedContents(recording)
+        return found
 
     @cached_property
     def tables(self) -> Tables:
@@ -723,6 +745,7 @@ class Session:
         self._schemas = {}
         self._channels.clear()
         with self._lock:
+            self._contents.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
         self._chunk_lists.clear()
         self.recent_chunks.clear()
@@ -737,6 +760,7 @@ class Session:
             for reader in self._segments.values():
                 reader.close()
             self._segments.clear()
+            self._contents.clear()
         self.recent_chunks.clear()
         self._tables_tried.clear()
         if "tables" in vars(self):

@@ -15,7 +15,12 @@ from hybridlog.choice import Choice
 from hybridlog.entries import text
 from hybridlog.field_indexes import FieldIndex
 from hybridlog.losses import extent_of
-from hybridlog.maintenance.report import Progress, RepairReport, being_written
+from hybridlog.maintenance.report import (
+    CompactedTopic,
+    Progress,
+    RepairReport,
+    being_written,
+)
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
@@ -45,7 +50,6 @@ if TYPE_CHECKING:
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
-    from hybridlog.maintenance.compact import CompactedTopic
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
@@ -775,6 +779,7 @@ class Store:
         topics: Sequence[str] | None = None,
         *,
         older_than_ns: int = 0,
+        drop_mcap: bool = False,
         dry_run: bool = False,
         progress: Progress | None = None,
     ) -> list[CompactedTopic]:
@@ -785,6 +790,8 @@ class Store:
             topics: Topics, as for `topic`; None for those that consist of arrays mostly: laser
                 scans, point clouds, images and other arrays of numbers.
             older_than_ns: Only recordings whose last message is at least as old, ns.
+            drop_mcap: True to take payloads that are in columns out of the segments. Every
+                message is rebuilt and compared before.
             dry_run: True to say what would be done, and write nothing.
             progress: Called after each chunk.
 
@@ -802,24 +809,27 @@ class Store:
         wanted = None if topics is None else set(self.topic(*topics).topics)
         before = time.time_ns() - older_than_ns
         found: list[CompactedTopic] = []
-        for entry in self.select(recordings):
-            if recordings is None and entry.status in {"open", "unfinished"}:
-                continue
-            if older_than_ns and (entry.span is None or entry.span[1] > before):
-                continue
-            found += compact(
-                self.directory,
-                self.catalog,
-                entry,
-                topics=wanted,
-                dry_run=dry_run,
-                progress=progress,
-            )
-            connected = self.session.connected
-            if not dry_run and connected is not None and self.session.connection.may_write:
-                with suppress(ConnectionLostError):  # the next connection mirrors it
-                    index.mirror(self.catalog, connected, entry.id)
-        self.refresh()
+        try:
+            for entry in self.select(recordings):
+                if recordings is None and entry.status in {"open", "unfinished"}:
+                    continue
+                if older_than_ns and (entry.span is None or entry.span[1] > before):
+                    continue
+                found += compact(
+                    self.directory,
+                    self.catalog,
+                    entry,
+                    topics=wanted,
+                    drop_mcap=drop_mcap,
+                    dry_run=dry_run,
+                    progress=progress,
+                )
+                connected = self.session.connected
+                if not dry_run and connected is not None and self.session.connection.may_write:
+                    with suppress(ConnectionLostError):  # the next connection mirrors it
+                        index.mirror(self.catalog, connected, entry.id)
+        finally:
+            self.refresh()
         return found
 
     def remove(self, recording: str) -> None:

@@ -76,6 +76,7 @@ SLOW = frozenset(
         "benchmarks/test_queries.py",
         "benchmarks/test_throughput.py",
         "payloads/test_compact.py",
+        "payloads/test_drop.py",
         "cli/test_coverage.py",
         "cli/test_export.py",
         "cli/test_fetch.py",

@@ -16,7 +16,7 @@ from hybridlog.cli.signals import if_stopped
 
 if TYPE_CHECKING:
     from hybridlog.choice import Choice
-    from hybridlog.maintenance.compact import CompactedTopic
+    from hybridlog.maintenance.report import CompactedTopic
 
 
 @click.command()
@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     "--older-than",
     metavar="DURATION",
     help="Only recordings whose last message is at least this old, such as 1d.",
+)
+@click.option(
+    "--drop-mcap",
+    is_flag=True,
+    help="Take payloads that are in columns out of the segments.",
 )
 @click.option("--dry-run", is_flag=True, help="Only say what would be done.")
 @options.store
@@ -37,6 +42,7 @@ def command(
     choice: Choice,
     topic: tuple[str, ...],
     older_than: str | None,
+    drop_mcap: bool,
     dry_run: bool,
     store: Path | None,
     mongo: str | None,
@@ -61,6 +67,7 @@ def command(
             None if choice.is_everything else recordings_of(opened, choice),
             topic or None,
             older_than_ns=age,
+            drop_mcap=drop_mcap,
             dry_run=dry_run,
             progress=Stages(bar),
         )
@@ -83,6 +90,10 @@ def _told(one: CompactedTopic, *, dry_run: bool) -> str:
             f"{one.messages} messages, {output.size(one.payload_bytes)}, in columns of "
             f"{output.size(one.column_bytes)}"
         )
+    if one.dropped:
+        parts.append(f"{one.dropped} messages taken out of the segments")
+    if one.both:
+        parts.append(f"{one.both} stay there, too: their chunks hold messages without columns")
     if one.kept:
         parts.append(f"{one.kept} without columns: {one.reason}")
     return f"{one.recording} {one.topic}: {'; '.join(parts)}"

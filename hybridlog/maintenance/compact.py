@@ -18,16 +18,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.entries import take_inventory
+from hybridlog.maintenance import thinning
 from hybridlog.maintenance.opening import put_entry
-from hybridlog.maintenance.report import being_written
+from hybridlog.maintenance.report import CompactedTopic, being_written
 from hybridlog.payloads import files as payload_files
+from hybridlog.payloads.contents import open_segment
 from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
 from hybridlog.tables.layout import table_schema_of, topic_folder
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.errors import DefinitionError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -49,29 +50,6 @@ if TYPE_CHECKING:
 
 _MIN_SHARE = 0.5  # of the sequences in the bytes of a topic's messages
 _MIN_BYTES = 128 << 10  # of a topic's messages: the footer of a file takes some kilobytes
-
-
-@dataclass(slots=True)
-class CompactedTopic:
-    """What `compact` did with a topic of a recording.
-
-    Attributes:
-        recording: Label of the recording.
-        topic: The topic.
-        messages: Messages whose payloads are in columns now.
-        payload_bytes: Bytes of these payloads.
-        column_bytes: Bytes of the files of columns; 0 in a dry run.
-        kept: Messages that stay in segments alone.
-        reason: Why they do; empty if there are none.
-    """
-
-    recording: str
-    topic: str
-    messages: int = 0
-    payload_bytes: int = 0
-    column_bytes: int = 0
-    kept: int = 0
-    reason: str = ""
 
 
 @dataclass(slots=True)
@@ -99,6 +77,7 @@ def compact(
     entry: RecordingEntry,
     *,
     topics: Collection[str] | None = None,
+    drop_mcap: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> list[CompactedTopic]:
@@ -109,11 +88,13 @@ def compact(
         catalog: Its catalog.
         entry: The recording.
         topics: Full names of the topics; None for those that consist of arrays mostly.
+        drop_mcap: True to take chunks that are in columns out of the segments.
         dry_run: True to write nothing.
         progress: Called after each chunk.
 
     Returns:
-        The topics; those that have columns already are left out.
+        The topics; those that have columns already are left out, unless their chunks are taken
+        out of the segments.
 
     Raises:
         StoreError: The recording is being written, or files cannot be read or written.
@@ -127,20 +108,27 @@ def compact(
         work = _Compaction(directory, entry.label, progress)
         chosen = work.choose(topics)
         reports = [*work.refused, *(topic.report for topic in chosen)]
-        if dry_run or not chosen:
+        if dry_run or not (chosen or drop_mcap):
             return reports
         try:
-            work.write(chosen)
-            work.prove(chosen)
-            listed = work.announce(chosen)
-            payload_files.publish(work.path, listed)
+            if chosen:
+                work.write(chosen)
+                work.prove(chosen)
+                listed = work.announce(chosen)
+                payload_files.publish(work.path, listed)
         except OSError as error:
             work.take_back()
             raise durability.explain(error, work.path, "writing columns of") from error
         except BaseException:
             work.take_back()
             raise
-        put_entry(directory, catalog, entry.label)
+        try:
+            if drop_mcap:
+                reports = thinning.drop(directory, entry.label, topics, reports, progress)
+        except OSError as error:
+            raise durability.explain(error, work.path, "replacing segments of") from error
+        finally:
+            put_entry(directory, catalog, entry.label)
         return reports
 
 
@@ -316,7 +304,7 @@ class _Compaction:
         wanted = {number for topic in topics for number in topic.channels}
         for number, summary in self._inventory.summaries.items():
             name = self._inventory.listing.sealed[number]
-            with SegmentReader(self.path / name, number) as reader:
+            with open_segment(self.path / name, number) as reader:
                 for place in summary.chunks:
                     if report:
                         self._done += 1

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from hybridlog.entries import take_inventory
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.maintenance.opening import put_entry
+from hybridlog.payloads.contents import open_segment
 from hybridlog_storage.catalog import stamps_of
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from typing import Any
@@ -64,7 +64,7 @@ def _decoded(
         if catalog.stamps(entry, number, summary.table) is None:
             stats: dict[int, dict[int, ChannelStats]] = {}
             path = directory.recording(entry.label) / inventory.listing.sealed[number]
-            with SegmentReader(path, number) as reader:
+            with open_segment(path, number) as reader:
                 for place in summary.chunks:
                     # An unreadable chunk has no results; reading it raises an error.
                     with suppress(SegmentError):

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import Inventory, take_inventory
 from hybridlog.maintenance.opening import clear_away
-from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.layout import IN_PAYLOADS, PAYLOADS
+from hybridlog.payloads.layout import IN_PAYLOADS
 from hybridlog_storage import durability, files, journal
-from hybridlog_storage.directory import IMPORTING
+from hybridlog_storage.directory import IMPORTING, PAYLOADS, payload_names
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.journal import JOURNAL, Journal
 from hybridlog_storage.segment_check import SegmentCheck
@@ -147,10 +146,11 @@ def _copy_segments(
     done = 0
     for number, summary in inventory.summaries.items():
         name = inventory.listing.sealed[number]
-        if not _is_there(path / name, summary.digest, summary.size):
+        digest, size = inventory.stored_file(number)
+        if not _is_there(path / name, digest, size):
             _copy(source.recording(inventory.label) / name, path / name)
             report.bytes_copied += summary.size
-            if not _is_there(path / name, summary.digest, summary.size):
+            if not _is_there(path / name, digest, size):
                 raise StoreError(
                     f"{source.recording(inventory.label) / name} is damaged: what was copied "
                     "does not match its checksums. `hybridlog verify` shows where."
@@ -172,7 +172,7 @@ def _copy_payloads(source: Path, path: Path, state: JournalState, report: Import
     from hybridlog.payloads.reader import PayloadReader
 
     try:
-        for name in payload_files.names_of(path):
+        for name in payload_names(path):
             if name not in listed:  # an import was interrupted
                 files.unlink(path / PAYLOADS / name, depth=IN_PAYLOADS)
         for file in listed.values():

@@ -15,6 +15,7 @@ from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import describe_inventory, put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
+from hybridlog.payloads.contents import MovedContents, open_segment
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import stamps_of
@@ -435,8 +436,9 @@ def _chunks(
     total = entry.stored_bytes
     before = 0
     path = directory.recording(entry.label)
+    contents = MovedContents(path)
     for number, _, _ in entry.spans:
-        with SegmentReader(path / f"{number:06d}.mcap", number) as reader:
+        with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
             summary = reader.summary()
             is_in_tables = tables.chunks_with(entry, summary.table, topics)
             for place in summary.chunks:

@@ -297,6 +297,8 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         Journal(path).append()
     if PARTS in listing.others:
         payload_files.publish(path, state.payloads if state is not None else {})
+    thinned = state.thinned if state is not None else {}
+    payload_files.replace_segments(path, listing.others, thinned)
     recovered = _recover_segments(directory, label, listing, state)
     inventory = take_inventory(directory, label)
     is_empty = not inventory.summaries and not (state is not None and state.sealed)
@@ -327,7 +329,8 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
-    return name == PARTS or bool(_LEFT_OVER.fullmatch(name) or _MOVING.fullmatch(name))
+    patterns = (_LEFT_OVER, _MOVING, payload_files.THINNED)
+    return name == PARTS or any(pattern.fullmatch(name) for pattern in patterns)
 
 
 def clear_away(directory: StoreDirectory, label: str) -> None:

@@ -11,12 +11,12 @@ from hybridlog.entries import journal_from_segments, sealed_line, take_inventory
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, reindex
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
+from hybridlog.payloads.contents import open_segment
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.recovery import rebuild_summary
-from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -207,7 +207,7 @@ def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEn
     """True if an unreadable chunk is readable again, after its file was restored."""
     for number, chunk in catalog.damage(entry.id):
         path = directory.recording(entry.label) / f"{number:06d}.mcap"
-        with suppress(SegmentError), SegmentReader(path, number) as reader:
+        with suppress(SegmentError), open_segment(path, number) as reader:
             reader.read_chunk(reader.summary().chunks[chunk])
             return True
     return False

@@ -44,6 +44,34 @@ class RepairReport:
     disk_full: DiskFullError | None = None
 
 
+@dataclass(slots=True)
+class CompactedTopic:
+    """What `compact` did with a topic of a recording.
+
+    Attributes:
+        recording: Label of the recording.
+        topic: The topic.
+        messages: Messages whose payloads are in columns now.
+        payload_bytes: Bytes of these payloads.
+        column_bytes: Bytes of the files of columns; 0 in a dry run.
+        dropped: Messages whose payloads were taken out of the segments.
+        both: After a removal from segments, messages that are in columns and still in segments,
+            because their chunks hold messages without columns, too.
+        kept: Messages that stay in segments alone.
+        reason: Why they do; empty if there are none.
+    """
+
+    recording: str
+    topic: str
+    messages: int = 0
+    payload_bytes: int = 0
+    column_bytes: int = 0
+    dropped: int = 0
+    both: int = 0
+    kept: int = 0
+    reason: str = ""
+
+
 def being_written(label: str) -> StoreError:
     """The error for a recording that another process holds."""
     return StoreError(f"Recording {label!r} is being written. Wait until it is done, or stop it.")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.payloads.contents import MovedContents, open_segment
 from hybridlog.tables.layout import (
     IN_TABLES,
     IN_TOPIC,
@@ -24,7 +25,6 @@ from hybridlog.tables.layout import (
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import files
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -148,8 +148,9 @@ def _chunks(
 ) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
     """Chunks with messages of some topics, in order; damaged ones are left out."""
     path = directory.recording(entry.label)
+    contents = MovedContents(path)
     for number, _, _ in entry.spans:
-        with SegmentReader(path / f"{number:06d}.mcap", number) as reader:
+        with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
             summary = reader.summary()
             is_wanted = chunks_with(entry, summary.table, topics)
             for place in summary.chunks:

@@ -11,9 +11,8 @@ from hybridlog.entries import take_inventory
 from hybridlog.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
-from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.layout import PAYLOADS
-from hybridlog_storage.directory import LOCK
+from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog_storage.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.index_documents import recording_key, with_prefix
 from hybridlog_storage.index_state import IndexState
@@ -180,6 +179,7 @@ class _Check:
         self._label = label
         self._result = result
         self._path = directory.recording(label)
+        self._contents = MovedContents(self._path)
         self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
         self._is_damaged = False
@@ -263,7 +263,7 @@ class _Check:
 
     def _payloads(self, inventory: Inventory) -> None:
         """Check every byte of the columns of payloads."""
-        listed = inventory.state.payloads if inventory.state is not None else {}
+        listed = inventory.payloads
         if not listed and PAYLOADS not in inventory.listing.others:
             return
         from hybridlog.payloads.reader import RecordingPayloads
@@ -275,12 +275,7 @@ class _Check:
                 self._result.bytes_read += file.bytes
             except StoreError as error:
                 self.found(f"{PAYLOADS}/{file.file}", str(error), _RESTORE_COLUMNS)
-        try:
-            names = payload_files.names_of(self._path)
-        except OSError as error:
-            self.found(PAYLOADS, error.strerror or str(error), _RESTORE_COLUMNS)
-            return
-        for name in names:
+        for name in inventory.listing.payloads:
             if name not in listed:
                 cure = "move it out of the store"
                 self.found(f"{PAYLOADS}/{name}", "the journal does not list it", cure)
@@ -302,7 +297,7 @@ class _Check:
                     self.found(f"{name} byte {offset}", problem, cure)
             if summary is None:
                 return
-            with SegmentReader(self._path / name, number) as reader:
+            with open_segment(self._path / name, number, self._contents) as reader:
                 for place in summary.chunks:
                     self._chunk(reader, place, summary.channels, name)
                 self._result.bytes_read += reader.bytes_read

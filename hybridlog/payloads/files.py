@@ -2,39 +2,24 @@
 
 from __future__ import annotations
 
-import stat
-from contextlib import suppress
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, Final
 
-from hybridlog.payloads.layout import IN_PAYLOADS, PARTS, PAYLOADS
+from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
 from hybridlog_storage import durability, files
+from hybridlog_storage.directory import PAYLOADS, payload_names
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.segment_file import sealed_name
+from hybridlog_storage.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from hybridlog_storage.journal import PayloadFile
 
-
-def names_of(recording: Path, folder: str = PAYLOADS) -> list[str]:
-    """Paths of all files below `payloads`, or below the folder of unfinished files.
-
-    Args:
-        recording: The recording's directory.
-        folder: Name of the folder.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    found = []
-    with suppress(FileNotFoundError):
-        for topic, about in files.names(recording / folder, depth=files.IN_RECORDING).items():
-            if not stat.S_ISDIR(about.st_mode):
-                found.append(topic)
-                continue
-            inside = files.names(recording / folder / topic, depth=IN_PAYLOADS - 1)
-            found += [f"{topic}/{name}" for name in inside]
-    return sorted(found)
+THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
+"""Name of a segment that is about to replace the whole one."""
 
 
 def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
@@ -49,7 +34,7 @@ def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
     """
     parts, final = recording / PARTS, recording / PAYLOADS
     try:
-        names = names_of(recording, PARTS)
+        names = sorted(payload_names(recording, PARTS))
         moved = [name for name in names if name in listed]
         for name in moved:
             folder = (final / name).parent
@@ -62,3 +47,52 @@ def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
         files.remove_tree(parts, depth=files.IN_RECORDING)
     except OSError as error:
         raise durability.explain(error, final, "moving payloads to") from error
+
+
+def replace_segments(
+    recording: Path, names: Iterable[str], thinned: Mapping[int, Sequence[tuple[str, int]]]
+) -> list[str]:
+    """Put finished segments without moved chunks in the place of the whole ones.
+
+    Those that the journal does not list are removed.
+
+    Args:
+        recording: The recording's directory, locked by this process.
+        names: Names of files in it.
+        thinned: Digest and size of such segments as the journal lists them, by number.
+
+    Returns:
+        Names of the segments that were replaced.
+
+    Raises:
+        HybridlogError: A file cannot be renamed or removed.
+    """
+    done = []
+    try:
+        for name in names:
+            found = THINNED.fullmatch(name)
+            if found is None:
+                continue
+            number = int(found["number"])
+            if _is_listed(recording / name, number, thinned.get(number, ())):
+                final = sealed_name(number)
+                files.rename(recording / name, recording / final)
+                done.append(final)
+            else:
+                files.unlink(recording / name)
+        if done:
+            files.sync_folder(recording)
+    except OSError as error:
+        raise durability.explain(error, recording, "replacing segments of") from error
+    return done
+
+
+def _is_listed(path: Path, number: int, listed: Sequence[tuple[str, int]]) -> bool:
+    if not listed:
+        return False
+    try:
+        with SegmentReader(path, number) as reader:
+            summary = reader.summary()
+    except SegmentError:
+        return False
+    return (summary.digest, summary.size) == listed[-1]

@@ -12,8 +12,6 @@ from typing import Final
 
 from hybridlog.tables.layout import RESERVED
 
-PAYLOADS: Final = "payloads"
-"""Folder of a recording that holds its files of payloads."""
 PARTS: Final = "payloads.part"
 """Folder of a recording that holds files that are being written."""
 IN_PAYLOADS: Final = 5
@@ -26,6 +24,11 @@ OWN_COLUMNS: Final = ("log_time", "t", "seq", "pub", "channel", "sequence", "ref
 """Columns of every file, before the fields of the messages."""
 PAYLOAD_RESERVED: Final = RESERVED | {"sequence", RECIPE, POINTS}
 """Names that no column of a field has."""
+
+
+def thinned_name(segment: str) -> str:
+    """Name of a segment without moved chunks until it takes the place of the whole one."""
+    return f"{segment}.thinned"
 
 
 def payload_file(folder: str, schema: str, number: int) -> str:

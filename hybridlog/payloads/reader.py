@@ -11,9 +11,12 @@ import pyarrow as pa
 
 from hybridlog.payloads.clouds import PointLayout
 from hybridlog.payloads.columns import ArrayColumn, Rebuilder
-from hybridlog.payloads.layout import IN_PAYLOADS, PAYLOADS
+from hybridlog.payloads.layout import IN_PAYLOADS
+from hybridlog.payloads.zones import Zone
+from hybridlog.tables.fields import original_name
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import journal
+from hybridlog_storage.directory import PAYLOADS
 from hybridlog_storage.errors import SegmentError, StoreError
 
 if TYPE_CHECKING:
@@ -74,7 +77,13 @@ class PayloadReader:
             self.is_ordered = bool(values["is_ordered"])
             self._rebuilder = Rebuilder(str(values["wire"]), self.arrays, self.order, self.layout)
             self.places = self._read_places(values["chunks"])
-        except (KeyError, TypeError, ValueError) as error:
+            self.zones = [
+                {str(path): Zone.from_json(zone) for path, zone in group.items()}
+                for group in values["zones"]
+            ]
+            if len(self.zones) != self.file.groups:
+                raise ValueError("its row groups and its zones differ")
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
         self._columns = [".".join(names) for names, _ in leaves_of(self.file.schema)]
         self._needed = self.leaves(self._rebuilder.needed)
@@ -120,6 +129,15 @@ class PayloadReader:
         """
         return self.file.read(group, self.leaves(columns))
 
+    def columns_of(self, kind: Any) -> list[str] | None:
+        """Dotted paths of the columns of some fields; None if one has no such column.
+
+        Args:
+            kind: Type of messages with these fields.
+        """
+        found: list[str] = []
+        return found if _find_columns(list(self.file.schema), list(kind), "", found) else None
+
     def rebuilt(self, group: int) -> Rebuilt:
         """The message records of a row group.
 
@@ -151,6 +169,24 @@ class PayloadReader:
         self.file.check()
 
 
+def _find_columns(columns: list[Any], fields: list[Any], prefix: str, found: list[str]) -> bool:
+    """Add the paths of the columns of some fields; False if one is missing."""
+    by_name = {original_name(column): column for column in columns}
+    for field in fields:
+        column = by_name.get(field.name)
+        if column is None:
+            return False
+        path = f"{prefix}{column.name}"
+        if not pa.types.is_struct(field.type):
+            found.append(path)
+            continue
+        if not pa.types.is_struct(column.type) or field.type.num_fields == 0:
+            return False  # a message without fields is a boolean
+        if not _find_columns(list(column.type), list(field.type), f"{path}.", found):
+            return False
+    return True
+
+
 class RecordingPayloads:
     """The files of payloads of one recording. Thread safe.
 
@@ -170,6 +206,7 @@ class RecordingPayloads:
         self._folder = recording / folder
         self._readers: dict[str, PayloadReader] = {}
         self._places: dict[tuple[int, int], list[PayloadReader]] | None = None
+        self._problem = ""  # of a file that cannot be read
         self._lock = threading.RLock()
 
     @classmethod
@@ -193,6 +230,22 @@ class RecordingPayloads:
             if found is None:
                 found = self._readers[listed.file] = PayloadReader(self._folder, listed)
             return found
+
+    def ordered(self, topic: str) -> list[PayloadReader] | None:
+        """The readers of a topic, in order of time; None if rows are in another order.
+
+        Raises:
+            StoreError: A file is missing or damaged.
+        """
+        readers = [self.reader(file) for file in self.listed if file.topic == topic]
+        if not readers or not all(reader.is_ordered for reader in readers):
+            return None
+        readers.sort(key=lambda reader: reader.file.about.bounds[0][1:3])
+        ends = [r.file.about.bounds[-1][3:] for r in readers]
+        starts = [r.file.about.bounds[0][1:3] for r in readers]
+        if any(end >= start for end, start in zip(ends[:-1], starts[1:], strict=True)):
+            return None
+        return readers
 
     def content(self, segment: int, chunk: int, size: int) -> Buffer:
         """The uncompressed content of a chunk.
@@ -228,20 +281,22 @@ class RecordingPayloads:
                 content[start : start + end - begin] = rebuilt.data[begin:end]
                 filled += end - begin
         if filled != size:
-            raise SegmentError(f"{size - filled} bytes of its content are missing")
+            raise SegmentError(
+                self._problem or f"{size - filled} bytes of its content are in no file of columns"
+            )
         return content.data
 
     def having(self, segment: int, chunk: int) -> list[PayloadReader]:
-        """The readers of files with messages of a chunk.
-
-        Raises:
-            StoreError: A file is missing or damaged.
-        """
+        """The readers of files with messages of a chunk, but for damaged or missing files."""
         with self._lock:
             if self._places is None:
                 places = defaultdict(list)
                 for listed in self.listed:
-                    reader = self.reader(listed)
+                    try:
+                        reader = self.reader(listed)
+                    except StoreError as error:
+                        self._problem = str(error)
+                        continue
                     for key in reader.places:
                         places[key].append(reader)
                 self._places = dict(places)

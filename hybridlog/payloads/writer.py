@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 
-from hybridlog.payloads.columns import TopicColumns, column_at
+from hybridlog.payloads.columns import TopicColumns, column_at, values_of
 from hybridlog.payloads.encodings import LEVEL, encodings_of
 from hybridlog.payloads.layout import IN_PAYLOADS, payload_file
+from hybridlog.payloads.zones import Zone
 from hybridlog.tables.layout import About, table_schema_of, topic_folder
 from hybridlog.tables.parquet_file import ParquetFileWriter
 from hybridlog_storage import durability, files
 from hybridlog_storage.journal import PayloadFile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from hybridlog.payloads.clouds import PointLayout
@@ -40,6 +41,7 @@ class _OpenFile:
         tables: Rows that wait for a row group.
         waiting: Their bytes.
         size: Bytes of all its messages.
+        zones: For each row group, the zone of each array, by path.
         chunks: For each row group, segment, number and rows of each chunk in it.
         bounds: See `About`.
         segments: See `About`.
@@ -55,6 +57,7 @@ class _OpenFile:
     size: int = 0
     pending: list[list[int]] = field(default_factory=list)
     chunks: list[list[list[int]]] = field(default_factory=list)
+    zones: list[dict[str, list[Any]]] = field(default_factory=list)
     bounds: list[tuple[int, int, int, int, int]] = field(default_factory=list)
     segments: dict[str, str] = field(default_factory=dict)
     last: tuple[int, int] = (-(1 << 63), -1)
@@ -155,6 +158,7 @@ class TopicWriter:
         file.last = last
         file.bounds.append((len(time), *first, *last))
         file.chunks.append(file.pending)
+        file.zones.append(_zones(table, file.columns))
         file.rows += len(time)
         file.tables, file.pending, file.waiting = [], [], 0
 
@@ -169,6 +173,7 @@ class TopicWriter:
             "order": [array.path for array in self._columns.arrays],
             "layout": layout.to_json() if layout is not None else None,
             "chunks": file.chunks,
+            "zones": file.zones,
             "is_ordered": file.is_ordered,
         }
         path = self._folder / file.name
@@ -188,6 +193,16 @@ class TopicWriter:
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
         self.written.append(PayloadFile(file.name, size, digest, self._channel.topic, file.rows))
+
+
+def _zones(table: pa.Table, columns: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
+    """The zones of the arrays in a row group, but for those of bytes."""
+    found = {}
+    for path, column, dtype in columns:
+        if dtype != "u1":
+            values, bounds = values_of(column_at(table, column))
+            found[path] = Zone.of(values, bounds).to_json()
+    return found
 
 
 def synced(path: Path) -> tuple[int, str]:

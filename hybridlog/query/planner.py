@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines.base import Engine, Outcomes, Values
     from hybridlog.query.engines.mongo import Mongo
+    from hybridlog.query.engines.payload_columns import PayloadColumns
     from hybridlog.query.engines.tables import TablesEngine
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.predicate.tree import Predicate
@@ -98,10 +99,18 @@ class Planner:
 
         return TablesEngine(self.session, self.counters)
 
+    @cached_property
+    def _columns(self) -> PayloadColumns:
+        from hybridlog.query.engines.payload_columns import PayloadColumns
+
+        return PayloadColumns(self.session, self.counters)
+
     def _files(self, part: Part, need: Need) -> tuple[Engine, ...]:
         """The engines that need no server."""
         if part.predicate is None and need is not Need.VALUES:
             return *self._catalog, self._scan
+        if part.recording.payloads:
+            return *self._catalog, self._tables, self._columns, self._scan
         return *self._catalog, self._tables, self._scan
 
     def parts(self) -> list[Part]:
@@ -238,8 +247,10 @@ class Planner:
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
-        """True if the fields of the messages of a part come from its table."""
+        """True if the fields of the messages of a part come from its table or columns."""
         costs = self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields)
+        if costs and part.recording.payloads and costs[0][1] is self._columns:
+            return True
         if not costs or costs[0][1] is not self._tables:
             return False
         try:

@@ -34,6 +34,8 @@ from hybridlog_storage.settings import StoreSettings, read_settings, write_setti
 from hybridlog_storage.sharing import make_shared
 
 LOCK: Final = "writer.lock"
+PAYLOADS: Final = "payloads"
+"""Folder of a recording that holds its columns of payloads."""
 REMOVED: Final = ".removed-"
 """Prefix of the directory of a recording that is being deleted."""
 IMPORTING: Final = ".importing-"
@@ -50,6 +52,7 @@ class Listing:
         sealed: Names of sealed segments, by number.
         open: Names of segments that were never sealed, by number.
         others: All other names.
+        payloads: Sizes of files of payloads, by path below `payloads`.
         look: As of `StoreDirectory.looks`, before the names were read.
         print: A value that changes whenever a relevant file changes.
     """
@@ -58,6 +61,7 @@ class Listing:
     sealed: Mapping[int, str]
     open: Mapping[int, str]
     others: tuple[str, ...]
+    payloads: Mapping[str, int]
     look: str
     print: str
 
@@ -229,11 +233,13 @@ class StoreDirectory:
             StoreError: It cannot be read.
         """
         path = self.recording(label)
-        look, found = "", {}
+        look, found, payloads = "", {}, {}
         try:
             with files.folder(path, files.IN_FOLDER) as fd:
                 look = _look(os.fstat(fd), JOURNAL, fd)
                 found = files.names_in(fd)
+            if PAYLOADS in found:
+                payloads = payload_names(path)
         except FileNotFoundError:
             pass
         except OSError as error:
@@ -257,11 +263,17 @@ class StoreDirectory:
                     f"{name} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns} "
                     f"{about.st_ino}\n".encode()
                 )
+        for name, about in sorted(payloads.items()):
+            looks.update(
+                f"{name} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns} "
+                f"{about.st_ino}\n".encode()
+            )
         return Listing(
             JOURNAL in found,
             dict(sorted(sealed.items())),
             dict(sorted(opened.items())),
             tuple(others),
+            {name: about.st_size for name, about in sorted(payloads.items())},
             look,
             looks.hexdigest(),
         )
@@ -429,6 +441,27 @@ def _look(about: os.stat_result, journal: str, fd: int) -> str:
     except OSError:
         return look
     return f"{look} {lines.st_ino} {lines.st_size} {lines.st_mtime_ns} {lines.st_ctime_ns}"
+
+
+def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_result]:
+    """Files of payloads of a recording, by path below their folder.
+
+    Args:
+        recording: The recording's directory.
+        folder: Name of the folder.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    found: dict[str, os.stat_result] = {}
+    with suppress(FileNotFoundError):
+        for topic, about in files.names(recording / folder, depth=files.IN_RECORDING).items():
+            if not stat.S_ISDIR(about.st_mode):
+                found[topic] = about
+                continue
+            inside = files.names(recording / folder / topic, depth=files.IN_RECORDING + 1)
+            found.update({f"{topic}/{name}": status for name, status in inside.items()})
+    return found
 
 
 def label_of(name: str) -> str:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -135,6 +135,8 @@ class JournalState:
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
         payloads: Files of payloads, by path.
+        thinned: Digest and size of each segment without moved chunks, by its number; a later
+            one follows an earlier one.
         end: The end of the recording; None while it is running.
         moving: Old and new label of a rename that is not finished, else None.
         removing: Whether a removal began.
@@ -155,6 +157,7 @@ class JournalState:
     sealed: dict[int, SealedSegment] = field(default_factory=dict)
     replaced: list[tuple[SealedSegment, SealedSegment]] = field(default_factory=list)
     payloads: dict[str, PayloadFile] = field(default_factory=dict)
+    thinned: dict[int, list[tuple[str, int]]] = field(default_factory=dict)
     end: dict[str, Any] | None = None
     moving: tuple[str, str] | None = None
     removing: bool = False
@@ -249,17 +252,32 @@ class JournalState:
         self.sealed[number] = sealed
 
     def _compact(self, line: Event) -> None:
-        found = [
-            PayloadFile(
-                _inner_path(value["file"]),
-                int(value["bytes"]),
-                _text(value["digest"]),
-                _text(value["topic"]),
-                int(value["messages"]),
-            )
-            for value in line["files"]
+        found = payload_files(line.get("files", ()))
+        segments = [
+            (int(value["segment"]), (_text(value["digest"]), int(value["bytes"])))
+            for value in line.get("segments", ())
         ]
         self.payloads.update({file.file: file for file in found})
+        for number, written in segments:
+            self.thinned.setdefault(number, []).append(written)
+
+
+def payload_files(values: Iterable[Mapping[str, Any]]) -> list[PayloadFile]:
+    """Files of payloads as an event or a segment lists them.
+
+    Raises:
+        KeyError, TypeError, ValueError: A value is missing or invalid.
+    """
+    return [
+        PayloadFile(
+            _inner_path(value["file"]),
+            int(value["bytes"]),
+            _text(value["digest"]),
+            _text(value["topic"]),
+            int(value["messages"]),
+        )
+        for value in values
+    ]
 
 
 def read_lines(data: bytes) -> Iterator[tuple[int, dict[str, Any] | None]]:

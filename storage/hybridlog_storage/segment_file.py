@@ -31,20 +31,25 @@ from hybridlog_storage.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.mcap_content import RECORD_HEAD
 from hybridlog_storage.segment_format import (
+    CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
+    INDEX_HEAD,
     LIBRARY,
     MAGIC,
+    MOVED_OPCODE,
     PROFILE,
     RECORDING_METADATA,
     ChunkSummary,
     arrival_record,
     channel_record,
     chunk_index_record,
+    compression_of,
     json_metadata,
     padding_record,
     record_bytes,
     schema_record,
+    split_trailer,
 )
 
 if TYPE_CHECKING:
@@ -146,6 +151,7 @@ class SegmentFile:
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
+        self._listed = 0  # chunks that other readers of MCAP find
         self._first: int | None = None
         self._last = 0
         self._sealed: Sealed | None = None  # once the file is complete
@@ -259,6 +265,10 @@ class SegmentFile:
         """Note an attachment that is in the file already."""
         self._attachment_indexes.append(attachment.index(offset, length))
 
+    def note_attachment_index(self, index: AttachmentIndex) -> None:
+        """Note an attachment that is in the file already, by its index record."""
+        self._attachment_indexes.append(index)
+
     def append_chunks(self, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
         """Append chunks with their message indexes and arrival numbers in one write.
 
@@ -319,6 +329,48 @@ class SegmentFile:
             )
         return stored
 
+    def append_stretch(self, pieces: Iterable[Buffer]) -> None:
+        """Append checked bytes of another segment that belong to no chunk."""
+        length = crc = 0
+        for piece in pieces:
+            self._append([piece])
+            length, crc = length + len(piece), crc32(piece, crc)
+        self.table.stretch(length, crc)
+
+    def append_copy(self, record: Buffer, trailer: Buffer, parts: NDArray[np.void]) -> None:
+        """Append a chunk of another segment, or the record of a moved one.
+
+        Args:
+            record: Its record.
+            trailer: Message indexes and arrival numbers, as they stand in the other segment.
+            parts: `PART`[c], statistics of each channel in it.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        indexes, body = split_trailer(trailer)
+        arrivals = arrival_record(self.position, bytes(body[8:]))
+        own = bytes(trailer[: len(trailer) - len(arrivals)]) + arrivals
+        _, _, first, last, size, _ = CHUNK_HEAD.unpack_from(record)
+        offset = self.position
+        self._append([record, own])
+        checksums = {"crc": crc32(record), "trailer_crc": crc32(own)}
+        if record[0] == MOVED_OPCODE:
+            self.table.chunk(
+                offset=offset,
+                length=len(record),
+                trailer=len(own),
+                first=first,
+                last=last,
+                parts=parts,
+                **checksums,
+            )
+            return
+        compression, compressed = compression_of(record)
+        sizes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in indexes}
+        chunk = ChunkSummary(first, last, offset, len(record), sizes, compression, compressed, size)
+        self.note_chunk(chunk, parts, trailer=len(own), **checksums)
+
     def append_trailer(self, trailer: bytes) -> None:
         """Append indexes and arrival numbers of a chunk that a crash cut off."""
         self._append([trailer])
@@ -352,6 +404,7 @@ class SegmentFile:
             parts=parts,
         )
         self._chunk_indexes += chunk_index_record(chunk)
+        self._listed += 1
         counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
         for channel, count in counts:
             self._counts[channel] = self._counts.get(channel, 0) + count
@@ -434,6 +487,18 @@ class SegmentFile:
         )
         return self._sealed
 
+    def finish(self) -> None:
+        """Force a complete file to the disk and close it, without giving it another name.
+
+        Raises:
+            HybridlogError: It cannot be written.
+        """
+        try:
+            self._file.finish(sync=True)
+        except OSError as error:
+            raise durability.explain(error, self.path, "writing") from error
+        self._finished = True
+
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""
         with suppress(OSError):
@@ -499,7 +564,7 @@ class SegmentFile:
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self.channels),
             channel_message_counts=dict(sorted(self._counts.items())),
-            chunk_count=self.chunks,
+            chunk_count=self._listed,
             message_count=sum(self._counts.values()),
             message_end_time=self._last,
             message_start_time=self._first or 0,

@@ -60,7 +60,15 @@ PADDING_OPCODE: Final = 0x91
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
 
+MOVED_OPCODE: Final = 0x93
+"""Record in place of a chunk whose content lies in columns of payloads."""
+COMPACTED_METADATA: Final = "hybridlog.compacted"
+"""Metadata record of a segment with moved chunks."""
+DATA_END_SIZE: Final = 13
+"""Bytes of the record of the end of the data."""
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
+MOVED_SIZE: Final = CHUNK_HEAD.size
+"""Bytes of the record of a moved chunk; every chunk record has more."""
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
 
@@ -206,6 +214,25 @@ def chunk_index_record(chunk: ChunkSummary) -> bytes:
     head = CHUNK_INDEX_HEAD.pack(chunk.first, chunk.last, chunk.offset, chunk.length, len(table))
     body = head + table + tail
     return RECORD_HEAD.pack(Opcode.CHUNK_INDEX, len(body)) + body
+
+
+def compression_of(record: Buffer) -> tuple[str, int]:
+    """Compression of a checked chunk record, and bytes of its compressed content."""
+    at = CHUNK_HEAD.size
+    (length,) = struct.unpack_from("<I", record, at)
+    name = bytes(record[at + 4 : at + 4 + length]).decode("ascii", "replace")
+    (compressed,) = struct.unpack_from("<Q", record, at + 4 + length)
+    return name, int(compressed)
+
+
+def moved_record(chunk: Buffer) -> bytes:
+    """The record in place of a chunk record whose content lies elsewhere.
+
+    Args:
+        chunk: The chunk record, or such a record already.
+    """
+    _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
+    return CHUNK_HEAD.pack(MOVED_OPCODE, MOVED_SIZE - RECORD_HEAD.size, first, last, size, crc)
 
 
 def padding_record(size: int) -> bytes:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -37,10 +37,13 @@ from hybridlog_storage.segment_file import digest_of
 from hybridlog_storage.segment_format import (
     CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
+    COMPACTED_METADATA,
     END_METADATA,
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
+    MOVED_OPCODE,
+    MOVED_SIZE,
     OUR_NAMES,
     RECORDING_METADATA,
     arrivals_of,
@@ -60,6 +63,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Batch
 
+_T = TypeVar("_T")
 _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 _TAIL = _FOOTER.size + len(MAGIC)
 _MAX_SUMMARY = 1 << 30
@@ -107,6 +111,7 @@ class SegmentSummary:
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
+        compacted: What a segment with moved chunks says of them; None in others.
         table: The chunk table.
         digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
@@ -121,6 +126,7 @@ class SegmentSummary:
     losses: list[dict[str, Any]]
     attachments: list[AttachmentIndex]
     metadata: list[MetadataIndex]
+    compacted: dict[str, object] | None
     table: ChunkTable
     digest: str
     size: int
@@ -138,6 +144,12 @@ class _Records:
     table: Buffer | None
 
 
+Contents = Callable[[int, int, int], Buffer]
+"""Returns the content of a moved chunk, by numbers of segment and chunk, and its size.
+
+It raises SegmentError when the content is missing or damaged. The caller checks it."""
+
+
 class SegmentReader:
     """One sealed segment file.
 
@@ -146,14 +158,24 @@ class SegmentReader:
         number: Its number in the recording.
         direct: Read past the page cache, if the file system allows it: for data that was
             just written that way and will not be read again soon.
+        contents: Returns the content of moved chunks.
 
     Raises:
             SegmentError: The file is missing or cannot be opened.
     """
 
-    def __init__(self, path: Path, number: int, *, direct: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        number: int,
+        *,
+        direct: bool = False,
+        contents: Contents | None = None,
+    ) -> None:
         self.path = path
         self.number = number
+        self._contents = contents
+        self._places: list[ChunkPlace] | None = None
         self._direct = direct and bool(DIRECT)
         cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
         try:
@@ -290,6 +312,8 @@ class SegmentReader:
                 found[index.name] = json_of(self.metadata(table, index))
                 if index.name == RECORDING_METADATA:
                     check_format(found[index.name], self.path)
+            elif index.name == COMPACTED_METADATA:
+                found[index.name] = json_of(self.metadata(table, index))
             elif index.name == LOSSES_METADATA:
                 losses += loss_rows(json_of(self.metadata(table, index)))
         if RECORDING_METADATA not in found:
@@ -297,9 +321,8 @@ class SegmentReader:
         totals = table.by_channel()
         counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
         stated = records.statistics.channel_message_counts if records.statistics else {}
-        if counts != {c: n for c, n in stated.items() if n} or not counts.keys() <= (
-            records.channels.keys()
-        ):
+        is_known = counts.keys() <= records.channels.keys()
+        if _listed_counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
             raise _NoSummaryError("its statistics and its chunk table differ")
         return SegmentSummary(
             recording=found[RECORDING_METADATA],
@@ -311,10 +334,22 @@ class SegmentReader:
             losses=losses,
             attachments=records.attachments,
             metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
+            compacted=found.get(COMPACTED_METADATA),
             table=table,
             digest=digest,
             size=self.size,
         )
+
+    def indexes(self) -> tuple[list[MetadataIndex], list[AttachmentIndex]]:
+        """Index records of the metadata and the attachments.
+
+        Raises:
+            SegmentError: As `summary`.
+        """
+        with self._explained():
+            _, tail = self._tail()
+            records = _records(tail[: len(tail) - _TAIL])
+            return records.metadata, records.attachments
 
     def metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
         """A metadata record, after checking the stretch that holds it.
@@ -370,12 +405,18 @@ class SegmentReader:
         Raises:
                 SegmentError: It is missing or damaged; the message names file and offset.
         """
+        return self._at_its_place(place, self._read_chunk)
+
+    def _read_chunk(self, place: ChunkPlace) -> StoredChunk:
         data = self.read(place.offset, place.length + place.trailer)
         record, trailer = data[: place.length], data[place.length :]
         try:
             if place.crc not in {None, crc32(record)}:
                 raise SegmentError("its checksum differs")
-            content, compressed = open_chunk(record, is_checked=place.crc is not None)
+            if len(record) == MOVED_SIZE:
+                content, compressed = self._moved_content(place, record), 0
+            else:
+                content, compressed = open_chunk(record, is_checked=place.crc is not None)
             if place.crc is None or place.trailer_crc is None:
                 batch = parse_content(content).batch
                 _check_around(record, trailer, batch)
@@ -402,6 +443,37 @@ class SegmentReader:
             compressed_size=compressed,
         )
 
+    def _moved_content(self, place: ChunkPlace, record: memoryview) -> Buffer:
+        """The content of a moved chunk, checked."""
+        opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
+        if opcode != MOVED_OPCODE or length + RECORD_HEAD.size != len(record):
+            raise SegmentError("no chunk record is there")
+        if self._contents is None:
+            raise SegmentError("its messages lie in columns of payloads")
+        content = self._contents(self.number, place.number, size)
+        if len(content) != size or crc32(content) != crc:
+            raise SegmentError("its messages do not come back from their columns")
+        return content
+
+    def _at_its_place(self, place: ChunkPlace, read: Callable[[ChunkPlace], _T]) -> _T:
+        """Read something of a chunk, whose place may be listed as before a rewriting.
+
+        A segment is written again when chunks are moved. Numbers of chunks stay.
+        """
+        try:
+            return read(place)
+        except SegmentError:
+            if self._places is None:
+                self._places = []
+                with suppress(SegmentError):
+                    self._places = places_of(self.table())
+            if place.number >= len(self._places):
+                raise
+            now = self._places[place.number]
+            if (now.offset, now.length) == (place.offset, place.length):
+                raise
+            return read(now)
+
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
 
@@ -416,6 +488,9 @@ class SegmentReader:
         Raises:
             SegmentError: They are missing or damaged; the message names file and offset.
         """
+        return self._at_its_place(place, self._read_times)
+
+    def _read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         trailer = self.read(place.offset + place.length, place.trailer)
         if crc32(trailer) == place.trailer_crc:
             return message_times(trailer)
@@ -436,6 +511,9 @@ class SegmentReader:
         Raises:
                 SegmentError: They are missing or damaged; the message names file and offset.
         """
+        return self._at_its_place(place, lambda at: self._read_arrivals(at, count))
+
+    def _read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
         trailer = self.read(place.offset + place.length, place.trailer)
         try:
             if crc32(trailer) != place.trailer_crc:
@@ -528,6 +606,16 @@ _WANTED = frozenset(
         Opcode.STATISTICS,
     }
 )
+
+
+def _listed_counts(table: ChunkTable) -> dict[int, int]:
+    """Messages of each channel in chunks that were not moved."""
+    rows = np.repeat(table.chunks["length"] != MOVED_SIZE, table.chunks["parts"])
+    counts: dict[int, int] = {}
+    parts = table.parts[rows]
+    for channel, count in zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True):
+        counts[channel] = counts.get(channel, 0) + count
+    return counts
 
 
 def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:

@@ -51,6 +51,7 @@ class Bench:
         path: Where stores are.
         scenarios: Those that were made already, by name.
         two: The store that most of them begin with, once it is made.
+        scans: A store with long arrays, once it is made.
     """
 
     server: Server
@@ -58,6 +59,7 @@ class Bench:
     path: Path
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     two: Prepared | None = None
+    scans: Prepared | None = None
 
     def scenario(
         self,

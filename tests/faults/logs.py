@@ -86,7 +86,9 @@ def write(path: Path, said: Content) -> Path:
     return path
 
 
-def record(store: Path, uri: str, log: Path, name: str) -> None:
+def record(
+    store: Path, uri: str, log: Path, name: str, settings: SegmentSettings = SETTINGS
+) -> None:
     """Record a log in several segments."""
     with hl.open(store, mongo=uri, create=True) as opened:
-        opened.record(log, name=name, settings=SETTINGS)
+        opened.record(log, name=name, settings=settings)

@@ -28,6 +28,7 @@ CHANGES: Final = {
     "import": 85,
     "repair": 220,
     "compact": 50,
+    "drop": 120,
 }
 INDEX: Final = {
     "reindex": 290,

@@ -427,6 +427,7 @@ COMMANDS: Mapping[str, Command] = {
     "repair": _on_store(_repair),
     "record": _on_store(_record),
     "compact": _on_store(lambda store, args: store.compact(topics=args)),
+    "drop": _on_store(lambda store, args: store.compact(topics=args, drop_mcap=True)),
 }
 
 

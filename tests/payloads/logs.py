@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_writer import SegmentSettings
 
+COUNT = 120
+SETTINGS = SegmentSettings(chunk_size=32 << 10, segment_size=60 << 10)
 BASE = 1_700_000_000_000_000_000
 STEP = 50_000_000
 SCAN = "sensor_msgs/msg/LaserScan"
@@ -117,7 +122,7 @@ def points_of(n: int) -> np.ndarray:
     return points
 
 
-def robot(count: int = 120) -> list[tuple[str, str, int, bytes]]:
+def robot(count: int = COUNT) -> list[tuple[str, str, int, bytes]]:
     """Scans, clouds, images and numbers of a robot."""
     said = []
     for n in range(count):
@@ -129,3 +134,15 @@ def robot(count: int = 120) -> list[tuple[str, str, int, bytes]]:
             pixels = (np.arange(64 * 80).reshape(64, 80) * (n + 1) % 251).astype(np.uint8)
             said.append(("/image", IMAGE, time + 3, image(pixels)))
     return said
+
+
+def messages(store: hl.Store) -> list[tuple[Any, ...]]:
+    """All messages of a store, byte for byte."""
+    return [
+        (m.topic, m.log_time_ns, m.publish_time_ns, m.sequence, m.seq, m.raw)
+        for m in store.all_topics()
+    ]
+
+
+def recording_of(store: Path) -> Path:
+    return store / "recordings" / "log"

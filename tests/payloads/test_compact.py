@@ -20,24 +20,21 @@ from hybridlog.payloads.columns import Rebuilder
 from hybridlog_storage import journal
 from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.segment_writer import SegmentSettings
 from tests.cli.running import run
-from tests.payloads.logs import BASE, STEP, points_of, ranges_of, robot, write_log
+from tests.payloads.logs import (
+    BASE,
+    COUNT,
+    SETTINGS,
+    STEP,
+    messages,
+    points_of,
+    ranges_of,
+    recording_of,
+    robot,
+    write_log,
+)
 
-COUNT = 120
-SETTINGS = SegmentSettings(chunk_size=32 << 10, segment_size=200 << 10)
 MOVED = ["/cloud", "/scan"]
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store of one recording, without columns."""
-    path = tmp_path_factory.mktemp("plain")
-    log = write_log(path / "log.mcap", robot(COUNT))
-    with hl.open(path / "store", create=True) as store:
-        store.record(log, name="log", settings=SETTINGS)
-    shutil.rmtree(path / "store" / "mongod")
-    return path / "store"
 
 
 @pytest.fixture(scope="module")
@@ -51,24 +48,6 @@ def compacted(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
             (topic, COUNT, 0) for topic in MOVED
         ]
         yield store
-
-
-@pytest.fixture
-def copy(plain: Path, tmp_path: Path) -> Path:
-    """A store without columns that a test may change."""
-    shutil.copytree(plain, tmp_path / "store")
-    return tmp_path / "store"
-
-
-def messages(store: hl.Store) -> list[tuple[Any, ...]]:
-    return [
-        (m.topic, m.log_time_ns, m.publish_time_ns, m.sequence, m.seq, m.raw)
-        for m in store.all_topics()
-    ]
-
-
-def recording_of(path: Path) -> Path:
-    return path / "recordings" / "log"
 
 
 def test_columns_change_no_answer(plain: Path, compacted: hl.Store) -> None:

@@ -1,0 +1,220 @@
+"""Takes chunks whose messages are in columns out of the segments of a recording.
+
+A chunk is taken out only if its whole content, rebuilt from the columns that the journal
+lists, equals the content in the segment. The segment is then written again without it, next
+to the old one, and every chunk of the new one is read and compared with the old one. Only
+then the journal announces the new segment, and it takes the place of the old one. A crash
+before that line leaves a file that the next opening removes; after it, the next opening
+renames it. Until then both segments are right.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.entries import take_inventory
+from hybridlog.maintenance.report import CompactedTopic
+from hybridlog.payloads import files as payload_files
+from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.payloads.layout import thinned_name
+from hybridlog_storage import files, journal
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.segment_check import SegmentCheck
+from hybridlog_storage.segment_format import MOVED_SIZE
+from hybridlog_storage.segment_thinning import thin
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+    from pathlib import Path
+
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
+
+
+def drop(
+    directory: StoreDirectory,
+    label: str,
+    topics: Collection[str] | None,
+    reports: Sequence[CompactedTopic],
+    progress: Progress | None,
+) -> list[CompactedTopic]:
+    """Take chunks out of the segments of a recording that this process has locked.
+
+    Args:
+        directory: The store.
+        label: The recording.
+        topics: Only chunks of these topics; None for all that have columns.
+        reports: What was done before; `dropped` is filled in.
+        progress: Called after each chunk.
+
+    Returns:
+        The reports, with those of topics that had columns before.
+
+    Raises:
+        SegmentError: A new segment is not what it should be.
+        DiskFullError: There is no room; the recording is right.
+    """
+    path = directory.recording(label)
+    inventory = take_inventory(directory, label)
+    dropped: Counter[str] = Counter()
+    total = sum(len(summary.chunks) for summary in inventory.summaries.values())
+    done = 0
+    for number, summary in inventory.summaries.items():
+        contents = MovedContents(path)
+        with open_segment(path / inventory.listing.sealed[number], number, contents) as reader:
+            movable = _movable(inventory, reader, summary, contents, topics)
+            if movable:
+                _replace(inventory, path, reader, summary, movable)
+                dropped.update(_messages(summary, movable))
+        done += len(summary.chunks)
+        if progress is not None:
+            progress(label, done, total)
+    found = {report.topic: report for report in reports}
+    for topic, count in dropped.items():
+        report = found.setdefault(topic, CompactedTopic(label, topic))
+        report.dropped += count
+    for topic, count in _left(take_inventory(directory, label)).items():
+        if topic in found or topics is None or topic in topics:
+            found.setdefault(topic, CompactedTopic(label, topic)).both = count
+    known = {report.topic for report in reports}
+    return [*reports, *(report for topic, report in found.items() if topic not in known)]
+
+
+def _left(inventory: Inventory) -> Counter[str]:
+    """Messages in segments of topics that have columns."""
+    in_columns = {file.topic for file in inventory.payloads.values()}
+    found: Counter[str] = Counter()
+    for summary in inventory.summaries.values():
+        there = {chunk.number for chunk in summary.chunks if chunk.length != MOVED_SIZE}
+        counts = _messages(summary, there)
+        found.update({topic: n for topic, n in counts.items() if topic in in_columns})
+    return found
+
+
+def _messages(summary: SegmentSummary, chunks: Collection[int]) -> Counter[str]:
+    """Messages of each topic in some chunks."""
+    number = np.repeat(np.arange(len(summary.table.chunks)), summary.table.chunks["parts"])
+    parts = summary.table.parts[np.isin(number, list(chunks))]
+    found: Counter[str] = Counter()
+    for channel, count in zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True):
+        found[summary.channels[channel].topic] += count
+    return found
+
+
+def _movable(
+    inventory: Inventory,
+    reader: SegmentReader,
+    summary: SegmentSummary,
+    contents: MovedContents,
+    topics: Collection[str] | None,
+) -> set[int]:
+    """Numbers of the chunks whose content comes back from columns, byte for byte."""
+    in_columns = {file.topic for file in inventory.payloads.values()}
+    if topics is not None:
+        in_columns &= set(topics)
+    found: set[int] = set()
+    for place in summary.chunks:
+        names = {summary.channels[c].topic for c in place.channels if c in summary.channels}
+        if place.length == MOVED_SIZE or not names <= in_columns:
+            continue
+        try:
+            content = memoryview(reader.read_chunk(place).batch.buffer).cast("B")
+            rebuilt = contents(reader.number, place.number, len(content))
+        except SegmentError:
+            continue  # not all of its messages are in columns, or it is damaged
+        if memoryview(rebuilt).cast("B") == content:
+            found.add(place.number)
+    return found
+
+
+def _replace(
+    inventory: Inventory,
+    path: Path,
+    reader: SegmentReader,
+    summary: SegmentSummary,
+    movable: set[int],
+) -> None:
+    """Write a segment without some chunks, prove it, and put it in place."""
+    name = inventory.listing.sealed[reader.number]
+    target = path / thinned_name(name)
+    state = inventory.state
+    sealed = state.sealed.get(reader.number) if state is not None else None
+    about = {
+        "digest": summary.digest,
+        "bytes": sealed.bytes if sealed is not None else summary.size,
+        "files": [asdict(file) for file in inventory.payloads.values()],
+    }
+    listed = False
+    try:
+        written = thin(reader, target, movable, about)
+        _prove(target, reader, summary, movable)
+        files.sync_folder(path)
+        line = {"segment": reader.number, "bytes": written.bytes, "digest": written.digest}
+        Journal(path).append(journal.event(journal.COMPACTED, segments=[line]))
+        listed = True
+        thinned = {reader.number: [(written.digest, written.bytes)]}
+        if payload_files.replace_segments(path, [target.name], thinned) != [name]:
+            raise SegmentError(f"{target} changed while it was to replace {name}")
+    except BaseException:
+        if not listed:
+            state = journal.read(path)
+            payload_files.replace_segments(path, [target.name], state.thinned if state else {})
+        raise
+
+
+def _prove(target: Path, reader: SegmentReader, summary: SegmentSummary, movable: set[int]) -> None:
+    """Compare a new segment with the old one: every byte, every message.
+
+    Raises:
+        SegmentError: It differs.
+    """
+    with SegmentCheck(target) as check:
+        problems = [problem for _, problem in check.problems()]
+    with open_segment(target, reader.number) as new:
+        found = new.summary()
+        is_same = (
+            not problems
+            and (found.recording, found.end, found.losses)
+            == (summary.recording, summary.end, summary.losses)
+            and _channels(found) == _channels(summary)
+            and found.counts == summary.counts
+            and len(found.chunks) == len(summary.chunks)
+            and {c.number for c in found.chunks if c.length == MOVED_SIZE}
+            == movable | {c.number for c in summary.chunks if c.length == MOVED_SIZE}
+            and _stretches(found)[: len(summary.table.others) - 1] == _stretches(summary)[:-1]
+            and [len(part) for part in new.indexes()[1:]]
+            == [len(part) for part in reader.indexes()[1:]]
+            and all(
+                _is_same(new.read_chunk(there), reader.read_chunk(here))
+                for there, here in zip(found.chunks, summary.chunks, strict=True)
+            )
+        )
+    if not is_same:
+        raise SegmentError(f"{target} is not what it should be: {problems or 'a chunk differs'}")
+
+
+def _channels(summary: SegmentSummary) -> dict[int, dict[str, Any]]:
+    return {number: asdict(channel) for number, channel in summary.channels.items()}
+
+
+def _stretches(summary: SegmentSummary) -> list[tuple[int, int]]:
+    """Length and checksum of all bytes between chunks."""
+    return [(length, crc) for _, length, crc in summary.table.others.tolist()]
+
+
+def _is_same(one: StoredChunk, other: StoredChunk) -> bool:
+    a, b = one.batch, other.batch
+    columns = ("offset", "length", "channel", "log_time", "publish_time", "sequence")
+    return (
+        memoryview(a.buffer).cast("B") == memoryview(b.buffer).cast("B")
+        and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in columns)
+        and np.array_equal(one.seq, other.seq)
+    )
