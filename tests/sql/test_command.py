@@ -7,6 +7,7 @@ import os
 import pty
 import secrets
 import select
+import shutil
 import signal
 import subprocess
 import time
@@ -21,7 +22,12 @@ from click.testing import CliRunner, Result
 import hybridlog as hl
 from hybridlog.cli.app import app
 from hybridlog.cli.sql_prompt import Completer
-from hybridlog_storage.errors import HybridlogError, ResourceError, UsageError
+from hybridlog_storage.errors import (
+    HybridlogError,
+    IncompleteError,
+    ResourceError,
+    UsageError,
+)
 from tests.cli.running import COMMAND, environment
 from tests.sql.conftest import LARGE
 from tests.sql.test_engine import ENDLESS
@@ -123,6 +129,20 @@ def test_unreadable_messages_are_told(tmp_path: Path, server: str) -> None:
     done = run(tmp_path / "store", "select count(*) from large", "-F", "csv")
     assert done.stdout.splitlines()[1] == "6"
     assert "/large: 1 message does not fit its definition; the fields are null" in done.stderr
+
+
+def test_losses_are_told(root: Path, tmp_path: Path) -> None:
+    shutil.copytree(root, tmp_path / "store", ignore=shutil.ignore_patterns("mongod*"))
+    (tmp_path / "store" / "recordings" / "second" / "000000.mcap").unlink()
+    done = run(tmp_path / "store", "select count(*) from large", "-F", "csv")
+    assert done.stdout.splitlines()[1] == str(LARGE)
+    lost = run(
+        tmp_path / "store", "select topic, sum(messages)::int from losses group by all", "-F", "csv"
+    )
+    assert '"/large",40' in lost.stdout.splitlines()
+    with pytest.raises(IncompleteError, match="lost"):
+        run(tmp_path / "store", "select count(*) from large", "--strict")
+    assert run(tmp_path / "store", "select count(*) from scan", "--strict", "-F", "csv").stdout
 
 
 def test_completion(store: hl.Store) -> None:

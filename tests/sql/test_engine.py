@@ -103,6 +103,22 @@ def test_a_query_reaches_nothing_else(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_settings_are_locked(connection: SqlConnection) -> None:
+    wanted = {
+        "allow_community_extensions": "false",
+        "allow_persistent_secrets": "false",
+        "autoinstall_known_extensions": "false",
+        "autoload_known_extensions": "false",
+        "enable_external_access": "false",
+        "lock_configuration": "true",
+        "python_enable_replacements": "false",
+        "temp_directory": "",
+        "TimeZone": "UTC",
+    }
+    query = f"select name, value from duckdb_settings() where name in {tuple(wanted)}"
+    assert dict(connection.query(query).rows()) == wanted
+
+
 def test_errors_say_what_to_do(store: hl.Store, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"views of this store alone.*Cannot access file"):
         store.sql(f"copy (select 1) to '{tmp_path / 'x'}'").rows()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -91,6 +92,17 @@ def test_sealed_segments_answer_from_tables(reader: tuple[LiveRecording, hl.Stor
         assert time.monotonic() < until
         time.sleep(0.05)
     assert answer.counts.chunks > 0
+    entry = store.entry("live")
+    chunks = store.session.chunks(entry, [c.id for c in entry.channels], None, "log")
+    messages: Counter[int] = Counter()
+    for chunk in chunks:
+        messages[chunk.segment] += chunk.messages
+    found = store.session.tables.of_sealed(entry, "/large", messages)
+    assert found is not None
+    assert found[0].rows == sum(messages[segment] for segment in found[1])
+    for wrong in (1, -1):  # a file that just lacks its name, or has another's
+        changed = messages | {min(found[1]): messages[min(found[1])] + wrong}
+        assert store.session.tables.of_sealed(entry, "/large", changed) is None
     assert store.sql(ROWS).rows() == [(count, count, 0, 99, count * 0.25)]
     before = store.sql("select * from large order by t").to_arrow()
     report = recording.close()
