@@ -18,7 +18,7 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
 from hybridlog.query.times import TIME_LIMIT, format_time, is_relative, parse_range
-from hybridlog.query.topics import matcher, resolve
+from hybridlog.query.topics import matcher, resolve, split_topic
 from hybridlog.wording import listed
 from hybridlog_storage.errors import IndexChangedError, TimeError, TopicError, UsageError
 
@@ -204,8 +204,7 @@ class _Choosing:
             raise _NothingLeftError(hint)
 
     def by_content(self, condition: str) -> None:
-        pattern, _, predicate = condition.partition(": ")
-        pattern = pattern.strip().removesuffix(":")
+        pattern, predicate = split_topic(condition)
         if not pattern:
             raise UsageError(
                 f"Write TOPIC: PREDICATE, such as 'scan: ranges.min < 0.5', not {condition!r}."
@@ -216,7 +215,7 @@ class _Choosing:
         if len(there):
             ids = tuple(self._snapshot.summaries[place].id for place in there.tolist())
             question = Question(tuple(topics), ids)
-            if predicate.strip():
+            if predicate:
                 asked = self._session.predicate(predicate, tuple(topics), ids)
                 question = Question(tuple(topics), ids, predicate=asked)
             found = {self._snapshot.by_id[one] for one in self._having_any(question)}
