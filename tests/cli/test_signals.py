@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from hybridlog.cli import signals
+from hybridlog.export.unfinished import beside
 from hybridlog_storage.stopping import at_safe_points, safe_point
 
 
@@ -43,6 +46,46 @@ def test_the_consequence_is_that_of_the_innermost_work_at_the_time() -> None:
     with pytest.raises(signals.Stopped) as stopped:
         work()
     assert (stopped.value.consequence, stopped.value.exit_code) == ("1 done", 143)
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_command_with_nothing_to_take_back_leaves_in_the_handler(
+    is_terminal: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    def leave(code: int) -> NoReturn:
+        raise SystemExit(code)
+
+    monkeypatch.setattr("os._exit", leave)
+    monkeypatch.setattr("os.isatty", lambda _: is_terminal)
+    signals.install()
+    place = beside(tmp_path / "x")
+    place.path.touch()
+    with pytest.raises(SystemExit) as left, signals.if_stopped("x\x07 is not written."):
+        signal.raise_signal(signal.SIGINT)
+    assert left.value.code == 130
+    assert list(tmp_path.iterdir()) == []
+    # The bar's line is cleared, and the cursor shown again.
+    clear = "\r\x1b[K\x1b[?25h" if is_terminal else ""
+    assert capfd.readouterr().err == f"{clear}hybridlog: interrupted. x\\x07 is not written.\n"
+
+
+def test_the_third_signal_leaves_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def leave(code: int) -> NoReturn:
+        raise SystemExit(code)
+
+    def press_three_times() -> None:
+        with at_safe_points():
+            for _ in range(3):
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("os._exit", leave)
+    signals.install()
+    with pytest.raises(signals.Stopped) as stopped:
+        press_three_times()
+    assert isinstance(stopped.value.__context__, SystemExit)
 
 
 def test_a_second_signal_only_says_that_it_waits(capfd: pytest.CaptureFixture[str]) -> None:

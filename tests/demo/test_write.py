@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import signal
 import subprocess
 import sys
 from collections import defaultdict
@@ -320,6 +321,26 @@ def test_nothing_half_made_is_left(
     monkeypatch.setattr("hybridlog.demo.topics.Topic.log_times", fail)
     with pytest.raises(raised):
         write_bag(tmp_path / "x", duration_s=2, ros=ros, topics=["/odom"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_stops_it_between_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+
+    def press(*_: object) -> None:
+        written.append(True)
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr("rosbags.rosbag1.Writer.write", press)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_bag(tmp_path / "x.bag", duration_s=2, topics=["/odom"])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert written == [True]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import pytest
@@ -51,6 +51,7 @@ from hybridlog_storage.segment_format import (
 )
 from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from hybridlog_storage.stopping import at_safe_points, postpone
 from tests.storage.steps import Steps, through
 
 RECORDING = {
@@ -460,6 +461,27 @@ def test_chunks_that_wait_are_written_together(
         assert int.from_bytes(data[chunk.offset + 1 : chunk.offset + 9], "little") == (
             chunk.length - 9
         )
+
+
+def test_waiting_for_chunks_ends_when_a_signal_asks_for_it(tmp_path: Path) -> None:
+    def stop() -> NoReturn:
+        raise KeyboardInterrupt
+
+    def work() -> None:
+        with at_safe_points():
+            writer.append(batch_of(many(20)), CHANNELS)
+            postpone(stop)
+            try:
+                writer.flush()
+                flushed.append(True)
+            finally:
+                writer.abort()
+
+    flushed: list[bool] = []
+    writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert flushed == []
 
 
 def test_no_chunk_follows_one_that_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
