@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,12 +12,13 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.answer_notes import latched, print_gaps, print_remarks
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room, replacing
+from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import Front, write_answer
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
+from hybridlog_storage.unfinished import undone
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
@@ -118,7 +120,10 @@ def _write_file(
     force: bool,
     quiet: bool,
 ) -> None:
-    with if_stopped(f"{target} is not written."), replacing(target, form=form, force=force):
+    with (
+        if_stopped(partial(not_written, target)),
+        replacing(target, form=form, force=force),
+    ):
         write_answer(query, form, target, front=front, extras=extras, quiet=quiet)
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
     beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
@@ -133,14 +138,17 @@ def _write_file(
 def _write_directory(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     """Write one file a topic, except topics that fit no table or have no message in the range."""
     query.check_range()  # refuses a range without any message
-    new = not directory.exists()
-    try:
+    if directory.exists():
+        _write_tables(query, form, directory, force=force, quiet=quiet)
+        return
+    with undone(partial(_remove_empty, directory)):
         _make(directory)
         _write_tables(query, form, directory, force=force, quiet=quiet)
-    finally:
-        if new:
-            with contextlib.suppress(OSError):  # files were written into it
-                directory.rmdir()
+
+
+def _remove_empty(directory: Path) -> None:
+    with contextlib.suppress(OSError):  # files were written into it
+        directory.rmdir()
 
 
 def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
@@ -151,7 +159,7 @@ def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quie
     for topic, path in paths.items():
         one = query.with_topic(topic)
         try:
-            with if_stopped(f"The files named above are whole, {path} is not written."):
+            with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
                 missing = write_answer(one, form, path, quiet=quiet)
         except (DefinitionError, TimeError) as error:
             what = "" if isinstance(error, DefinitionError) else f"{topic}: "

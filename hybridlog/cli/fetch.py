@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from hybridlog.cli.answer_notes import (
 )
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room, replacing
+from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import Front, write_answer
@@ -200,7 +201,7 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
         missing = write_answer(query, form, sys.stdout.buffer, front=front, quiet=True)
     else:
         with (
-            if_stopped(f"{path} is not written."),
+            if_stopped(partial(not_written, path)),
             replacing(path, form=form, force=choices.force),
         ):
             missing = write_answer(query, form, path, front=front, quiet=choices.quiet)

@@ -29,7 +29,7 @@ def main() -> NoReturn:
     try:
         code = _run()
     except signals.Stopped as stopped:
-        signals.remove_unfinished()
+        signals.undo_unfinished()
         _complain(f"interrupted. {stopped.consequence}".rstrip())
         code = stopped.exit_code
     _leave(_flushed(code))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.unfinished import is_published, undone
 
 
 def check_room(path: Path, *, form: str, force: bool) -> None:
@@ -49,17 +51,24 @@ def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
     import shutil
 
     aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
-    try:
-        path.rename(aside)
-    except OSError as error:
-        raise UsageError(f"{path} cannot be replaced: {error.strerror}.") from error
-    try:
+    with undone(partial(_bring_back, aside, path)):
+        try:
+            path.rename(aside)
+        except OSError as error:
+            raise UsageError(f"{path} cannot be replaced: {error.strerror}.") from error
         yield
-    except BaseException:
-        with suppress(OSError):
-            aside.rename(path)
-        raise
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def _bring_back(aside: Path, path: Path) -> None:
+    with suppress(OSError):
+        if not path.exists():
+            aside.rename(path)
+
+
+def not_written(path: Path) -> str:
+    """What becomes of an output file when the command is stopped."""
+    return "" if is_published(path) else f"{path} is not written."
 
 
 def _holds_payloads(path: Path) -> bool:

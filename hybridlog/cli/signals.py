@@ -89,11 +89,11 @@ def install() -> None:
             signal.signal(number, stop)
 
 
-def remove_unfinished() -> None:
-    """Remove the files that a command was writing when it was stopped."""
-    unfinished = sys.modules.get("hybridlog.export.unfinished")
+def undo_unfinished() -> None:
+    """Take back what a command has not completed when it is stopped, such as files."""
+    unfinished = sys.modules.get("hybridlog_storage.unfinished")
     if unfinished is not None:
-        unfinished.remove_unfinished()
+        unfinished.undo_unfinished()
 
 
 def write_note(text: str) -> None:
@@ -116,7 +116,7 @@ def _consequence() -> str:
 
 def _leave(number: int, consequence: str) -> NoReturn:
     """End the process in the handler: no other code of the main thread runs any more."""
-    remove_unfinished()
+    undo_unfinished()
     with contextlib.suppress(OSError, ValueError):
         clear = _SHOW_CURSOR if os.isatty(sys.stderr.fileno()) else ""
         write_note(clear + printable(f"hybridlog: interrupted. {consequence}".rstrip()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.output_path import check_room, replacing
+from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -127,7 +128,7 @@ def write_tables(
     if choices.output is None:
         return _write(limited, schema, form, sys.stdout.buffer)
     with (
-        if_stopped(f"{choices.output} is not written."),
+        if_stopped(partial(not_written, choices.output)),
         replacing(choices.output, form=form, force=choices.force),
     ):
         return _write(limited, schema, form, choices.output)

@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.export.base import FileWriter, Target, destination, failures
 from hybridlog.export.mcap import source_metadata
-from hybridlog.export.unfinished import beside, scratch_directory
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.unfinished import beside, scratch_directory
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
 
-from hybridlog.export.unfinished import Unfinished, beside
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.unfinished import Unfinished, beside
 
 if TYPE_CHECKING:
     from types import TracebackType

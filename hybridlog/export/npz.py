@@ -29,9 +29,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.export.base import FileWriter, Sink, Target, failures
-from hybridlog.export.unfinished import scratch_directory
 from hybridlog.schema.arrow_types import converted
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.unfinished import scratch_directory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import secrets
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ import zstandard
 
 from hybridlog.sources.base import cannot_open
 from hybridlog_storage.errors import NO_SPACE, SourceError
+from hybridlog_storage.unfinished import undone
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -103,16 +106,20 @@ def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | 
     room = shutil.disk_usage(folder).free - _SPARE
     if size > room:
         raise _no_room(path, folder)
-    with tempfile.NamedTemporaryFile(prefix="hybridlog-", delete=False) as target:
-        spooled = Spooled(Path(target.name), None)
+    spooled = Spooled(folder / f"hybridlog-{secrets.token_hex(8)}", None)
+    with undone(spooled.remove):
         try:
-            spooled.problem = fill(target, room)
-        except BaseException as error:
-            spooled.remove()
-            if isinstance(error, OSError) and error.errno in NO_SPACE:
+            with open(spooled.path, "xb", opener=_private) as target:
+                spooled.problem = fill(target, room)
+        except OSError as error:
+            if error.errno in NO_SPACE:
                 raise _no_room(path, folder) from error
             raise
     return spooled
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:

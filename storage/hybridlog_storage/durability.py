@@ -15,10 +15,13 @@ import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hybridlog_storage import files
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
-from hybridlog_storage.messages import Buffer
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Buffer
 
 
 def explain(error: OSError, path: Path, doing: str) -> HybridlogError:

@@ -10,8 +10,8 @@ from typing import NoReturn
 import pytest
 
 from hybridlog.cli import signals
-from hybridlog.export.unfinished import beside
 from hybridlog_storage.stopping import at_safe_points, safe_point
+from hybridlog_storage.unfinished import beside
 
 
 @pytest.fixture(autouse=True)

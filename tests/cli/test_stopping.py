@@ -200,6 +200,17 @@ main()
 """
 
 
+def stop_at(moment: str, *command: str, store: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command that gets SIGINT at a moment."""
+    return subprocess.run(
+        [sys.executable, "-c", STOPS_ITSELF, moment, *command],
+        capture_output=True,
+        text=True,
+        env=environment(HYBRIDLOG_STORE=str(store)),
+        check=False,
+    )
+
+
 @pytest.mark.parametrize(
     ("form", "moment"),
     [
@@ -221,17 +232,26 @@ def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path:
         command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target)]
     else:
         command = ["export", str(target)]
-    ended = subprocess.run(
-        [sys.executable, "-c", STOPS_ITSELF, moment, *command, "-r", "robot"],
-        capture_output=True,
-        text=True,
-        env=environment(HYBRIDLOG_STORE=str(store)),
-        check=False,
-    )
+    ended = stop_at(moment, *command, "-r", "robot", store=store)
     assert ended.returncode == 130, ended.stderr
     assert f"{target} is not written" in ended.stderr
     assert "Traceback" not in ended.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_that_was_to_be_replaced_comes_back(store: Path, tmp_path: Path) -> None:
+    target = tmp_path / "payloads"
+    command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target), "-r", "robot"]
+    run(*command, store=store)
+    before = sorted(path.name for path in target.iterdir())
+    ended = stop_at("return RawWriter.__init__", *command, "--force", store=store)
+    assert ended.returncode == 130, ended.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
+    assert sorted(path.name for path in target.iterdir()) == before
+    command = ["export", str(tmp_path / "new"), "-F", "csv", "-r", "robot"]
+    ended = stop_at("return FileWriter.__enter__", *command, store=store)
+    assert ended.returncode == 130, ended.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
 
 
 def limited(kilobytes: int) -> tuple[str, ...]:

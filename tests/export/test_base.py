@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -23,8 +24,15 @@ from hybridlog.export import (
     open_table_writer,
 )
 from hybridlog.export.base import Sink
-from hybridlog.export.unfinished import beside, remove_unfinished, scratch_directory
+from hybridlog_storage import unfinished
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.unfinished import (
+    beside,
+    is_published,
+    scratch_directory,
+    undo_unfinished,
+    undone,
+)
 from tests.export.batches import many, ros1_channels
 
 TABLE = pa.table({"x": [1.0, 2.0], "name": ["a", "b"], "v": [[1, 2], []]})
@@ -218,7 +226,7 @@ def write_whole(name: str, target: Path) -> None:
         with fill(name, target, messages=5):  # type: ignore[attr-defined]
             pass
     except BaseException:
-        remove_unfinished()
+        undo_unfinished()
         raise
 
 
@@ -237,7 +245,7 @@ class Interruption:
         at: Number of the step, from 1; 0 for none.
     """
 
-    OURS = str(Path(hybridlog.export.__file__).parent)
+    OURS = (str(Path(hybridlog.export.__file__).parent), unfinished.__file__)
 
     def __init__(self, at: int) -> None:
         self.at = at
@@ -354,17 +362,42 @@ def test_a_child_process_removes_nothing_of_its_parent(tmp_path: Path) -> None:
     child = os.fork()
     if not child:
         try:
-            remove_unfinished()
+            undo_unfinished()
             file.remove()
         finally:
             os._exit(0)
     os.waitpid(child, 0)
     assert len(list(tmp_path.iterdir())) == 2
-    remove_unfinished()
+    undo_unfinished()
     assert list(tmp_path.iterdir()) == []
     file.path.touch()  # another's by now
     file.remove()
     assert list(tmp_path.iterdir()) == [file.path]
+
+
+def test_what_was_done_is_undone_when_the_process_is_stopped_or_the_work_fails() -> None:
+    done: list[str] = []
+    with undone(lambda: done.append("over")):
+        pass
+    with suppress(ValueError), undone(lambda: done.append("failed")):
+        raise ValueError
+    with undone(lambda: done.append("outer")), undone(lambda: done.append("inner")):
+        child = os.fork()
+        if not child:
+            undo_unfinished()
+            os._exit(len(done) - 1)
+        assert os.waitpid(child, 0)[1] == 0
+        undo_unfinished()
+    undo_unfinished()
+    assert done == ["failed", "inner", "outer"]
+
+
+def test_a_file_is_published_once_it_has_its_name(tmp_path: Path) -> None:
+    place = beside(tmp_path / "x")
+    place.path.touch()
+    assert not is_published(tmp_path / "x")
+    place.publish(tmp_path / "x")
+    assert is_published(tmp_path / "x")
 
 
 def test_a_scratch_directory_is_private(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -117,6 +117,18 @@ def test_a_clock_that_goes_back_takes_log_times_with_it(store: hl.Store) -> None
     assert "/clock went back by 100.000 s, to 0.000 s" in simulation.said[0]
 
 
+def test_a_loss_over_a_jump_is_a_span(store: hl.Store) -> None:
+    simulation = Simulation(store)
+    simulation.tick(100)
+    first = simulation.now
+    simulation.say("a")
+    simulation.tick(3)
+    simulation.speaker.sink.lost(  # type: ignore[union-attr]
+        "/chatter", Cause.TRANSPORT, 2, first=first, last=simulation.now
+    )
+    assert simulation.end()[1] == [("/chatter", "transport", 2, 3 * SECOND, 100 * SECOND)]
+
+
 def test_what_does_not_fit_before_the_clock_is_in_the_ledger(store: hl.Store) -> None:
     simulation = Simulation(store, budget_bytes=1 << 20)
     for number in range(10):

@@ -3,8 +3,8 @@
 An interruption (Ctrl-C) may come at any moment: after a file is created and before an
 object owns it, or on the way into the function that would remove it. So a name is
 registered before its file exists, and unregistered only after its file is gone.
-Registered files are removed with their owner, by `remove_unfinished`, or when the process
-ends.
+Registered files are removed with their owner, by `undo_unfinished`, or when the process
+ends. `undone` registers other things to take back.
 """
 
 from __future__ import annotations
@@ -14,13 +14,16 @@ import secrets
 import shutil
 import tempfile
 import weakref
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hybridlog_storage.durability import publish
 
 _noted: dict[Path, int] = {}
 """Unfinished paths and the process that makes them: a child process removes none."""
+_published: set[Path] = set()
+_undo: list[tuple[int, Callable[[], object]]] = []
 
 
 class Unfinished:
@@ -46,6 +49,7 @@ class Unfinished:
             OSError: The rename fails.
         """
         publish(self.path, final, depth=1)
+        _published.add(final)
         self.remove()
 
     def remove(self) -> None:
@@ -70,13 +74,40 @@ def scratch_directory() -> Unfinished:
     return place
 
 
-def remove_unfinished() -> None:
-    """Remove all unfinished files of this process.
+@contextmanager
+def undone(undo: Callable[[], object]) -> Iterator[None]:
+    """Take something back if the block fails, or if the process is stopped in it.
+
+    Args:
+        undo: Takes it back; may be called before it was done.
+    """
+    registered = os.getpid(), undo
+    _undo.append(registered)
+    try:
+        yield
+    except BaseException:
+        undo()
+        raise
+    finally:
+        _undo.remove(registered)
+
+
+def is_published(final: Path) -> bool:
+    """True if this process has completed a file or directory of that name."""
+    return final in _published
+
+
+def undo_unfinished() -> None:
+    """Remove all unfinished files of this process, and take back what is registered.
 
     For a process that is stopping and may have lost its reference to the writer.
     """
     for path in list(_noted):
         _remove(path)
+    for process, undo in reversed(_undo):
+        if process == os.getpid():
+            with suppress(OSError):
+                undo()
 
 
 def _remove(path: Path) -> None:
