@@ -62,7 +62,7 @@ def open_source(path: Path) -> Source:
         raise SourceError(f"{path}: neither a file nor a directory; give the path of a log")
     metadata = read_metadata(path.parent)
     if isinstance(metadata, BagMetadata) and sniff(path)[0] in {Format.SQLITE, Format.MCAP}:
-        files, _ = locate(path.parent, metadata) if metadata.files else ({}, [])
+        files, _ = locate(path.parent, metadata)
         if path in files:
             return _join(path, {path: files[path]}, metadata)
     return _open_file(path)
@@ -210,6 +210,8 @@ def _open_directory(folder: Path) -> Source:
 def _open_bag(folder: Path, metadata: BagMetadata) -> Source:
     """Open a ROS 2 bag with its metadata, which need not list all parts."""
     files, damage = locate(folder, metadata)
+    if not files:
+        return _open_renamed(folder, metadata, damage)
     names = {plain(path) for path in files}
     first = next((path for path in files if path.stat().st_size), None)
     more = [path for path in _empty_in(folder) if _continues(first, path)]
@@ -229,6 +231,23 @@ def _open_bag(folder: Path, metadata: BagMetadata) -> Source:
     lost = {damaged.file for damaged in damage}
     gaps = [gap for gap in _gaps(list(files)) if gap.file not in lost]
     return _join(folder, files, metadata, damage, gaps=gaps, unread=unread)
+
+
+def _open_renamed(folder: Path, metadata: BagMetadata, damage: Sequence[Damage]) -> Source:
+    """Open the files of a ROS 2 bag whose metadata lists none of them.
+
+    Raises:
+        SourceError: There are none, or they are not parts of one log.
+    """
+    logs = _logs_in(folder)
+    if not logs or (len(logs) > 1 and not _is_split(logs)):
+        listed = ", ".join(metadata.files[:5]) or "no file"
+        raise SourceError(
+            f"{folder}: none of the files that its {NAME} lists is there ({listed}); put them "
+            "beside it, or give the path of the file itself"
+        )
+    # With as many messages as listed, they are the listed files under other names.
+    return _join(folder, dict.fromkeys(logs), metadata, gaps=[*damage, *_gaps(logs)])
 
 
 def _continues(first: Path | None, path: Path) -> bool:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from hybridlog.sources.base import Damage, cannot_open
 from hybridlog.sources.rosbag2_metadata import MAX_BYTES, NAME, BagMetadata, parse_metadata
 from hybridlog.yaml_values import YamlError
-from hybridlog_storage.errors import SourceError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,7 +43,7 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None],
         for missing ones.
 
     Raises:
-        SourceError: None of them exists.
+        SourceError: The folder cannot be read.
     """
     files: dict[Path, int | None] = {}
     absent: list[str] = []
@@ -65,12 +64,6 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None],
             files.setdefault(found, metadata.counts.get(name))
         else:
             absent.append(name)
-    if not files:
-        listed = ", ".join(metadata.files[:5]) or "no file"
-        raise SourceError(
-            f"{folder}: none of the files that its {NAME} lists is there ({listed}); put them "
-            "beside it, or give the path of the file itself"
-        )
     return files, _missing(folder, metadata, absent)
 
 

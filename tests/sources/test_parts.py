@@ -12,6 +12,7 @@ import zstandard
 from mcap.writer import Writer
 
 from hybridlog.sources.detect import open_source, read_time_range
+from hybridlog_storage.errors import SourceError
 
 BEGIN = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -143,6 +144,28 @@ def test_first_and_last_parts_are_missed_by_their_messages(bag: Path) -> None:
     found = Found(bag)
     assert found.numbers == FIFTEEN[5:10]
     assert found.damage == [("metadata.yaml", 10)]
+
+
+@pytest.mark.parametrize(
+    ("listed", "count", "damage"),
+    [
+        (["x_0.db3", "x_1.db3"], 15, []),
+        (["x_0.db3"], 20, [("x_0.db3", 5)]),
+        ([], 15, []),
+        ([], 16, [("metadata.yaml", 1)]),
+    ],
+)
+def test_files_that_got_other_names(
+    bag: Path, listed: list[str], count: int, damage: list[tuple[str, int]]
+) -> None:
+    put_metadata(bag, listed, count)
+    found = Found(bag)
+    assert (found.numbers, found.damage) == (FIFTEEN, damage)
+    found = Found(bag / "bag_1.db3")
+    assert (found.numbers, found.damage) == (FIFTEEN[5:10], [])
+    put_db3(bag / "other.db3", [99])
+    with pytest.raises(SourceError, match="none of the files"):
+        open_source(bag)
 
 
 def test_several_missing_parts_and_their_names(tmp_path: Path) -> None:
