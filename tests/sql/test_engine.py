@@ -213,6 +213,17 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
         own.sql("select max(ranges[1]) from scan").rows()
 
 
+def test_compacted_recordings_answer_alike(own: hl.Store) -> None:
+    query = "select ranges, echo.far, echo.data[3] from scan where angle < 100 order by t"
+    before = own.sql(query).to_arrow()
+    report = own.compact(drop_mcap=True)
+    assert report
+    own.refresh()
+    answer = own.sql(query)
+    assert answer.to_arrow().equals(before)
+    assert answer.counts.payload_bytes > 0
+
+
 def test_refreshing_sees_new_recordings(own: hl.Store) -> None:
     query = "select count(*) from large where recording = 'first'"
     before = own.sql(query)
