@@ -302,7 +302,7 @@ def _check_result(source: Source, writer: RecordingWriter, options: RecordOption
         first = source.damage[0]
         raise SourceError(f"{source.path}: no message could be read: {first.reason}")
     if options.matcher is not None and not writer.totals.messages:
-        topics = ", ".join(sorted({c.topic for c in source.channels})[:20]) or "none"
+        topics = listed(sorted({c.topic for c in source.channels}), 20)
         raise TopicError(
             f"{source.path}: no message is on the topics asked for; the log has: {topics}"
         )

@@ -22,6 +22,7 @@ from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.schema.arrow_columns import DURATION, numbers
 from hybridlog.schema.arrow_types import common_schema, common_type, converted
 from hybridlog.schema.column import STAMP
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
@@ -593,7 +594,7 @@ def side_by_side(
     if len(base.topics) != 1:
         raise UsageError(
             f"The rows are the messages of one topic, not of {len(base.topics)}: name one of "
-            f"{', '.join(base.topics[:10])}."
+            f"{listed(base.topics)}."
         )
     counters = Counters()
     chosen: Clock = clock  # type: ignore[assignment]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog.cli import output
 from hybridlog.losses import Cause
+from hybridlog.wording import listed
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -169,7 +170,7 @@ def closing_rows(
     for cause, count in sorted(state.lost.items()):
         losses = [row for row in entry.end.get("losses", []) if row["cause"] == cause]
         topics = sorted({row["topic"] or "any" for row in losses})
-        named = ", ".join(topics[:3]) + (" …" if len(topics) > 3 else "")
+        named = listed(topics, 3)
         what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
         rows.append((what, f"{_number(count, losses)} ({named})"))
     return rows

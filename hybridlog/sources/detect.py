@@ -14,6 +14,7 @@ from hybridlog.sources.base import Damage, Source, cannot_open
 from hybridlog.sources.joined import JoinedSource, Part, Total
 from hybridlog.sources.rosbag2 import locate, plain, read_metadata
 from hybridlog.sources.rosbag2_metadata import NAME, BagMetadata
+from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
 
 if TYPE_CHECKING:
@@ -197,7 +198,7 @@ def _open_directory(folder: Path) -> Source:
             "of a log itself"
         )
     if len(logs) > 1 and not _is_split(logs):
-        names = ", ".join(path.name for path in logs[:5]) + (", ..." if len(logs) > 5 else "")
+        names = listed((path.name for path in logs), 5)
         raise SourceError(
             f"{folder}: {len(logs)} logs that are not parts of one ({names}); give the path of "
             "one of them"

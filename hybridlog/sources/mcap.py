@@ -19,6 +19,7 @@ from hybridlog.sources.base import (
     Source,
     cannot_open,
 )
+from hybridlog.wording import listed
 from hybridlog_storage.attachments import Attachment, FileHandle
 from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import SegmentError, SourceError
@@ -265,7 +266,7 @@ class McapSource(Source):
             lost = int((found == _UNDEFINED).sum())
             if lost:
                 undefined = distinct(rows.channel[found == _UNDEFINED]).tolist()
-                names = ", ".join(map(str, undefined[:5]))
+                names = listed(map(str, undefined), 5)
                 reason = f"{lost} messages on channels that are not defined ({names})"
                 self._note(offset, None, reason, lost)
             rows, found = rows.take(known), found[known]

@@ -46,6 +46,7 @@ from hybridlog.sources.rosbag1_records import (
     parse_fields,
     parse_header,
 )
+from hybridlog.wording import listed
 from hybridlog_storage.compression import is_implausible
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap_content import MIN_RECORDS
@@ -758,7 +759,7 @@ class Rosbag1Source(Source):
         if not self._undefined:
             return
         ids = sorted(self._undefined)
-        shown = ", ".join(str(conn) for conn in ids[:10]) + (", ..." if len(ids) > 10 else "")
+        shown = listed(map(str, ids))
         self._report(
             self._undefined_at or 0,
             None,

@@ -24,6 +24,7 @@ from hybridlog.sources.base import (
 )
 from hybridlog.sources.rosbag2_metadata import parse_metadata
 from hybridlog.sources.spool import copy_start
+from hybridlog.wording import listed
 from hybridlog.yaml_values import YamlError
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
@@ -340,7 +341,7 @@ class SqliteSource(Source):
         if self._undefined:
             numbers = sorted(number for number in self._undefined if number is not None)
             names = [*map(str, numbers), *(["NULL"] if None in self._undefined else [])]
-            ids = ", ".join(names[:10])
+            ids = listed(names)
             reason = f"messages of topics that the bag does not list (topic id {ids})"
             lost = self._undefined.total()
             self.damage.append(Damage(self.path, None, None, reason, lost))

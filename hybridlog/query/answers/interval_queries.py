@@ -18,6 +18,7 @@ from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joi
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
+from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -259,7 +260,7 @@ class IntervalQueries:
         if len(question.topics) != 1:
             raise UsageError(
                 f"{subject} is one topic's; this question has {len(question.topics)}: name one "
-                f"of {', '.join(question.topics[:10])}."
+                f"of {listed(question.topics)}."
             )
         if not question.returns_all or question.reverse:
             raise UsageError(

@@ -13,6 +13,7 @@ from hybridlog.query.intervals import MOST_PIECES, Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class Rates:
         if len(self._question.topics) != 1:
             raise UsageError(
                 f"A gap is one topic's; this question has {len(self._question.topics)}: name one "
-                f"of {', '.join(self._question.topics[:10])}."
+                f"of {listed(self._question.topics)}."
             )
         least = 0 if longer_than is None else parse_duration(longer_than)
         if periods is None and longer_than is None:

@@ -20,6 +20,7 @@ from hybridlog.query.predicate.tree import (
     Predicate,
     Value,
 )
+from hybridlog.wording import listed
 from hybridlog_storage.errors import WhereError
 
 Stat = Literal["n", "min", "max", "mean"]
@@ -198,7 +199,7 @@ class _Checker:
             return
         below = [name for name in self._types.types if name.startswith(f"{path}.")]
         leaves = [name for name in below if name not in self._types.inner]
-        names = ", ".join(leaves[:_SHOWN]) + (" …" if len(leaves) > _SHOWN else "")
+        names = listed(leaves, _SHOWN)
         raise self._fail(
             asked, f"{path} is a message, not a value; ask for one of its fields: {names}"
         )
@@ -238,8 +239,8 @@ class _Checker:
             for key in difflib.get_close_matches(path.lower(), lowered, n=_SHOWN, cutoff=0.5)
         ]
         shown = list(dict.fromkeys(near or known))
-        names = ", ".join(shown[:_SHOWN]) + (" …" if len(shown) > _SHOWN else "")
-        hint = f"; did you mean {names}?" if near else f"; there are {names}" if names else ""
+        names = listed(shown, _SHOWN)
+        hint = f"; did you mean {names}?" if near else f"; there are {names}" if shown else ""
         return self._fail(asked, f"there is no field {path}{hint}")
 
     def _fail(self, asked: Field, message: str) -> WhereError:

@@ -514,7 +514,9 @@ def test_a_dead_node_is_told_of_once_and_its_topics_do_not_come(
             master.add(f"/dead/{number:02}", "std_msgs/String", "/dead", uri)
         sink = Collector()
         source.start(sink)
-        sink.wait_said("11 topics (/dead/00, /dead/01, /dead/02, …)", uri, "rosnode cleanup")
+        sink.wait_said(
+            "11 topics (/dead/00, /dead/01, /dead/02 and 8 more)", uri, "rosnode cleanup"
+        )
         master.add("/dead/late", "std_msgs/String", "/dead", uri)
         calls = master.calls.count("getSystemState")
         eventually(lambda: master.calls.count("getSystemState") > calls + 30)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.ros1.network import UnreachedError, reason_of
 from hybridlog.live.sources.text import one_line
+from hybridlog.wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,9 +78,7 @@ class ErrorAggregator:
 
 
 def _line(uri: str, reason: str, topics: list[str], *, is_unreachable: bool) -> str:
-    named = ", ".join(map(one_line, topics[:_MAX_NAMED])) + (
-        ", …" if len(topics) > _MAX_NAMED else ""
-    )
+    named = listed(map(one_line, topics), _MAX_NAMED)
     its = "its"
     if len(topics) > 1:
         named, its = f"{len(topics)} topics ({named})", "their"
