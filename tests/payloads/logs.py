@@ -47,12 +47,14 @@ def _header(n: int, frame: str):
     return kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](1, n), frame)
 
 
-def scan(values: Sequence[float] | np.ndarray, *, frame: str = "laser", n: int = 2) -> bytes:
+def scan(
+    values: Sequence[float] | np.ndarray, *, frame: str = "laser", n: int = 2, big: bool = False
+) -> bytes:
     numbers = np.asarray(values, np.float32)
     half = numbers[: len(numbers) // 2]
     angles = -1.5, 1.5, 0.01, 0.0, 0.1, 0.0, 30.0
     message = typestore().types[SCAN](_header(n, frame), *angles, numbers, half)
-    return bytes(typestore().serialize_cdr(message, SCAN))
+    return bytes(typestore().serialize_cdr(message, SCAN, little_endian=not big))
 
 
 def cloud(

@@ -15,6 +15,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.maintenance import thinning
 from hybridlog.payloads.contents import open_segment
+from hybridlog.payloads.reader import RecordingPayloads
 from hybridlog_storage import journal
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.segment_reader import SegmentReader
@@ -280,6 +281,30 @@ def test_a_segment_that_differs_is_not_used(copy: Path, monkeypatch: pytest.Monk
         assert len(store.recordings()[0].payloads) == 2
         assert messages(store) == before
         assert store.verify().findings == []
+
+
+def test_content_that_differs_is_not_used(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither when chunks are taken out, nor when one is read later."""
+    content = RecordingPayloads.content
+
+    def wrong(self: RecordingPayloads, segment: int, chunk: int, size: int) -> Any:
+        found = content(self, segment, chunk, size)
+        if any("topic=cloud" in r.listed.file for r in self.having(segment, chunk)):
+            found[-1] ^= 1
+        return found
+
+    with hl.open(copy) as store:
+        monkeypatch.setattr(RecordingPayloads, "content", wrong)
+        clouds, scans = store.compact(drop_mcap=True)
+        assert (clouds.dropped, clouds.both) == (0, COUNT)
+        assert (scans.dropped, scans.both) == (COUNT, 0)
+        monkeypatch.undo()
+        assert store.verify().findings == []
+        (clouds,) = store.compact(topics=["cloud"], drop_mcap=True)
+        assert clouds.dropped == COUNT
+        monkeypatch.setattr(RecordingPayloads, "content", wrong)
+        with pytest.raises(SegmentError, match="do not come back"):
+            store.topic("/cloud").at(BASE + STEP)
 
 
 def test_the_proof_sees_every_difference(copy: Path) -> None:

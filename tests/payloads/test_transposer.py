@@ -65,6 +65,14 @@ def test_bytes_that_mean_nothing_come_back() -> None:
     assert_exact(scan_channel(), [bytes(p) + b"\xa5\x5a" for p in payloads])
 
 
+def test_both_byte_orders_may_share_a_chunk() -> None:
+    payloads = [scan([n + 0.25] * (3 + n), big=n % 2 == 1) for n in range(6)]
+    piece = assert_exact(scan_channel(), payloads)
+    found = piece.table.column("ranges").to_pylist()
+    assert found == [[n + 0.25] * (3 + n) for n in range(6)]
+    assert_exact(scan_channel(), payloads[1::2])
+
+
 def test_all_bits_of_floats_come_back() -> None:
     bits = np.array([0x7FC00001, 0xFF800001, 0x80000000, 0x00000001, 0x7F800000], np.uint32)
     piece = assert_exact(scan_channel(), [scan(bits.view(np.float32))] * 3)
