@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room
+from hybridlog.cli.output_path import check_room, not_written
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
@@ -144,7 +145,7 @@ def _write_all(found: list[StoredAttachment], directory: Path, *, force: bool, q
 
 
 def _write(attachment: StoredAttachment, path: Path, *, quiet: bool) -> None:
-    with if_stopped(f"{path} is not written."):
+    with if_stopped(partial(not_written, path)):
         attachment.save(path)
     if not quiet:
         output.note(f"{path}: {output.size(attachment.size)}")

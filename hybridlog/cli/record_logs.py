@@ -65,7 +65,8 @@ def record_logs(choices: RecordChoices) -> None:
             before = 0
             for log in logs:
                 safe_point()
-                recorder.record(store, log, partial(_shown, bar, before, log))
+                name = f"{log.path.name}: " if len(logs) > 1 else ""
+                recorder.record(store, log, partial(_shown, bar, before, name))
                 before += log.size
     finally:
         done.show()
@@ -119,9 +120,9 @@ def _what(logs: Sequence[Log]) -> str:
     return logs[0].path.name if len(logs) == 1 else f"{len(logs)} logs"
 
 
-def _shown(bar: Bar, before: int, log: Log, read: int, messages: int) -> None:
-    """Show the progress of a log after others."""
-    bar(before + read, f"{log.path.name}: {output.counted(messages, 'message')}")
+def _shown(bar: Bar, before: int, name: str, read: int, messages: int) -> None:
+    """Show the progress of a log after others; a single one needs no name beside the bar."""
+    bar(before + read, f"{name}{output.counted(messages, 'message')}")
 
 
 class LogRecorder:
