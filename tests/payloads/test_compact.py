@@ -120,6 +120,7 @@ def test_every_byte_is_verified(compacted: hl.Store) -> None:
     assert compacted.verify().findings == []
 
 
+@pytest.mark.exhaustive
 def test_a_second_run_finds_nothing(compacted: hl.Store) -> None:
     before = sorted(recording_of(compacted.directory.path).rglob("*"))
     assert compacted.compact() == []
@@ -154,6 +155,7 @@ def test_damage_of_columns_is_found(plain: Path, copy: Path) -> None:
             assert messages(store) == messages(other)  # from the segments
 
 
+@pytest.mark.exhaustive
 def test_columns_follow_a_recording(compacted: hl.Store, tmp_path: Path) -> None:
     with hl.open(tmp_path / "other", create=True) as store:
         assert store.import_from(compacted.directory.path).imported == ["log"]
@@ -283,6 +285,7 @@ def test_a_crash_before_the_journal_is_undone_and_after_it_finished(copy: Path) 
     assert not file.exists()
 
 
+@pytest.mark.exhaustive
 def test_a_full_disk_leaves_the_recording_as_it_was(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

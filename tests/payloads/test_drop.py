@@ -92,6 +92,7 @@ def test_every_byte_is_verified(thin: hl.Store) -> None:
     assert found.messages == 3 * COUNT + IMAGES
 
 
+@pytest.mark.exhaustive
 def test_index_and_tables_are_made_again_from_columns(plain: Path, copy: Path) -> None:
     with hl.open(copy) as store:
         store.compact(drop_mcap=True)
@@ -174,6 +175,7 @@ def test_a_topic_can_follow_later(plain: Path, copy: Path) -> None:
             assert [m.raw for m in store.query(topics)] == [m.raw for m in other.query(topics)]
 
 
+@pytest.mark.exhaustive
 def test_what_else_is_in_a_segment_stays(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", robot(40))
     with path.open("rb") as file, (tmp_path / "more.mcap").open("wb") as more:
@@ -202,6 +204,7 @@ def test_what_else_is_in_a_segment_stays(tmp_path: Path) -> None:
         assert kept == [("map.pgm", b"P5" * 5000), {"wheels": "4"}]
 
 
+@pytest.mark.exhaustive
 def test_columns_follow_a_recording(thin: hl.Store, tmp_path: Path) -> None:
     with hl.open(tmp_path / "other", create=True) as store:
         store.import_from(thin.directory.path)
@@ -221,6 +224,7 @@ def test_a_lost_journal_is_made_again(thin: hl.Store, tmp_path: Path) -> None:
         assert "was rebuilt" in finding.problem
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("which", [b'"files"', b'"segments"'])
 def test_a_damaged_line_of_the_journal_loses_nothing(
     thin: hl.Store, tmp_path: Path, which: bytes
@@ -255,6 +259,7 @@ def test_a_lost_file_of_columns_is_a_loss(thin: hl.Store, tmp_path: Path) -> Non
         assert any("is missing" in finding.problem for finding in store.verify().findings)
 
 
+@pytest.mark.exhaustive
 def test_a_flipped_bit_of_columns_is_found(thin: hl.Store, tmp_path: Path) -> None:
     copy_of(thin, tmp_path)
     (path,) = recording_of(tmp_path / "store").glob("payloads/topic=cloud/*")
