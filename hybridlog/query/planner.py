@@ -145,6 +145,8 @@ class Planner:
         predicate = self.question.predicate
         asks_fields = predicate is not None and predicate.asks_fields
         for topic, channels in by_topic.items():
+            if recording.status != "open" and not any(c.stats.messages for c in channels):
+                continue  # nothing was sent on the topic
             blind = [c for c in channels if asks_fields and _has_no_fields(c)]
             yield Part(
                 recording,
