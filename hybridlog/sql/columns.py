@@ -151,12 +151,6 @@ def merged(kinds: Sequence[Any]) -> Any:
     kinds = list(dict.fromkeys(kind for kind in kinds if not _types.is_null(kind)))
     if len(kinds) <= 1:
         return kinds[0] if kinds else pa.null()
-    whole = [kind for kind in kinds if not is_summary(kind)]
-    if len(whole) < len(kinds):
-        if whole and all(map(_may_be_summary, whole)):
-            return merged(whole)
-        if whole or len({kind.num_fields for kind in kinds}) > 1:
-            return pa.json_()
     for applies, merge in _MERGES:
         if all(map(applies, kinds)):
             return merge(kinds)
@@ -207,11 +201,16 @@ _MERGES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Sequence[Any]], A
 )
 
 
-def whole_type(kind: Any) -> Any:
-    """The type of messages of which tables hold some arrays as summaries.
+def whole_message(kind: Any) -> Any:
+    """The type of messages of which a table holds some arrays as summaries.
 
     Such an array is a list of numbers, or JSON text where its elements are no numbers.
     """
+    return pa.struct([field.with_type(whole_type(field.type)) for field in kind])
+
+
+def whole_type(kind: Any) -> Any:
+    """The same for the type of a field."""
     if is_summary(kind):
         if kind.num_fields == 1:
             return pa.json_()

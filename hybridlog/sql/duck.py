@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Final, TypeVar
 
@@ -138,8 +138,9 @@ class Worker:
     def _stop(self, future: Future[_T]) -> None:
         # A call that has not reached DuckDB yet does not notice.
         while not future.done():
-            self._cursor.interrupt()
-            wait([future], _POLL_S)
+            with suppress(KeyboardInterrupt):  # pressed again
+                self._cursor.interrupt()
+                wait([future], _POLL_S)
 
     def close(self) -> None:
         """End the thread."""

@@ -18,6 +18,7 @@ import pyarrow as pa
 
 from hybridlog.losses import lost_spans
 from hybridlog.query.question import RecordedChannel
+from hybridlog.sql.columns import whole_message
 from hybridlog.tables.fields import without
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog_storage.catalog import ChannelStats
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.open_segment import OpenSegment
     from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 
-_FIXED: Final = frozenset({"ros1", "cdr", "protobuf"})
+_FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""
 _MAX_CHUNKS: Final = 4  # read chunks that are kept
 Paths = Collection[str] | None
@@ -153,17 +154,19 @@ class TopicOfRecording:
     def is_fixed(self) -> bool:
         """True if definitions fix the fields of all messages."""
         return all(
-            channel.is_reduced
-            or channel.codec.reason is not None
-            or channel.channel.message_encoding in _FIXED
+            channel.is_reduced or channel.codec.reason is not None or _is_fixed(channel)
             for channel in self.channels.values()
         )
 
     @cached_property
     def kinds(self) -> list[Any]:
-        """Types of its messages; arrays may be summaries where no definition fixes the fields."""
+        """Types of its messages."""
         if not self.is_fixed:
-            return [kind for source in self.sources for kind in source.kinds]
+            return [
+                kind if source.is_whole else whole_message(kind)
+                for source in self.sources
+                for kind in source.kinds
+            ]
         return [
             kind_of(channel)
             for channel in self.channels.values()
@@ -175,7 +178,10 @@ class TopicOfRecording:
         """Its table; None if it can have none."""
         if self.entry.status == "open" or any(True for _ in lost_spans(self.entry)):
             return None  # rows of lost messages must not answer
-        return self.session.table(self.entry, self.topic)
+        found = self.session.table(self.entry, self.topic)
+        if found is None or self.is_fixed or all(len(f.about.topics) == 1 for f in found.files):
+            return found
+        return None  # small topics without a definition share a file, and its types
 
     @cached_property
     def sources(self) -> list[RowSource]:
@@ -239,6 +245,20 @@ class TopicOfRecording:
                     del self._read[next(iter(self._read))]
                 self._read[segment, number] = found
         return found
+
+
+def _is_fixed(channel: RecordedChannel) -> bool:
+    """True if the definition of a channel fixes the fields of its messages."""
+    encoding = channel.channel.message_encoding
+    # The keys of a map of protobuf are fields, which no definition knows.
+    return encoding in _FIXED or (encoding == "protobuf" and not _has_open(kind_of(channel)))
+
+
+def _has_open(kind: Any) -> bool:
+    """True if a type has a struct without fields."""
+    if pa.types.is_struct(kind):
+        return not kind.num_fields or any(_has_open(field.type) for field in kind)
+    return bool(pa.types.is_list(kind)) and _has_open(kind.value_type)
 
 
 def kind_of(channel: RecordedChannel) -> Any:

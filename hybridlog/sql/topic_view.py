@@ -21,7 +21,6 @@ from hybridlog.sql.columns import (
     merged,
     summary_values,
     view_columns,
-    whole_type,
 )
 from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
@@ -104,7 +103,7 @@ class TopicView:
         self.size = size
         self._recordings = recordings
         self._made: dict[int, tuple[TopicOfRecording, _Chooser]] = {}
-        kind = whole_type(merged(list(kinds)) if kinds else pa.struct([]))
+        kind = merged(list(kinds)) if kinds else pa.struct([])
         self._columns = {column.name: column for column in view_columns(kind)}
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
@@ -249,7 +248,7 @@ class _Plan:
         where = self._where
         tests_them = _named(str(where), [leaf.name for leaf in absent.values()])
         if where is not None and not tests_them:
-            known = self._batch(recording, rows, {}, self._tested)
+            known = self._batch(recording, rows, dict.fromkeys(absent), self._tested)
             chosen = np.flatnonzero(_mask(known, where).to_numpy(zero_copy_only=False))
             where = None
         for some in _split(chosen, rows.own["ref"]):
@@ -291,7 +290,7 @@ class _Plan:
             if key in payloads:
                 return payloads[key]
             array = _at(rows.records, column.source)
-            if array is None or (lacks(array.type, column.kind) and not column.is_summary):
+            if array is None:
                 return None
             return (summary_values if column.is_summary else fitted)(array, column.kind)
 

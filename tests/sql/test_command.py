@@ -228,7 +228,7 @@ def test_the_prompt(root: Path, tmp_path: Path) -> None:
     person.reads("\n")
     while b"stopped" not in person.shown:  # it may not have begun yet
         os.kill(person.process.pid, signal.SIGINT)
-        if select.select([person.terminal], [], [], 0.2)[0]:
+        if select.select([person.terminal], [], [], 5)[0]:
             person.shown += os.read(person.terminal, 1 << 16)
     person.types("\rselect 6 * 7 as answer;\r")
     person.reads("42")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import secrets
 import shutil
 import signal
 import threading
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 
 import hybridlog as hl
@@ -162,15 +164,11 @@ def test_ctrl_c_ends_a_query(connection: SqlConnection) -> None:
 
 def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
-        if name in {"duckdb", "polars"}:
+        if name == "duckdb":
             raise ImportError(name)
         return importlib.import_module(name)
 
     with hl.open(root, mongo="mongodb://127.0.0.1:1/") as opened:
-        answer = opened.sql("select 1")
-        monkeypatch.setattr("hybridlog.sql.engine.import_module", missing)
-        with pytest.raises(MissingDependencyError, match="pip install polars"):
-            answer.to_polars()
         monkeypatch.setattr(duck, "import_module", missing)
         with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[sql\]'"):
             opened.sql("select 1")
@@ -222,6 +220,26 @@ def test_compacted_recordings_answer_alike(own: hl.Store) -> None:
     answer = own.sql(query)
     assert answer.to_arrow().equals(before)
     assert answer.counts.payload_bytes > 0
+
+
+def test_fields_that_no_definition_fixes(tmp_path: Path, server: str) -> None:
+    """Keys of a map of protobuf, and of JSON; types come from the messages."""
+    cases = Path(__file__).parents[1] / "cases"
+    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
+    with hl.open(tmp_path / "store", create=True, mongo=mongo) as opened:
+        for name in ("pb_std_imports_missing", "json_optional_keys", "json_int64_missing"):
+            opened.record(cases / f"{name}.mcap", name=name)
+        found = opened.sql("select info.fields.k.number_value, info.fields.l from c").rows()
+        assert found[0][0] == 3.0
+        assert found[0][1]["list_value"]["values"][0]["string_value"] == "z"
+        for topic in opened.topics():
+            view = opened.sql_engine.content().names.views[topic]
+            table = opened.sql(f'select * from "{view}" order by t, seq').to_arrow()
+            frame = opened.topic(topic).to_arrow()
+            assert table.num_rows == frame.num_rows > 0
+            for name in set(frame.column_names) & set(table.column_names) - {"log_time"}:
+                if not pa.types.is_timestamp(frame.schema.field(name).type):
+                    assert table.column(name).to_pylist() == frame.column(name).to_pylist()
 
 
 def test_refreshing_sees_new_recordings(own: hl.Store) -> None:
