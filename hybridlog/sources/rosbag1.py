@@ -426,6 +426,8 @@ class Rosbag1Source(Source):
 
     def _skip_damage(self, pos: int, start: int) -> None:
         """Skip from damage at `pos` to the first valid record at or behind `start`."""
+        if self._place is not None:  # the record before, with a wrong length, is not its end
+            self._place.end = min(self._place.end, start)
         place = self._place_at(pos)
         place.torn_index = place.start < pos
         place.broken |= place.indexed is None

@@ -474,13 +474,15 @@ def test_a_gap_between_chunks_does_not_count_the_messages_behind_it(tmp_path: Pa
     path = tmp_path / "a.bag"
     expected = make(path, "none", chunk=2000, messages=400)
     data = path.read_bytes()
-    # Neither the length nor the count of the first index record is right.
-    at = data.index(b"op=\x04")
-    start = data.index(b"count=", at - 60)
+    # Neither the length nor the count of the last index record of the first chunk is right, and
+    # the length reaches into the second chunk.
+    second = data.index(b"op=\x05", data.index(b"op=\x05") + 1)
+    start = data.rindex(b"count=", 0, second)
+    (count,) = struct.unpack_from("<I", data, start + 6)
     broken = bytearray(data)
-    struct.pack_into("<I", broken, start + 6, 5000)
-    size = data.index(struct.pack("<I", 12 * struct.unpack_from("<I", data, start + 6)[0]), start)
-    struct.pack_into("<I", broken, size, 77)
+    struct.pack_into("<I", broken, start + 6, count + 1)
+    size = data.index(struct.pack("<I", 12 * count), start + 10)
+    struct.pack_into("<I", broken, size, 12 * count + 150)
     path.write_bytes(broken)
     found, damage = read(path)
     assert found == expected
