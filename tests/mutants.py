@@ -443,7 +443,7 @@ FORMAT_2 = [
         ),
         (
             "an-import-begins-anew",
-            "        if not _is_there(path / name, summary.digest, summary.size):\n            _copy",
+            "        if not _is_there(path / name, digest, size):\n            _copy",
             "        if True:\n            _copy",
             f"{IDENTITY}::test_an_import_goes_on_where_it_was_stopped",
         ),

@@ -86,10 +86,11 @@ def command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Show topics side by side: a row for each message of one, with those of others then.
+    """Show topics side by side by time.
 
-    Columns are named by topic and field; `distance` is the time of a topic's message minus
-    that of the row. What is not near enough is empty.
+    A row for each message of one topic, with what the others had said by then. Columns are
+    named by topic and field; `distance` is the time of a topic's message minus that of the
+    row. What is not near enough is empty.
     """
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()

@@ -49,11 +49,12 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Write payloads of ended recordings into columns that any Parquet reader opens.
+    """Write payloads into columns that any reader opens.
 
-    Laser scans, point clouds by their own fields, images, and other arrays of numbers. Every
-    message is rebuilt from its columns and compared byte for byte before the columns are
-    used. Without --topic, topics are chosen that consist of arrays mostly.
+    Of ended recordings: laser scans, point clouds by their own fields, images, and other
+    arrays of numbers. Every message is rebuilt from its columns and compared byte for byte
+    before the columns are used. Without --topic, topics are chosen that consist of arrays
+    mostly.
     """
     from hybridlog.query.times import parse_duration
 

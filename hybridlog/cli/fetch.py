@@ -26,7 +26,6 @@ from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import Front, write_answer
-from hybridlog.query.predicate.across import names_topics
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -217,7 +216,7 @@ def _query(store: Store, choices: _Choices) -> Query:
     query = query.clock(choices.clock)
     near = _near(choices)
     for predicate in choices.where:
-        query = query.where(predicate, near if names_topics(predicate) else None)
+        query = query.where(predicate, near if _names_topics(predicate) else None)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
     if choices.tags is not None:
@@ -240,7 +239,7 @@ def _form(choices: _Choices) -> str:
             (choices.every > 1, "--every"),
             (choices.reverse, "--reverse"),
             (choices.clock != "log", "--clock"),
-            (any(map(names_topics, choices.where)), "--where with other topics"),
+            (any(map(_names_topics, choices.where)), "--where with other topics"),
         ):
             if given:
                 raise UsageError(f"--at gives one message, by log time: leave out {option}.")
@@ -268,12 +267,18 @@ def _near(choices: _Choices) -> str | tuple[str, str] | None:
     return around[0] or "0s", around[1] or "0s"
 
 
+def _names_topics(predicate: str) -> bool:
+    from hybridlog.query.predicate.across import names_topics
+
+    return names_topics(predicate)
+
+
 def _check_near(choices: _Choices) -> None:
     around = choices.before is not None or choices.after is not None
     if around and choices.within is not None:
         raise UsageError("--within is before and after: leave out --before and --after.")
     near = around or choices.within is not None
-    asks = any(map(names_topics, choices.where))
+    asks = any(map(_names_topics, choices.where))
     if near and not asks:
         raise UsageError(
             "--within, --before and --after are about messages of other topics: add --where "

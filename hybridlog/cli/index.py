@@ -38,7 +38,10 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Make, list or drop an index that speeds up queries of a field."""
+    """Make, list or drop an index of a field.
+
+    Queries of that field become faster.
+    """
     if remove and not field:
         raise UsageError("--remove needs an index. Name the topic and the fields after it.")
     with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:

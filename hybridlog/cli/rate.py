@@ -43,7 +43,7 @@ def command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Show how many messages came, and how many in a second."""
+    """Show how many messages came in a second."""
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:

@@ -58,7 +58,10 @@ def command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Show topics at regular times from the beginning of each recording or of the range."""
+    """Show topics at regular times.
+
+    They begin with each recording, or with the range of --between.
+    """
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:

@@ -14,6 +14,7 @@ from hybridlog.cli.output import note, say
 from hybridlog.cli.sql_answer import print_remarks, write_answer
 from hybridlog.consent import state_directory
 from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     from hybridlog.cli.table_output import TableChoices
@@ -84,16 +85,18 @@ def run_prompt(
             if not text.strip():
                 continue
             try:
-                check(text)
-                answer = connection.query(text, timeout=timeout)
-                write_answer(answer, choices)
-                sys.stdout.flush()
-                print_remarks(answer)
+                with at_safe_points():
+                    check(text)
+                    answer = connection.query(text, timeout=timeout)
+                    write_answer(answer, choices)
+                    sys.stdout.flush()
+                    print_remarks(answer)
             except HybridlogError as error:
                 for line in str(error).splitlines():
                     note(line)
             except KeyboardInterrupt:
-                note("The query was stopped.")
+                with suppress(KeyboardInterrupt):  # pressed again
+                    note("The query was stopped.")
 
 
 def _statement(completer: Completer) -> str | None:

@@ -61,7 +61,10 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Show count, least, greatest, mean and deviation of the numeric fields of topics."""
+    """Show count, extremes and mean of numeric fields.
+
+    Also their standard deviation, and how many values are NaN.
+    """
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet or as_json) as opened:
         query = query_of(opened, topic, choice)

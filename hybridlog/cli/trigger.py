@@ -55,7 +55,10 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Let a recorder write its ring to disk now, or rehearse a trigger on what is stored."""
+    """Make a recorder write its ring, or rehearse a trigger.
+
+    A rehearsal says how often a predicate would have fired on what is stored.
+    """
     if rehearse is None:
         if since is not None or before is not None or after is not None or as_json:
             raise UsageError("--since, --before, --after and --json are for --rehearse.")

@@ -21,7 +21,7 @@ from bson.errors import BSONError
 
 from hybridlog.schema.object_rows import arrow_of, body_groups, objects_of, payloads_of
 from hybridlog_storage.errors import PayloadError
-from hybridlog_storage.messages import REDUCED, Channel
+from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED, Channel
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from hybridlog.schema.definition import FieldPath
     from hybridlog_storage.messages import Buffer
 
-ORIGINAL_ENCODING = "hybridlog.message_encoding"
-"""Metadata key of a reduced channel: the encoding of the dropped payloads."""
 
 _HEAD = struct.Struct("<Q32s")
 _GIVEN_UP = "its payload was dropped under pressure; only its fields are stored"

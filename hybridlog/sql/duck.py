@@ -15,6 +15,7 @@ from hybridlog_storage.errors import (
     ResourceError,
     UsageError,
 )
+from hybridlog_storage.stopping import at_safe_points, safe_point
 
 MEMORY: Final = 1 << 30
 """Default limit of DuckDB's memory, bytes."""
@@ -119,21 +120,25 @@ class Worker:
         Raises:
             ResourceError: the time is over.
         """
-        future: Future[_T] = self._pool.submit(call)
-        try:
-            left = None if self._until is None else max(self._until - time.monotonic(), 0)
-            return future.result(left)
-        except TimeoutError:
-            if future.done():
-                raise
-            self._stop(future)
-            raise ResourceError(
-                f"The query was stopped after {self._timeout:g} s: narrow it down, or allow more."
-            ) from None
-        except BaseException as error:
-            if not future.done():  # Ctrl-C
+        with at_safe_points():
+            future: Future[_T] = self._pool.submit(call)
+            try:
+                self._wait(future)
+            except BaseException:
                 self._stop(future)
-            raise error
+                raise
+            return future.result()
+
+    def _wait(self, future: Future[_T]) -> None:
+        while not future.done():
+            safe_point()  # Ctrl-C
+            left = _POLL_S if self._until is None else self._until - time.monotonic()
+            if left <= 0:
+                raise ResourceError(
+                    f"The query was stopped after {self._timeout:g} s: narrow it down, or allow "
+                    "more."
+                )
+            wait([future], min(left, _POLL_S))
 
     def _stop(self, future: Future[_T]) -> None:
         # A call that has not reached DuckDB yet does not notice.

@@ -21,11 +21,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.schema.reduced_codec import ORIGINAL_ENCODING
 from hybridlog_storage.catalog import schema_hash
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.messages import REDUCED
+from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel

@@ -26,6 +26,8 @@ MAX_CHANNELS = 65535
 MAX_PAYLOAD = (1 << 30) - (1 << 16)
 """Largest payload, bytes: a chunk, with the heads of its records, has to hold it."""
 
+ORIGINAL_ENCODING = "hybridlog.message_encoding"
+"""Metadata key of a reduced channel: the encoding of the dropped payloads."""
 REDUCED = "hybridlog.reduced"
 """Message encoding of a channel with reduced messages, whose payload was dropped."""
 

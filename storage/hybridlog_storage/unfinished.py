@@ -10,15 +10,11 @@ ends. `undone` registers other things to take back.
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
-import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-
-from hybridlog_storage.durability import publish
 
 _noted: dict[Path, int] = {}
 """Unfinished paths and the process that makes them: a child process removes none."""
@@ -48,6 +44,8 @@ class Unfinished:
         Raises:
             OSError: The rename fails.
         """
+        from hybridlog_storage.durability import publish
+
         publish(self.path, final, depth=1)
         _published.add(final)
         self.remove()
@@ -60,6 +58,8 @@ class Unfinished:
 
 def beside(final: Path) -> Unfinished:
     """An unused name in the same directory."""
+    import secrets
+
     return Unfinished(final.with_name(f".{final.name[:100]}.{secrets.token_hex(6)}.partial"))
 
 
@@ -69,6 +69,9 @@ def scratch_directory() -> Unfinished:
     Raises:
         OSError: It cannot be created.
     """
+    import secrets
+    import tempfile
+
     place = Unfinished(Path(tempfile.gettempdir()) / f"hybridlog-{secrets.token_hex(8)}")
     place.path.mkdir(mode=0o700)
     return place

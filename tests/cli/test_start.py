@@ -46,7 +46,7 @@ def packages_of(*arguments: object) -> set[str]:
 
 def test_help_imports_little() -> None:
     """Each module costs about a millisecond: the number of modules is the time of the start."""
-    for arguments, most in ((("--help",), 190), (("fetch", "--help"), 160)):
+    for arguments, most in ((("--help",), 200), (("fetch", "--help"), 160)):
         loaded = modules_of(*arguments)
         assert not {name.split(".")[0] for name in loaded} & HEAVY
         assert len(loaded) < most, sorted(loaded)
@@ -220,7 +220,7 @@ def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     assert not {name for name in ours if name.startswith(unneeded)}
     assert "numpy.ma" not in loaded
     # Each module costs about a millisecond.
-    assert len(ours) < 90, sorted(ours)
+    assert len(ours) < 100, sorted(ours)
 
 
 def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
