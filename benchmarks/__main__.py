@@ -25,6 +25,7 @@ from hybridlog.cli import signals
 from hybridlog.cli.exit_codes import of_os_error
 from hybridlog.cli.output import note, parse_size, print_table, printable
 from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.stopping import anywhere, at_safe_points
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -78,7 +79,9 @@ def main(arguments: Sequence[str]) -> int:
         return int(import_module("benchmarks.live.command").main(list(arguments[1:])))
     signals.install()
     try:
-        return _do(_parser().parse_args(arguments), ["python", "-m", "benchmarks", *arguments])
+        # Wherever it stops, the processes of a run are ended and the journal is closed.
+        with at_safe_points(), anywhere():
+            return _do(_parser().parse_args(arguments), ["python", "-m", "benchmarks", *arguments])
     except HybridlogError as error:
         print(f"benchmarks: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
