@@ -391,7 +391,7 @@ def test_definitions_without_messages(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", *(channel(9, f"/t{k}") for k in range(70_000)), message())
     assert read(path) == (1, 2, [])
     flips = [channel(k) for k in range(1, FULL)] + [schema(1, f"a/T{k % 2}") for k in range(10_000)]
-    assert read(write(tmp_path / "b.mcap", *flips, message())) == (1, 1, [])
+    assert read(write(tmp_path / "b.mcap", *flips, message())) == (1, FULL - 1, [])
     bag = tmp_path / "a.bag"
     rows = [bags.connection(k, topic=f"/t{k}") for k in range(1, FULL + 100)]
     bag.write_bytes(bags.bag(*rows, bags.connection(0), bags.message(0, 1, b"")))
