@@ -147,4 +147,4 @@ def test_store_can_be_made_and_asked_from_the_wheel(installed: Path, tmp_path: P
         "    print(store.recordings(), store.topics())\n"
     )
     shown = _run("-c", script, cwd=tmp_path, PYTHONPATH=str(installed))
-    assert shown.strip() == "[] []"
+    assert shown.strip() == "<Recordings none> []"
