@@ -391,7 +391,17 @@ BESIDES: dict[str, Callable[[Any], None]] = {
 }
 
 
-@pytest.mark.parametrize("name", KEEPING)
+ALWAYS = frozenset(("hybridlog", "hybridlog_recorder", "mongo_json_batched", "sqlite_json1"))
+"""The others are tried before figures are published."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ALWAYS else pytest.param(name, marks=pytest.mark.exhaustive)
+        for name in KEEPING
+    ],
+)
 def test_contract(name: str, tmp_path: Path) -> None:
     with opened(name, tmp_path) as backend:
         sent = insert_from_threads(backend, 0, 20)

@@ -48,6 +48,7 @@ def test_every_backend_stores_what_it_says(tmp_path: Path) -> None:
         assert values["persisted"] > 0, sample.backend
 
 
+@pytest.mark.exhaustive
 @pytest.mark.timeout(600)
 def test_all_three_studies_end_and_the_answers_agree(tmp_path: Path) -> None:
     # The searches, for ceilings and for the speed at which logs drop, have tests of their own.

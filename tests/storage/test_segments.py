@@ -1017,7 +1017,9 @@ def content_of(chunk: StoredChunk) -> tuple[Any, ...]:
     return chunk.number, chunk.crc, chunk.trailer_crc, list(rows), payloads, sizes
 
 
-@pytest.mark.parametrize("bit", [0, 3, 7])
+@pytest.mark.parametrize(
+    "bit", [0, *(pytest.param(bit, marks=pytest.mark.exhaustive) for bit in range(1, 8))]
+)
 def test_no_flipped_bit_changes_an_answer_and_each_is_found(tmp_path: Path, bit: int) -> None:
     """In any byte of a segment: heads, lengths, metadata, indexes, summary, footer, magic."""
     whole, _ = sample(tmp_path / "a")
