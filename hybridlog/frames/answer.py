@@ -129,9 +129,8 @@ def _fields_of(planner: Planner) -> list[str] | None:
 def _table_blocks(planner: Planner, part: Part) -> Iterator[Block]:
     """The messages of a part from its table, in order."""
     rank = planner.ranks[part.recording.key] << _SEQ_BITS
-    none = np.empty(0, np.int64)
     # Tables have lists where a definition fixes the length.
-    kind = part.channels[0].codec.arrow(b"", none, none, _fields_of(planner)).records.type
+    kind = part.channels[0].arrow_type(_fields_of(planner))
     for found in planner.values(part, _fields_of(planner)):
         rows = len(found.log_time)
         planner.counters.messages += rows

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -98,6 +98,15 @@ class RecordedChannel:
         from hybridlog.schema.codecs import codec_for
 
         return codec_for(self.channel)
+
+    def arrow_type(self, fields: Collection[str] | None = None) -> Any:
+        """Arrow type of its messages, as far as a definition fixes it.
+
+        Args:
+            fields: Only these fields; None for all.
+        """
+        none = np.empty(0, np.int64)
+        return self.codec.arrow(b"", none, none, fields).records.type
 
     @property
     def is_reduced(self) -> bool:

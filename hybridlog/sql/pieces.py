@@ -41,7 +41,7 @@ Paths = Collection[str] | None
 
 @dataclass(slots=True)
 class ScanCounts:
-    """What was read for a query.
+    """Counts of what was read for a query.
 
     Attributes:
         files: Paths of the files of tables that were read.
@@ -168,7 +168,7 @@ class TopicOfRecording:
                 for kind in source.kinds
             ]
         return [
-            kind_of(channel)
+            channel.arrow_type()
             for channel in self.channels.values()
             if not channel.is_reduced and channel.codec.indexed
         ]
@@ -251,7 +251,7 @@ def _is_fixed(channel: RecordedChannel) -> bool:
     """True if the definition of a channel fixes the fields of its messages."""
     encoding = channel.channel.message_encoding
     # The keys of a map of protobuf are fields, which no definition knows.
-    return encoding in _FIXED or (encoding == "protobuf" and not _has_open(kind_of(channel)))
+    return encoding in _FIXED or (encoding == "protobuf" and not _has_open(channel.arrow_type()))
 
 
 def _has_open(kind: Any) -> bool:
@@ -259,12 +259,6 @@ def _has_open(kind: Any) -> bool:
     if pa.types.is_struct(kind):
         return not kind.num_fields or any(_has_open(field.type) for field in kind)
     return bool(pa.types.is_list(kind)) and _has_open(kind.value_type)
-
-
-def kind_of(channel: RecordedChannel) -> Any:
-    """Type of the messages of a channel whose definition fixes their fields."""
-    none = np.empty(0, np.int64)
-    return channel.codec.arrow(b"", none, none, None).records.type
 
 
 class _TableRows:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from enum import Enum, auto
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
 
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
-    import numpy as np
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import ChunkTask, RowSelection
+    from hybridlog.query.chunk_scan import ChunkKey, ChunkTask, RowSelection
     from hybridlog.query.question import Part
 
 
@@ -105,3 +106,31 @@ class Counting:
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """Not supported: `cost` returns None."""
         raise NotImplementedError
+
+
+def places_of(references: Any) -> NDArray[np.int64]:
+    """Segment, chunk and payload offset of messages: int64[n, 3].
+
+    Args:
+        references: The column `ref` of a table.
+    """
+    columns = [references.field(n).to_numpy(zero_copy_only=False) for n in ("seg", "chunk", "off")]
+    return np.stack(columns, axis=1).astype(np.int64)
+
+
+def offsets_by_chunk(
+    recording: str, places: NDArray[np.int64]
+) -> dict[ChunkKey, NDArray[np.int64]]:
+    """Payload offsets of messages by chunk, sorted.
+
+    Args:
+        recording: Id of the recording.
+        places: As of `places_of`, in any order.
+    """
+    places = places[np.lexsort((places[:, 2], places[:, 1], places[:, 0]))]
+    edges = np.flatnonzero(np.any(places[1:, :2] != places[:-1, :2], axis=1)) + 1
+    return {
+        (recording, int(group[0, 0]), int(group[0, 1])): group[:, 2]
+        for group in np.split(places, edges)
+        if len(group)
+    }

@@ -13,7 +13,14 @@ import numpy as np
 
 from hybridlog.losses import lost_spans
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
-from hybridlog.query.engines.base import Need, Outcomes, UndecidedError, Values
+from hybridlog.query.engines.base import (
+    Need,
+    Outcomes,
+    UndecidedError,
+    Values,
+    offsets_by_chunk,
+    places_of,
+)
 from hybridlog.query.message_filter import can_decide
 from hybridlog.query.predicate.tree import is_meta
 
@@ -52,7 +59,7 @@ class PayloadColumns:
         wanted = _paths(part, fields if need is Need.VALUES else ())
         size = 0
         for reader in readers:
-            columns = reader.columns_of(_kind(part, wanted))
+            columns = reader.columns_of(part.channels[0].arrow_type(wanted))
             if columns is None:
                 return None
             size += reader.size(range(reader.file.groups), columns)
@@ -92,7 +99,7 @@ class PayloadColumns:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Columns of the rows for which the predicate holds, in order."""
-        kind = _kind(part, fields)
+        kind = part.channels[0].arrow_type(fields)
         for (time, seq), holds, table, inside in self._rows(part, fields):
             if not holds.any():
                 continue
@@ -104,17 +111,10 @@ class PayloadColumns:
         found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         for part in parts:
             for _, holds, table, inside in self._rows(part, own=("ref",)):
-                reference = table.column("ref").combine_chunks().take(inside[holds])
-                names = ("seg", "chunk", "off")
-                places = np.stack(
-                    [reference.field(n).to_numpy(zero_copy_only=False) for n in names], axis=1
-                ).astype(np.int64)
-                edges = np.flatnonzero(np.any(places[1:, :2] != places[:-1, :2], axis=1)) + 1
-                for group in np.split(places, edges):
-                    if len(group):
-                        key = part.recording.id, int(group[0, 0]), int(group[0, 1])
-                        if key in wanted:
-                            found[key].append(group[:, 2])
+                places = places_of(table.column("ref").combine_chunks())[inside[holds]]
+                for key, offsets in offsets_by_chunk(part.recording.id, places).items():
+                    if key in wanted:
+                        found[key].append(offsets)
         return RowSelection({key: np.sort(np.concatenate(o)) for key, o in found.items()})
 
     def _rows(
@@ -148,7 +148,8 @@ class PayloadColumns:
         if readers is None:
             raise UndecidedError(f"The columns of {part.topic} are missing.")
         wanted = _paths(part, fields)
-        kind, asked = _kind(part, wanted), _kind(part, _paths(part, ()))
+        channel = part.channels[0]
+        kind, asked = channel.arrow_type(wanted), channel.arrow_type(_paths(part, ()))
         for reader in readers:
             columns = reader.columns_of(kind)
             if columns is None:
@@ -229,12 +230,6 @@ def _are_known(part: Part, fields: Collection[str] | None) -> bool:
         any(name == path or name.startswith((f"{path}.", f"{path}[")) for name in types)
         for path in fields or ()
     )
-
-
-def _kind(part: Part, fields: Collection[str] | None) -> Any:
-    """The type of messages with some fields."""
-    none = np.empty(0, np.int64)
-    return part.channels[0].codec.arrow(b"", none, none, fields).records.type
 
 
 def records_of(table: pa.Table, kind: Any) -> pa.StructArray:

@@ -11,7 +11,14 @@ import numpy as np
 
 from hybridlog.losses import lost_spans
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
-from hybridlog.query.engines.base import Need, Outcomes, UndecidedError, Values
+from hybridlog.query.engines.base import (
+    Need,
+    Outcomes,
+    UndecidedError,
+    Values,
+    offsets_by_chunk,
+    places_of,
+)
 from hybridlog.query.message_filter import can_decide, meta_array
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog_storage.errors import StoreError
@@ -149,20 +156,8 @@ class TablesEngine:
     def _find(self, part: Part) -> dict[ChunkKey, NDArray[np.int64]]:
         places: list[NDArray[np.int64]] = []
         for rows, holds in self._rows(part, own=("ref",)):
-            ref = rows.own["ref"]
-            columns = [ref.field(name).to_numpy(zero_copy_only=False) for name in _REFERENCE]
-            places.append(np.stack(columns, axis=1).astype(np.int64)[holds])
-        if not places:
-            return {}
-        table = np.concatenate(places)
-        order = np.lexsort((table[:, 2], table[:, 1], table[:, 0]))
-        table = table[order]
-        edges = np.flatnonzero(np.any(table[1:, :2] != table[:-1, :2], axis=1)) + 1
-        return {
-            (part.recording.id, int(group[0, 0]), int(group[0, 1])): group[:, 2]
-            for group in np.split(table, edges)
-            if len(group)
-        }
+            places.append(places_of(rows.own["ref"])[holds])
+        return offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
 
     def _rows(
         self, part: Part, fields: Collection[str] | None = (), own: Collection[str] = ()
@@ -217,9 +212,6 @@ def _are_unreadable(rows: TableRows) -> NDArray[np.bool_]:
     if state is None:
         return np.zeros(len(rows), np.bool_)
     return np.asarray(pc.equal(state, "unreadable").to_numpy(zero_copy_only=False))
-
-
-_REFERENCE = ("seg", "chunk", "off")
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:
