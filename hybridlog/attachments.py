@@ -98,7 +98,7 @@ class StoredMetadata(NamedTuple):
 
 
 class Extras(NamedTuple):
-    """What the recordings of a question have beside their messages.
+    """Attachments and metadata records of the recordings of a question.
 
     Attributes:
         channels: Channels of its topics, also those without messages.
@@ -151,7 +151,7 @@ def metadata_of(session: Session, entry: RecordingEntry) -> list[StoredMetadata]
 
 
 def extras_of(session: Session, question: Question) -> Extras:
-    """What a slice has beside its messages.
+    """Attachments and metadata records of a slice.
 
     Raises:
         SegmentError: A segment is damaged.

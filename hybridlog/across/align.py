@@ -55,7 +55,7 @@ class Stream:
 
 
 class Base(Protocol):
-    """What the rows are: messages of a topic, or regular times."""
+    """The rows: messages of a topic, or regular times."""
 
     @property
     def question(self) -> Question:

@@ -20,7 +20,6 @@ from hybridlog.cli.answer_notes import (
     print_remarks,
     print_unreadable,
 )
-from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -80,15 +79,7 @@ class _Choices:
 
 
 @click.command()
-@click.option(
-    "--topic",
-    "-t",
-    required=True,
-    multiple=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
-)
+@options.topics
 @options.store
 @options.between
 @click.option(
@@ -260,7 +251,7 @@ def _form(choices: _Choices) -> str:
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:
-    """How near in time the messages of other topics in --where are."""
+    """Greatest distance in time to the messages of other topics in --where."""
     around = choices.before, choices.after
     if around == (None, None):
         return choices.within

@@ -166,6 +166,15 @@ one_topic = click.option(
     shell_complete=complete_topic,
     help="Full name, or an unambiguous short one (scan).",
 )
+topics = click.option(
+    "--topic",
+    "-t",
+    required=True,
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
+)
 only_topics = click.option(
     "--topic",
     "-t",

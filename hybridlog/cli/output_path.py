@@ -67,7 +67,7 @@ def _bring_back(aside: Path, path: Path) -> None:
 
 
 def not_written(path: Path) -> str:
-    """What becomes of an output file when the command is stopped."""
+    """The sentence about an output file after a stopped command; empty if the file is complete."""
     return "" if is_published(path) else f"{path} is not written."
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from hybridlog.cli import output
 from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import query_of
+from hybridlog.cli.query_options import asked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -47,13 +47,14 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
     started = time.monotonic()
     quiet = choices.quiet or choices.as_json
     with opened_store(choices.store, choices.mongo, quiet=quiet) as store:
-        query = query_of(store, [choices.topic], choices.choice)
-        if choices.between is not None:
-            query = query.between(*choices.between)
-        for predicate in choices.where:
-            query = query.where(predicate)
-        if choices.strict:
-            query.check_complete()
+        query = asked(
+            store,
+            [choices.topic],
+            choices.choice,
+            between=choices.between,
+            where=choices.where,
+            strict=choices.strict,
+        )
         found = answer(query)
         labels = {recording.id: recording.label for recording in store.summaries()}
         if choices.count:

@@ -50,6 +50,36 @@ def named_or_chosen(
     return recordings_of(store, named), words[1:], store.is_one(named.name)
 
 
+def asked(
+    store: Store,
+    topics: Sequence[str],
+    choice: Choice,
+    *,
+    between: tuple[str, str] | None,
+    where: Sequence[str],
+    fields: str | None = None,
+    strict: bool,
+) -> Query:
+    """The query of a command with these options.
+
+    Raises:
+        TopicError: A name fits nothing, or several things; or no recording is chosen.
+        TimeError: `between` is no range of time.
+        WhereError: A predicate cannot be parsed, or does not fit the fields.
+        IncompleteError: `strict`, and messages of the range are lost.
+    """
+    query = query_of(store, topics, choice)
+    if between is not None:
+        query = query.between(*between)
+    for predicate in where:
+        query = query.where(predicate)
+    if fields is not None:
+        query = query.fields(*parse_fields(fields))
+    if strict:
+        query.check_complete()
+    return query
+
+
 def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Query:
     """A query of some topics of the chosen recordings.
 

@@ -12,7 +12,7 @@ import click
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost, print_gaps, print_remarks
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import query_of
+from hybridlog.cli.query_options import asked
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 
 if TYPE_CHECKING:
@@ -47,13 +47,7 @@ def command(
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        query = query_of(opened, topic, choice)
-        if between is not None:
-            query = query.between(*between)
-        for predicate in where:
-            query = query.where(predicate)
-        if strict:
-            query.check_complete()
+        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
         write_tables([query.rate(window)], lambda: None, choices)
         sys.stdout.flush()
         if not quiet:

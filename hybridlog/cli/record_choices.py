@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from hybridlog.cli import output
+from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import check_latched
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from hybridlog.store import Store
     from hybridlog_storage.segment_writer import SegmentSettings
 
 
@@ -154,4 +158,17 @@ def segment_settings(choices: RecordChoices) -> SegmentSettings:
         chunk_size=output.parse_size(choices.chunk_size),
         compression=cast(Any, choices.compression),
         level=choices.level,
+    )
+
+
+def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
+    """The store, which is made if there is none."""
+    return opened_store(
+        choices.store,
+        choices.mongo,
+        create=True,
+        shared=choices.shared,
+        needs_database=True,
+        cache_mb=choices.cache_size,
+        quiet=choices.quiet,
     )

@@ -17,7 +17,7 @@ from hybridlog.cli import output
 from hybridlog.cli.live_options import recorder_options, sources_of
 from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.record_choices import opened_to_record
 from hybridlog.cli.signals import SIGNALS, write_note
 from hybridlog_storage.stopping import Flag
 
@@ -45,17 +45,7 @@ def record_live(choices: RecordChoices) -> None:
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
-        store = held.enter_context(
-            opened_store(
-                choices.store,
-                choices.mongo,
-                create=True,
-                shared=choices.shared,
-                needs_database=True,
-                cache_mb=choices.cache_size,
-                quiet=quiet,
-            )
-        )
+        store = held.enter_context(opened_to_record(choices))
         with _stop_flag() as stop:
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from hybridlog.cli import coverage, output
-from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
-from hybridlog.cli.record_choices import RecordChoices, segment_settings
+from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -30,8 +29,6 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
     from hybridlog.cli.progress import Bar
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordOptions, RecordReport
@@ -71,19 +68,6 @@ def record_logs(choices: RecordChoices) -> None:
     finally:
         done.show()
     done.exit()
-
-
-def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
-    """The store, which is made if there is none."""
-    return opened_store(
-        choices.store,
-        choices.mongo,
-        create=True,
-        shared=choices.shared,
-        needs_database=True,
-        cache_mb=choices.cache_size,
-        quiet=choices.quiet,
-    )
 
 
 def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:

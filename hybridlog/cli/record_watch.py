@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
-from hybridlog.cli.record_logs import LogRecorder, check_new_store, opened_to_record, print_stores
+from hybridlog.cli.record_choices import opened_to_record
+from hybridlog.cli.record_logs import LogRecorder, check_new_store, print_stores
 from hybridlog.cli.signals import Stopped, if_stopped
 from hybridlog_storage.errors import DatabaseError, SourceError
 from hybridlog_storage.stopping import at_safe_points, pause, safe_point

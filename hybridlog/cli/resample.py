@@ -11,9 +11,8 @@ import click
 
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
-from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.query_options import asked
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 
 if TYPE_CHECKING:
@@ -21,15 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option(
-    "--topic",
-    "-t",
-    required=True,
-    multiple=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
-)
+@options.topics
 @click.option("--step", required=True, metavar="DURATION", help="Time between two rows: 100ms.")
 @options.how
 @options.near
@@ -65,15 +56,9 @@ def command(
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        query = query_of(opened, topic, choice)
-        if between is not None:
-            query = query.between(*between)
-        for predicate in where:
-            query = query.where(predicate)
-        if fields is not None:
-            query = query.fields(*parse_fields(fields))
-        if strict:
-            query.check_complete()
+        query = asked(
+            opened, topic, choice, between=between, where=where, fields=fields, strict=strict
+        )
         rows = query.resample(step, how, tolerance)
         write_tables(rows.to_tables(), rows.schema, choices)
         sys.stdout.flush()

@@ -12,9 +12,8 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
-from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.query_options import asked, parse_fields
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,15 +25,7 @@ _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
 @click.command()
-@click.option(
-    "--topic",
-    "-t",
-    required=True,
-    multiple=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
-)
+@options.topics
 @click.option(
     "--fields",
     metavar="A,B.C",
@@ -67,13 +58,7 @@ def command(
     """
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet or as_json) as opened:
-        query = query_of(opened, topic, choice)
-        if between is not None:
-            query = query.between(*between)
-        for predicate in where:
-            query = query.where(predicate)
-        if strict:
-            query.check_complete()
+        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
         found = query.stats(*([] if fields is None else parse_fields(fields)))
         if as_json:
             from hybridlog.schema.plain import without_nan

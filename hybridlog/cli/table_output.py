@@ -66,7 +66,7 @@ def table_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableChoices:
-    """Where a table goes.
+    """Format and destination of a table.
 
     Attributes:
         form: Format; None for the usual one.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What a trigger would have kept.
+    """The snapshots that a trigger would have kept.
 
     Attributes:
         trigger: Its text.
@@ -87,7 +87,7 @@ def rehearse(
     before: DurationLike = "10s",
     after: DurationLike = 0,
 ) -> Rehearsal:
-    """What a trigger would have kept; see `Store.rehearse`."""
+    """The snapshots that a trigger would have kept; see `Store.rehearse`."""
     started = time.monotonic()
     trigger = Trigger.of(text)
     before_ns, after_ns = parse_duration(before), parse_duration(after)

@@ -46,7 +46,7 @@ class RepairReport:
 
 @dataclass(slots=True)
 class CompactedTopic:
-    """What `compact` did with a topic of a recording.
+    """The result of `compact` for a topic of a recording.
 
     Attributes:
         recording: Label of the recording.

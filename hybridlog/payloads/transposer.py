@@ -72,7 +72,7 @@ class Split:
 
 @dataclass(slots=True)
 class Spans:
-    """Where the arrays of some messages lie.
+    """Positions of the arrays of some messages.
 
     Attributes:
         start: int64[n, k], byte of the buffer where each array starts.

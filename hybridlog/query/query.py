@@ -493,7 +493,7 @@ class Query:
         return in_force(self._session, self.question, self.counters, original_times=original_times)
 
     def extras(self) -> Extras:
-        """What belongs to the answer as a slice of the recordings, beside its messages.
+        """Attachments and metadata records that belong to the answer as a slice.
 
         Raises:
             SegmentError: A segment is damaged.
@@ -634,7 +634,7 @@ class Query:
             return Rates(self._session, self.question, self.counters).gaps(longer_than, periods)
 
     def rate(self, window: DurationLike | None = None) -> pa.Table:
-        """How many messages of each topic there are, and how many in a second.
+        """Number and rate of the messages of each topic.
 
         Args:
             window: Length of the windows, a duration; the first begins with the recording or
@@ -798,7 +798,7 @@ class Query:
         return self._session.doubtful(self.question)
 
     def lost(self) -> Lost:
-        """What is missing from the asked range, as the loss ledger knows.
+        """The messages that are missing from the asked range, as the loss ledger knows.
 
         Losses of topics in conditions count as an unknown number.
 

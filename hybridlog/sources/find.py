@@ -48,7 +48,7 @@ class Log:
 
 @dataclass(slots=True)
 class Found:
-    """What lies below a directory.
+    """Logs and stores below a directory.
 
     Attributes:
         logs: The logs, by path.

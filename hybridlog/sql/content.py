@@ -1,4 +1,4 @@
-"""What a store holds for SQL at one moment: names of views, recordings, flushed chunks."""
+"""Content of a store for SQL at one moment: names of views, recordings, flushed chunks."""
 
 from __future__ import annotations
 

@@ -234,12 +234,12 @@ class SqlAnswer:
 
     @property
     def counts(self) -> ScanCounts:
-        """What was read for it."""
+        """Counts of what was read for it."""
         return self._reading.counts
 
     @property
     def remarks(self) -> Remarks:
-        """What it may lack."""
+        """Messages and topics that it may lack."""
         return self._reading.remarks
 
     def run(self) -> None:

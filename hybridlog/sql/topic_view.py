@@ -42,7 +42,7 @@ _WORD: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 @dataclass(slots=True)
 class Remarks:
-    """What an answer may lack.
+    """Remarks about an answer: messages and topics that it may lack.
 
     Attributes:
         unreadable: Messages without fields, because they do not fit their definition, by topic.
@@ -61,7 +61,7 @@ class Remarks:
 
 @dataclass(slots=True)
 class Reading:
-    """What one execution of a query reads and finds.
+    """One execution of a query: what it reads and finds.
 
     Attributes:
         usage: Paths that the query names.

@@ -1,4 +1,4 @@
-"""What an answer lacks: messages of the asked range that the ledger knows to be lost."""
+"""Lost messages of the range of a question, as the loss ledger knows them."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Lost:
 
 
 def lost_in(session: Session, question: Question) -> Lost:
-    """What is missing from the range of a question.
+    """The messages that are missing from the range of a question.
 
     Raises:
         TimeError: the range is empty, or outside all recordings.

@@ -1,9 +1,9 @@
-"""How often messages came, and when none came for long."""
+"""Rates of messages, and gaps between them."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -103,27 +103,19 @@ class Rates:
         if periods is not None and not 0 < periods < float("inf"):
             raise UsageError(f"A number of periods is more than 0, not {periods}.")
         found: list[tuple[str, NDArray[np.int64]]] = []
-        periods_of = self._periods() if periods is not None else {}
-        for stretch in self._stretches():
+        stretches = [(stretch, self._times(stretch)) for stretch in self._stretches()]
+        periods_of = _periods(stretches) if periods is not None else {}
+        for stretch, times in stretches:
             limit = float(least)
             if periods is not None:
                 median = periods_of.get(stretch.summary.id)
                 if median is None:
                     continue  # of one message nobody knows when the next one was due
                 limit = max(limit, periods * median)
-            times = self._times(stretch)
             edges = np.concatenate([[stretch.span[0]], times, [stretch.span[1]]])
             rows = np.stack([edges[:-1], edges[1:], np.zeros(len(edges) - 1, np.int64)], axis=1)
             found.append((stretch.summary.id, rows[(edges[1:] - edges[:-1]) > limit]))
         return Intervals.of(found)
-
-    def _periods(self) -> dict[str, float]:
-        """Median time from one message to the next in each recording, ns, where there are two."""
-        steps: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for stretch in self._stretches():
-            steps[stretch.summary.id].append(np.diff(self._times(stretch)))
-        joined = {name: np.concatenate(parts) for name, parts in steps.items()}
-        return {name: float(np.median(found)) for name, found in joined.items() if len(found)}
 
     def _stretches(self) -> Iterator[_Stretch]:
         """Topics and spans of the question, by recording."""
@@ -174,6 +166,15 @@ class Rates:
         found += [one.log_time[one.holds] for one in self._planner.outcomes(stretch.part)]
         times: NDArray[np.int64] = np.concatenate(found)
         return times
+
+
+def _periods(stretches: Sequence[tuple[_Stretch, NDArray[np.int64]]]) -> dict[str, float]:
+    """Median time from one message to the next in each recording, ns, where there are two."""
+    steps: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
+    for stretch, times in stretches:
+        steps[stretch.summary.id].append(np.diff(times))
+    joined = {name: np.concatenate(parts) for name, parts in steps.items()}
+    return {name: float(np.median(found)) for name, found in joined.items() if len(found)}
 
 
 def _table(labels: list[tuple[str, str, int]], columns: _Columns) -> pa.Table:
