@@ -58,6 +58,7 @@ ALLOWED = {
     "pyarrow": (
         "hybridlog.across",
         "hybridlog.cli",
+        "hybridlog.drawing.series",
         "hybridlog.export",
         "hybridlog.frames",
         "hybridlog.payloads",

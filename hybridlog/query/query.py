@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.answers.lost import Lost
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.question import RecordedChannel
+    from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -858,6 +858,23 @@ class Query:
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
         return self._session.field_types(self.topics, self.question.recordings)
+
+    def spans(self) -> dict[str, Span]:
+        """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
+
+        It is known without reading messages: those at its ends may not satisfy the predicate,
+        or a range of another clock.
+
+        Raises:
+            TimeError: the range is empty, or outside all recordings.
+        """
+        found: dict[str, Span] = {}
+        for part in Planner(self._session, self.question, Counters()).parts():
+            extent = part.extent
+            if extent is not None:
+                low, high = found.get(part.recording.id, extent)
+                found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
+        return found
 
     def check_range(self) -> None:
         """Check that the time range overlaps a recording.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from hybridlog.losses import extent_of
 from hybridlog.query.times import TIME_LIMIT, TimeLike
 from hybridlog_storage.messages import REDUCED
 
@@ -181,13 +182,33 @@ class Part:
     @property
     def share(self) -> float:
         """Fraction of the topic's time in the part, 0 to 1."""
+        whole = self._messages_span
+        if whole is None:
+            return 0.0
+        cut = np.clip(self.log_windows, *whole)
+        return float((cut[:, 1] - cut[:, 0]).sum()) / (whole[1] - whole[0])
+
+    @property
+    def extent(self) -> Span | None:
+        """Log time of the topic's messages in the part, ns; None without any.
+
+        Bounds of another clock do not restrict it.
+        """
+        whole = self._messages_span
+        if self.recording.status == "open" and self.recording.span is not None:
+            whole = extent_of(self.recording)
+        if whole is None:
+            return None
+        cut = np.clip(self.log_windows, *whole)
+        cut = cut[cut[:, 1] > cut[:, 0]]
+        return (int(cut[0, 0]), int(cut[-1, 1])) if len(cut) else None
+
+    @property
+    def _messages_span(self) -> Span | None:
+        """Log time of the topic's messages in the recording, ns; None without any."""
         firsts = [s.first for s in self.stats if s.first is not None]
         lasts = [s.last for s in self.stats if s.last is not None]
-        if not firsts:
-            return 0.0
-        first, end = min(firsts), max(lasts) + 1
-        cut = np.clip(self.log_windows, first, end)
-        return float((cut[:, 1] - cut[:, 0]).sum()) / (end - first)
+        return (min(firsts), max(lasts) + 1) if firsts else None
 
 
 def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:

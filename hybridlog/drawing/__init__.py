@@ -1,0 +1,1 @@
+"""Pictures of what a store holds, as numbers and bytes: no server, page or terminal here."""

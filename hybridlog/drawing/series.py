@@ -1,0 +1,335 @@
+"""Fields over time, with no more points than a picture has pixels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.frames.names import FIELD
+from hybridlog.query.intervals import Intervals
+from hybridlog.schema.arrow_types import is_list, lengths_of
+from hybridlog.wording import listed
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import Span
+
+GAP_PERIODS: Final = 5
+"""A time without messages is a gap if it is longer than so many usual periods."""
+_ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
+_NUMBER = re.compile(r"bool|byte|char|time|duration|float(32|64)|u?int(8|16|32|64)")
+_FAR = 1 << 61  # ns; differences of such times are int64
+_SHOWN = 8  # names of fields in a message
+
+
+@dataclass(frozen=True)
+class Series:
+    """One field over time. Entries are in order of time; NaN means no line there.
+
+    A time without messages longer than `GAP_PERIODS` usual periods has one entry of NaN in its
+    middle. All series of one call have the same times.
+
+    Attributes:
+        field: Path of the field.
+        times: int64[n], log time, ns since the epoch: of a message, or of the first one in a
+            pixel.
+        least: float64[n], least value; NaN where a field is missing or NaN.
+        greatest: float64[n], greatest value.
+        exact: True if there is an entry for each message, and `least` equals `greatest`. Else
+            there is one for each pixel with messages, and values that are infinite or NaN are
+            left out if a pixel has others.
+    """
+
+    field: str
+    times: NDArray[np.int64]
+    least: NDArray[np.float64]
+    greatest: NDArray[np.float64]
+    exact: bool
+
+
+def series(
+    query: Query, fields: Sequence[str], *, pixels: int, span: Span | None = None
+) -> list[Series]:
+    """Fields of the messages of a query over log time.
+
+    Numbers become float64, true and false 1 and 0, times and durations nanoseconds. The
+    counters of the query are set to the cost.
+
+    Args:
+        query: About one topic of one recording.
+        fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
+            (`twist.linear`), which give a series for each.
+        pixels: Width of the picture. Up to twice as many messages are returned exactly.
+        span: Log time `[begin, end)` of the picture, ns; None for that of the messages.
+
+    Raises:
+        TopicError: no such field exists.
+        UsageError: several topics or recordings, `reverse`, no field, a field that is no
+            number, or no pixel.
+        TimeError: the range of the query is outside all recordings.
+    """
+    if pixels < 1:
+        raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
+    if query.question.reverse:
+        raise UsageError("Time runs from left to right here: leave out reverse.")
+    wanted = [_Wanted.of(text) for text in fields]
+    if not wanted:
+        raise UsageError(f"Name a field, such as {listed(numbers_of(query), _SHOWN)}.")
+    asked = query.fields(*dict.fromkeys(one.path for one in wanted))
+    _check(wanted, asked.field_types() or {})
+    spans = query.spans()
+    if len(query.topics) != 1 or len(spans) > 1:
+        raise UsageError(
+            f"A series is of one topic in one recording; these are {len(query.topics)} topics in "
+            f"{len(spans)} recordings."
+        )
+    recording, (begin, end) = next(iter(spans.items()), ("", (0, 0)))
+    if span is not None:
+        begin, end = max(begin, span[0]), min(end, span[1])
+        window = np.array([[begin, max(begin, end), 0]], np.int64)
+        asked = asked.during(Intervals.of([(recording, window)])) if recording else asked
+    if begin >= end:
+        none = np.empty(0)
+        return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
+    with query.counters.timed():
+        found = _read(asked, wanted, _Grid.over(span or (begin, end), pixels))
+        query.counters.add(asked.counters)
+    return found
+
+
+def numbers_of(query: Query) -> list[str]:
+    """Paths of the fields that are single numbers; none where no definition fixes them."""
+    known = query.field_types() or {}
+    return [p for p, kind in known.items() if _NUMBER.fullmatch(kind) and "[" not in p]
+
+
+def _check(wanted: Sequence[_Wanted], known: Mapping[str, str]) -> None:
+    """Refuse fields that are known to be no numbers, before anything is read.
+
+    Raises:
+        UsageError: one is.
+    """
+    for one in wanted:
+        kind = known.get(one.path)
+        has_fields = any(path.startswith(f"{one.path}.") for path in known)
+        if kind and not (one.access or has_fields or _NUMBER.fullmatch(kind)):
+            raise UsageError(_no_number(one.text, kind))
+
+
+def _no_number(text: str, kind: str) -> str:
+    element, bracket, _ = kind.partition("[")
+    if not bracket:
+        return f"{text} is no number but {kind}: only numbers can be drawn."
+    if _NUMBER.fullmatch(element):
+        return (
+            f"{text} is an array ({kind}): name one element, {text}[0], or a summary, {text}.min."
+        )
+    return f"{text} is an array of {element}: name a number in one element, such as {text}[0].x."
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """A field as it was asked for.
+
+    Attributes:
+        text: As it was written.
+        path: Path of a column.
+        access: Elements by number and fields by name, which lead from there to the number.
+    """
+
+    text: str
+    path: str
+    access: tuple[int | str, ...]
+
+    @classmethod
+    def of(cls, text: str) -> _Wanted:
+        path, bracket, rest = text.partition("[")
+        rest = bracket + rest
+        found = list(_ACCESS.finditer(rest))
+        if "".join(match[0] for match in found) != rest or not path:
+            raise UsageError(f"{text!r} names no single number: write position[0] for an element.")
+        return cls(text, path, tuple(int(m[1]) if m[1] else m[2] for m in found))
+
+    def columns(self, table: pa.Table) -> dict[str, NDArray[np.float64]]:
+        """Its numbers in a table, by path; those of other types are left out."""
+        found = {}
+        for field, column in zip(table.schema, table.columns, strict=True):
+            path = (field.metadata or {}).get(FIELD, field.name.encode()).decode()
+            if path != self.path and (self.access or not path.startswith(f"{self.path}.")):
+                continue
+            array = column.combine_chunks()
+            for step in self.access:
+                array = _stepped(array, step)
+            values = None if array is None else _numbers(array)
+            if values is not None:
+                found[self.text if path == self.path else path] = values
+        return found
+
+
+def _stepped(array: Any, step: int | str) -> Any:
+    """An element of each list, or a field of each message; None if the type has none."""
+    import pyarrow as pa
+
+    if array is None:
+        return None
+    if isinstance(array, pa.ChunkedArray):
+        array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.nulls(0, array.type)
+    if isinstance(step, str):
+        if not pa.types.is_struct(array.type):
+            return None
+        names = [field.name for field in array.type]
+        return array.flatten()[names.index(step)] if step in names else None
+    if not is_list(array.type):
+        return None
+    counts = lengths_of(array)
+    begins = np.cumsum(counts) - counts
+    return array.flatten().take(pa.array(begins + step, mask=counts <= step))
+
+
+def _numbers(array: Any) -> NDArray[np.float64] | None:
+    """Values as float64, NaN for null; None if they are no numbers."""
+    import pyarrow as pa
+
+    types, kind = pa.types, array.type
+    if kind == pa.json_():
+        array = _numbers_in_json(array.cast(pa.string()))
+    elif types.is_timestamp(kind) or types.is_duration(kind):
+        array = array.cast(pa.int64())
+    elif types.is_boolean(kind):
+        array = array.cast(pa.uint8())
+    elif not (types.is_integer(kind) or types.is_floating(kind) or types.is_null(kind)):
+        return None
+    values: NDArray[np.float64] = array.cast(pa.float64(), safe=False).to_numpy(
+        zero_copy_only=False
+    )
+    return values
+
+
+def _numbers_in_json(texts: Any) -> Any:
+    """The numbers among JSON values of several types; null for others."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    for word, number in (("true", "1"), ("false", "0")):
+        texts = pc.if_else(pc.equal(texts, word), number, texts)
+    is_number = pc.match_substring_regex(texts, r"^-?[0-9][0-9.eE+-]*$")
+    return pc.if_else(is_number, texts, pa.scalar(None, texts.type))
+
+
+def _read(asked: Query, wanted: Sequence[_Wanted], grid: _Grid) -> list[Series]:
+    """The series from the tables of an answer.
+
+    Raises:
+        UsageError: a field is no number.
+    """
+    held: list[tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]] = []
+    names: list[dict[str, None]] = [{} for _ in wanted]
+    rows = 0
+    for table in asked.to_tables():
+        times = table["log_time"].combine_chunks().cast("int64").to_numpy()
+        columns: dict[str, NDArray[np.float64]] = {}
+        for one, known in zip(wanted, names, strict=True):
+            found = one.columns(table)
+            known.update(dict.fromkeys(found))
+            columns.update(found)
+        rows += len(times)
+        held.append((times, columns))
+        if rows > 2 * grid.pixels:
+            for each in held:
+                grid.add(*each)
+            held.clear()
+    for one, known in zip(wanted, names, strict=True):
+        if not known and rows:
+            raise UsageError(f"{one.text} is no number: only numbers can be drawn.")
+    paths = list(dict.fromkeys(path for known in names for path in known))
+    if rows > 2 * grid.pixels:
+        return grid.series(paths)
+    return _exact(held, paths)
+
+
+def _exact(
+    held: Sequence[tuple[NDArray[np.int64], Mapping[str, NDArray[np.float64]]]],
+    paths: Sequence[str],
+) -> list[Series]:
+    times = np.concatenate([times for times, _ in held])
+    steps = np.diff(times)
+    periods = steps[steps > 0]
+    usual = float(np.median(periods)) if len(periods) else 0.0
+    gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1
+    middles = times[gaps - 1] + steps[gaps - 1] // 2
+    found = []
+    for path in paths:
+        values = np.concatenate([c.get(path, np.full(len(t), np.nan)) for t, c in held])
+        values = np.insert(values, gaps, np.nan)
+        found.append(Series(path, np.insert(times, gaps, middles), values, values, True))
+    return found
+
+
+class _Grid:
+    """Least and greatest values by pixel.
+
+    Args:
+        begin: Log time of the first pixel, ns.
+        width: Log time of a pixel, ns.
+        pixels: Number of pixels.
+    """
+
+    def __init__(self, begin: int, width: int, pixels: int) -> None:
+        self.pixels = pixels
+        self._begin = begin
+        self._width = width
+        self._count = np.zeros(pixels, np.int64)
+        self._first = np.zeros(pixels, np.int64)
+        self._last = np.zeros(pixels, np.int64)
+        self._extremes: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    @classmethod
+    def over(cls, span: Span, pixels: int) -> _Grid:
+        """A grid of a span of log time, ns."""
+        begin, end = max(span[0], -_FAR), min(span[1], _FAR)
+        return cls(begin, max(1, -(-(end - begin) // pixels)), pixels)
+
+    def add(self, times: NDArray[np.int64], columns: Mapping[str, NDArray[np.float64]]) -> None:
+        """Add messages, which are in order of time and not before earlier ones."""
+        if not len(times):
+            return
+        # Messages of a running recording may be later than its known end.
+        pixel = np.minimum((times - self._begin) // self._width, self.pixels - 1)
+        begins = np.concatenate(([0], np.flatnonzero(np.diff(pixel)) + 1))
+        ends = np.append(begins[1:], len(times))
+        used = pixel[begins]
+        new = self._count[used] == 0
+        self._first[used[new]] = times[begins[new]]
+        self._last[used] = times[ends - 1]
+        self._count[used] += ends - begins
+        for path, values in columns.items():
+            if path not in self._extremes:
+                least, greatest = np.full((2, self.pixels), np.nan)
+                self._extremes[path] = least, greatest
+            least, greatest = self._extremes[path]
+            finite = np.where(np.isfinite(values), values, np.nan)
+            least[used] = np.fmin(least[used], np.fmin.reduceat(finite, begins))
+            greatest[used] = np.fmax(greatest[used], np.fmax.reduceat(finite, begins))
+
+    def series(self, paths: Sequence[str]) -> list[Series]:
+        """An entry for each pixel with messages, and one of NaN in each gap."""
+        used = np.flatnonzero(self._count)
+        first, last = self._first[used], self._last[used]
+        usual = self._width / float(np.median(self._count[used]))
+        pause = first[1:] - last[:-1]
+        is_gap = (np.diff(used) > 1) & (pause > GAP_PERIODS * usual)
+        gaps = np.flatnonzero(is_gap) + 1
+        times = np.insert(first, gaps, last[gaps - 1] + pause[gaps - 1] // 2)
+        found = []
+        for path in paths:
+            least, greatest = (np.insert(side[used], gaps, np.nan) for side in self._extremes[path])
+            found.append(Series(path, times, least, greatest, False))
+        return found

@@ -1,0 +1,101 @@
+"""A recording with drives, joints, flags, pauses, text and JSON; another one without pauses."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+import hybridlog as hl
+from hybridlog_storage.segment_writer import SegmentSettings
+
+MS = 10**6
+BASE = 1_748_937_600 * 10**9
+DRIVE = b"""\
+geometry_msgs/Vector3 linear
+float32 y
+int64 ticks
+bool on
+duration age
+string state
+float64[] position
+float32[40] wide
+geometry_msgs/Vector3[] way
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 z
+"""
+
+
+@dataclass
+class Drive:
+    """What was written: one entry a message."""
+
+    store: hl.Store
+    times: NDArray[np.int64]
+    x: NDArray[np.float64]
+    z: NDArray[np.float64]
+    ticks: NDArray[np.int64]
+    joints: list[list[float]]
+    wide: NDArray[np.float32]
+
+
+def payload(drive: Drive, n: int) -> bytes:
+    joints = drive.joints[n]
+    way = [(float(k), n / 2) for k in range(n % 3)]
+    return (
+        struct.pack("<ddfq?ii", drive.x[n], drive.z[n], n / 4, drive.ticks[n], n % 2, 0, n)
+        + struct.pack("<I2s", 2, b"go")
+        + struct.pack(f"<I{len(joints)}d", len(joints), *joints)
+        + drive.wide[n].tobytes()
+        + struct.pack("<I", len(way))
+        + b"".join(struct.pack("<dd", *point) for point in way)
+    )
+
+
+@pytest.fixture(scope="session")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
+    """5,000 messages, 10 ms apart but for two pauses of 20 s and one of 30 ms."""
+    path = tmp_path_factory.mktemp("drawing")
+    count = 5000
+    rng = np.random.default_rng(7)
+    steps = np.full(count, 10 * MS)
+    steps[[1500, 4000]] = 20_000 * MS
+    steps[2500] = 30 * MS
+    x = rng.normal(size=count)
+    x[100] = np.nan
+    x[3000] = np.inf
+    x[1600:1800] = np.nan
+    with hl.open(path / "store", create=True) as store:
+        made = Drive(
+            store,
+            BASE + np.cumsum(steps) - steps[0],
+            x,
+            np.sin(np.arange(count) / 100),
+            rng.integers(-(2**50), 2**50, count),
+            [rng.normal(size=n % 4).tolist() for n in range(count)],
+            rng.normal(size=(count, 40)).astype(np.float32),
+        )
+        with (path / "drive.mcap").open("wb") as file:
+            writer = Writer(file)
+            writer.start("ros1")
+            schema = writer.register_schema("demo/Drive", "ros1msg", DRIVE)
+            any_json = writer.register_schema("Any", "jsonschema", b"{}")
+            channel = writer.register_channel("/drive", "ros1", schema)
+            loose = writer.register_channel("/loose", "json", any_json)
+            for n, time in enumerate(made.times.tolist()):
+                writer.add_message(channel, time, payload(made, n), time)
+                if n % 50 == 0:
+                    said = {"v": n if n % 100 else "no", "w": n / 2, "on": n % 100 > 0 or -5}
+                    said = said if n % 150 else {"name": "a"}
+                    writer.add_message(loose, time, json.dumps(said).encode(), time)
+            writer.finish()
+        store.record(path / "drive.mcap", settings=SegmentSettings(chunk_size=1 << 16))
+        yield made
