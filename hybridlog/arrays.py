@@ -6,14 +6,17 @@ import io
 import re
 import struct
 import warnings
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from hybridlog.array_views import MAX_EMPTY, byte_array, check_rows, view_of
+from hybridlog.point_arrays import POINT_MAKERS
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -38,17 +41,6 @@ _CV_ENCODING = re.compile(r"(8|16|32|64)(U|S|F)C(\d{1,3})?")
 _CV_TYPES = {"8U", "8S", "16U", "16S", "32S", "32F", "64F", "16F"}
 _CV_CHANNELS = 512
 
-_POINT_TYPES: Final[Mapping[int, str]] = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    8: "f8",
-}
-_MAX_EMPTY = 1 << 31  # a size beside one that is zero
 _COMPRESSED = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _DEPTH_HEADER = struct.Struct("<iff")
@@ -66,47 +58,56 @@ def to_numpy(type_name: str, message: object) -> NDArray[Any]:
       (NaN for missing measurements).
     * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present)
       and `angle` (radians), float32. Ranges without an intensity have NaN.
+      `MultiEchoLaserScan` has a row for each echo, beam after beam, and `echo`, its number.
     * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the
       cloud's own fields, which may overlap; `PointCloud`: shape (n,), `x`, `y`, `z` and the
       channels, NaN where a channel ends early.
+    * `foxglove.LaserScan` and `foxglove.PointCloud`, also of `foxglove_msgs`: the same.
 
     An empty image, picture or cloud is an empty array. A step of 0 means rows without
     padding. Images and `PointCloud2` clouds are views of the message's data, without a copy.
 
     Args:
         type_name: `sensor_msgs/Image` or `sensor_msgs/msg/Image`.
-        message: The decoded message, its fields as attributes.
+        message: The decoded message, its fields as attributes or, from JSON, as a dict.
 
     Raises:
         PayloadError: the type is none of these, or the sizes, the encoding or the
             fields do not fit the data.
         MissingDependencyError: Pillow is required and not installed.
     """
-    maker = _MAKERS.get(type_name.replace("/msg/", "/"))
+    maker = _MAKERS.get(plain_type(type_name))
     if maker is None:
         raise PayloadError(
             f"{type_name} has no array form; {', '.join(_MAKERS)} have. "
             "Its fields are in decode(), its columns in to_pandas()."
         )
     try:
-        return maker(message)
+        return maker(attributes(message))
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise PayloadError(f"this {type_name} has unusual fields: {error}") from error
 
 
-def _bytes(data: Any) -> NDArray[np.uint8]:
-    """The bytes of a uint8 sequence, as a view if it is an array or a buffer."""
-    if isinstance(data, (bytes, bytearray, memoryview)):
-        return np.frombuffer(data, np.uint8)
-    return np.ascontiguousarray(data).view(np.uint8).reshape(-1)
+def plain_type(name: str) -> str:
+    """The name of a type without `msg`, and of a Foxglove type as Foxglove has it."""
+    return name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove.")
+
+
+def attributes(message: Any) -> Any:
+    """The message with its fields as attributes, if it is a dict as JSON gives it."""
+    if isinstance(message, dict):
+        return SimpleNamespace(**{str(name): attributes(item) for name, item in message.items()})
+    if isinstance(message, list) and any(isinstance(item, dict) for item in message[:1]):
+        return [attributes(item) for item in message]
+    return message
 
 
 def _image(message: Any) -> NDArray[Any]:
     encoding = str(message.encoding).strip()
     height, width, step = int(message.height), int(message.width), int(message.step)
-    data = _bytes(message.data)
+    data = byte_array(message.data)
     if not encoding and not height * width and not len(data):
-        return np.empty((min(height, _MAX_EMPTY), min(width, _MAX_EMPTY)), np.uint8)
+        return np.empty((min(height, MAX_EMPTY), min(width, MAX_EMPTY)), np.uint8)
     channels, sample = 1, np.dtype(np.uint8)
     planes = _PLANAR.get(encoding.lower())
     if planes is not None:
@@ -120,11 +121,11 @@ def _image(message: Any) -> NDArray[Any]:
         sample = sample.newbyteorder(">")
     row = width * channels * sample.itemsize
     step = step or row
-    _check_rows("an image", (height, width), row, step, len(data))
+    check_rows("an image", (height, width), row, step, len(data))
     pixel = channels * sample.itemsize
     if channels == 1:
-        return _view(data, (height, width), sample, (step, pixel))
-    return _view(data, (height, width, channels), sample, (step, pixel, sample.itemsize))
+        return view_of(data, (height, width), sample, (step, pixel))
+    return view_of(data, (height, width, channels), sample, (step, pixel, sample.itemsize))
 
 
 def _sample(encoding: str) -> tuple[np.dtype[Any], int]:
@@ -141,36 +142,9 @@ def _sample(encoding: str) -> tuple[np.dtype[Any], int]:
     raise PayloadError(f"an image has the unknown encoding {encoding[:40]!r}")
 
 
-def _check_rows(what: str, shape: tuple[int, int], row: int, step: int, size: int) -> None:
-    """Check that rows of `row` bytes, `step` bytes apart, lie within `size` bytes."""
-    height, width = shape
-    if height < 0 or width < 0:
-        raise PayloadError(f"{what} cannot have {width} columns and {height} rows")
-    if height and step < row:
-        raise PayloadError(f"{what} has rows of {step} bytes, and {width} columns need {row}")
-    if height and width and (height - 1) * step + row > size:
-        raise PayloadError(
-            f"{what} of {width} x {height} needs {(height - 1) * step + row} bytes and has {size}"
-        )
-
-
-def _view(
-    data: NDArray[np.uint8],
-    shape: tuple[int, ...],
-    dtype: np.dtype[Any],
-    strides: tuple[int, ...],
-) -> NDArray[Any]:
-    """An array over `data`; the caller checked that it lies inside."""
-    if 0 in shape:
-        # If one size is zero, the others are unchecked; numpy refuses those it cannot multiply.
-        return np.empty(tuple(min(size, _MAX_EMPTY) for size in shape), dtype)
-    array: NDArray[Any] = np.ndarray(shape, dtype, data.data, 0, strides)
-    return array
-
-
 def _compressed_image(message: Any) -> NDArray[Any]:
     form = str(message.format)
-    data = _bytes(message.data).tobytes()
+    data = byte_array(message.data).tobytes()
     if not data:
         return np.empty((0, 0), np.uint8)
     if "compressedDepth" in form:
@@ -234,103 +208,8 @@ def _picture(data: bytes) -> NDArray[Any]:
     return array
 
 
-def _laser_scan(message: Any) -> NDArray[Any]:
-    ranges = np.asarray(message.ranges, np.float32)
-    intensities = np.asarray(message.intensities, np.float32)
-    names = ["range", "intensity", "angle"] if len(intensities) else ["range", "angle"]
-    scan = np.empty(len(ranges), [(name, np.float32) for name in names])
-    scan["range"] = ranges
-    if len(intensities):
-        scan["intensity"] = _fill(intensities, len(ranges))
-    with np.errstate(over="ignore", invalid="ignore"):
-        steps = np.arange(len(ranges)) * float(message.angle_increment)
-        scan["angle"] = float(message.angle_min) + steps
-    return scan
-
-
-def _fill(values: Any, size: int) -> NDArray[np.float32]:
-    """As many values as there are points: NaN for those that lack, without surplus ones."""
-    filled = np.full(size, np.nan, np.float32)
-    filled[: len(values)] = values[:size]
-    return filled
-
-
-def _point_cloud2(message: Any) -> NDArray[Any]:
-    height, width = int(message.height), int(message.width)
-    step = int(message.point_step)
-    data = _bytes(message.data)
-    if height * width and not step:
-        raise PayloadError("a point cloud has points of 0 bytes")
-    order = ">" if message.is_bigendian else "<"
-    dtype = _point_dtype(message.fields, step, order)
-    row_step = int(message.row_step) if height > 1 else width * step
-    row_step = row_step or width * step  # some drivers leave it out
-    _check_rows("a point cloud", (height, width), width * step, row_step, len(data))
-    if height == 1:
-        return _view(data, (width,), dtype, (step,))
-    return _view(data, (height, width), dtype, (row_step, step))
-
-
-def _point_dtype(fields: Iterable[Any], step: int, order: str) -> np.dtype[Any]:
-    """The structure of one point.
-
-    Raises:
-        PayloadError: a field has an unknown type, or lies outside the point.
-    """
-    names: list[str] = []
-    formats: list[Any] = []
-    offsets: list[int] = []
-    for field in fields:
-        code, offset, count = int(field.datatype), int(field.offset), int(field.count) or 1
-        name = _unique(str(field.name), names)
-        if code not in _POINT_TYPES:
-            raise PayloadError(f"field {name!r} of a point cloud has the unknown type {code}")
-        item = np.dtype(order + _POINT_TYPES[code])
-        end = offset + count * item.itemsize
-        if offset < 0 or end <= offset:
-            raise PayloadError(
-                f"field {name!r} of a point cloud has {count} elements from byte {offset}"
-            )
-        if end > step:
-            raise PayloadError(
-                f"field {name!r} of a point cloud ends at byte {end} of points of {step} bytes"
-            )
-        names.append(name)
-        formats.append(item if count == 1 else (item, (count,)))
-        offsets.append(offset)
-    try:
-        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
-    except (ValueError, OverflowError) as error:
-        raise PayloadError(f"points of {step} bytes cannot be read: {error}") from error
-
-
-def _unique(name: str, taken: list[str]) -> str:
-    """A field name that numpy accepts: not empty and not used already."""
-    name = name or f"field_{len(taken)}"
-    while name in taken:
-        name += "_"
-    return name
-
-
-def _point_cloud(message: Any) -> NDArray[Any]:
-    points = message.points
-    names = ["x", "y", "z"]
-    columns = []
-    for channel in message.channels:
-        names.append(_unique(str(channel.name), names))
-        columns.append(_fill(channel.values, len(points)))
-    cloud = np.empty(len(points), [(name, np.float32) for name in names])
-    for axis in ("x", "y", "z"):
-        cloud[axis] = np.fromiter((getattr(p, axis) for p in points), np.float32, len(points))
-    for name, values in zip(names[3:], columns, strict=True):
-        cloud[name] = values
-    return cloud
-
-
 _MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
     "sensor_msgs/Image": _image,
     "sensor_msgs/CompressedImage": _compressed_image,
-    "sensor_msgs/LaserScan": _laser_scan,
-    "sensor_msgs/PointCloud2": _point_cloud2,
-    "sensor_msgs/PointCloud": _point_cloud,
+    **POINT_MAKERS,
 }

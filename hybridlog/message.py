@@ -150,7 +150,7 @@ class Message:
         return self._codec.decode(self._view)
 
     def to_numpy(self) -> NDArray[Any]:
-        """Image, CompressedImage, LaserScan or PointCloud2 as an array.
+        """An image, scan or point cloud as an array.
 
         Raises:
             PayloadError: another type, or sizes that do not fit the data.

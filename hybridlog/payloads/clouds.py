@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from hybridlog.point_arrays import MAX_FIELDS, POINT_TYPES
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
 from hybridlog.tables.layout import column_names
 
@@ -22,9 +23,7 @@ if TYPE_CHECKING:
 CLOUD_TYPES: Final = frozenset({"sensor_msgs/PointCloud2", "sensor_msgs/msg/PointCloud2"})
 DATA: Final = "data"
 """Field of a cloud that holds its points."""
-_DTYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_STEP = 1 << 16
-_MAX_FIELDS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,14 +81,14 @@ class PointLayout:
         """
         fields = [PointField(str(n), int(o), str(d), int(c)) for n, o, d, c in value["fields"]]
         found = cls(int(value["step"]), tuple(fields))
-        known = {order + name for order in "<>" for name in _DTYPES.values()}
+        known = {order + name for order in "<>" for name in POINT_TYPES.values()}
         if not {f.dtype for f in fields} <= known or not found.is_sound():
             raise ValueError("the layout of points contradicts itself")
         return found
 
     def is_sound(self) -> bool:
         """True if all fields lie within the point, in order and apart."""
-        if not (0 < self.step <= _MAX_STEP and 0 < len(self.fields) <= _MAX_FIELDS):
+        if not (0 < self.step <= _MAX_STEP and 0 < len(self.fields) <= MAX_FIELDS):
             return False
         if any(f.offset < 0 or f.count < 1 or f.end > self.step for f in self.fields):
             return False
@@ -212,7 +211,7 @@ def _described(fields: Arrays) -> list[tuple[str, int, int, int]] | None:
     inner, rows = fields.values, len(fields)
     count, rest = divmod(int(fields.offset[-1]), rows)
     is_even = rest == 0 and bool((np.diff(fields.offset) == count).all())
-    if not is_even or not isinstance(inner, Records) or not 0 < count <= _MAX_FIELDS:
+    if not is_even or not isinstance(inner, Records) or not 0 < count <= MAX_FIELDS:
         return None
     columns = []
     for name in ("offset", "datatype", "count"):
@@ -240,7 +239,7 @@ def _text(names: Strings, place: int) -> str:
 def _layout(
     step: int, order: str, described: Sequence[tuple[str, int, int, int]]
 ) -> PointLayout | None:
-    known = [one for one in described if one[2] in _DTYPES]
+    known = [one for one in described if one[2] in POINT_TYPES]
     if len(known) < len(described):
         return None
     ordered = sorted(known, key=lambda one: one[1])
@@ -252,7 +251,7 @@ def _layout(
         names.append(label)
     columns = [column for _, column in column_names(names, ())]
     fields = tuple(
-        PointField(column, offset, order + _DTYPES[kind], count or 1)
+        PointField(column, offset, order + POINT_TYPES[kind], count or 1)
         for column, (_, offset, kind, count) in zip(columns, ordered, strict=True)
     )
     found = PointLayout(step, fields)
