@@ -1,0 +1,265 @@
+"""Scans and point clouds as points to draw: float32 arrays of bounded length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.arrays import attributes, plain_type, to_numpy
+from hybridlog.point_arrays import POINT_MAKERS
+from hybridlog_storage.errors import PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+
+MAX_POINTS: Final = 500_000
+"""Points that are drawn at most, unless the caller says otherwise."""
+COLOUR: Final = "rgb"
+"""Name of the values that are colours: red * 65536 + green * 256 + blue."""
+_MAX_VALUES = 64
+_FAR = 8192.0  # m; from here on float32 has steps of a millimetre
+_AXES = ("x", "y", "z")
+_NONE: Final = np.empty(0)
+_PARTS = (("red", "green", "blue"), ("r", "g", "b"))
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """The points of a message.
+
+    Attributes:
+        xyz: float32[n, 3], metres from `origin`, in the frame of the message.
+        values: float32[n] for each name that was asked for: the value minus its `bases`. NaN
+            where a point has none. Those called `rgb` are colours, red * 65536 + green * 256
+            + blue.
+        frame: The frame's name.
+        names: Every name that can be asked for.
+        total: Points of the message.
+        dropped: Number of points that are left out, by reason.
+        every: 1 if all others are here, n if only every n-th is.
+        origin: Metres, [0, 0, 0] unless float32 would lose millimetres without it.
+        bases: For each name, 0 unless float32 would lose differences without it.
+        is_flat: True if all points have the same z, as those of a scan.
+        remarks: Sentences about what contradicts itself in the message.
+    """
+
+    xyz: NDArray[np.float32]
+    values: dict[str, NDArray[np.float32]]
+    frame: str
+    names: tuple[str, ...]
+    total: int
+    dropped: dict[str, int] = field(default_factory=dict)
+    every: int = 1
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bases: dict[str, float] = field(default_factory=dict)
+    is_flat: bool = False
+    remarks: tuple[str, ...] = ()
+
+
+def points(
+    message: Message, *, values: Collection[str] | None = None, limit: int = MAX_POINTS
+) -> Points:
+    """The points of a scan or cloud.
+
+    Points that are not finite, and ranges outside of those that the scanner can measure, are
+    left out.
+
+    Args:
+        message: `LaserScan`, `MultiEchoLaserScan`, `PointCloud2` or `PointCloud` of sensor_msgs,
+            or Foxglove's `LaserScan` or `PointCloud`.
+        values: Names of values of the points; None for all. Unknown names are left out.
+        limit: Maximum number of points. If there are more, every n-th is taken.
+
+    Raises:
+        PayloadError: the message has another type, no points, or sizes that do not fit its data.
+        DefinitionError: it has no definition.
+    """
+    kind = plain_type(message.type)
+    if kind not in POINT_MAKERS:
+        raise PayloadError(
+            f"{message.type or 'a message without a type'} has no points; "
+            f"{', '.join(POINT_MAKERS)} have."
+        )
+    decoded = attributes(message.decode())
+    rows = to_numpy(message.type, decoded).reshape(-1)
+    try:
+        return _drawn(decoded, rows, values, limit)
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise PayloadError(f"this {message.type} has unusual fields: {error}") from error
+
+
+def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, limit: int) -> Points:
+    is_scan = hasattr(decoded, "ranges")
+    remarks: list[str] = []
+    dropped: dict[str, int] = {}
+    with np.errstate(over="ignore", invalid="ignore"):
+        axes = _scanned(rows) if is_scan else _axes(rows)
+        axes = _posed(axes, getattr(decoded, "pose", None))
+        origin = tuple(_origin(axis) for axis in axes)
+        near = [(axis - base).astype(np.float32) for axis, base in zip(axes, origin, strict=True)]
+        finite = np.isfinite(near[0]) & np.isfinite(near[1]) & np.isfinite(near[2])
+        chosen = finite
+        if is_scan and hasattr(decoded, "range_min"):
+            chosen = finite & _in_range(rows["range"], decoded, remarks)
+    if not finite.all():
+        dropped["not finite"] = int(len(rows) - np.count_nonzero(finite))
+    outside = int(np.count_nonzero(finite) - np.count_nonzero(chosen))
+    if outside:
+        dropped["out of range"] = outside
+    places = np.flatnonzero(chosen)
+    every = max(1, -(-len(places) // max(limit, 1)))
+    places = places[::every]
+    xyz = np.stack([axis[places] for axis in near], axis=1)
+    offered = _offered(rows[places])
+    with np.errstate(over="ignore", invalid="ignore"):
+        taken = {
+            name: _relative(column) if name != COLOUR else (column.astype(np.float32), 0.0)
+            for name, column in offered.items()
+            if values is None or name in values
+        }
+    return Points(
+        xyz=xyz,
+        values={name: value for name, (value, _) in taken.items()},
+        frame=_frame(decoded),
+        names=tuple(offered),
+        total=len(rows),
+        dropped=dropped,
+        every=every,
+        origin=(origin[0], origin[1], origin[2]),
+        bases={name: base for name, (_, base) in taken.items()},
+        is_flat=is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
+        remarks=tuple(remarks),
+    )
+
+
+def _scanned(rows: NDArray[Any]) -> list[NDArray[Any]]:
+    """x, y and z of the ranges of a scan."""
+    angle = rows["angle"].astype(np.float64)
+    return [rows["range"] * np.cos(angle), rows["range"] * np.sin(angle), np.zeros(len(rows))]
+
+
+def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:
+    """x, y and z of the points of a cloud; one that lacks is 0.
+
+    Raises:
+        PayloadError: two lack, or one is not a single number.
+    """
+    names = rows.dtype.names or ()
+    if not len(rows):
+        return [np.zeros(0)] * 3
+    if sum(name in names for name in _AXES) < 2:
+        raise PayloadError(f"a point cloud has no x, y and z; its fields are {', '.join(names)}")
+    axes = [rows[name] if name in names else np.zeros(len(rows)) for name in _AXES]
+    if any(axis.ndim > 1 for axis in axes):
+        raise PayloadError("x, y and z of a point cloud are not single numbers")
+    return axes
+
+
+def _posed(axes: list[NDArray[Any]], pose: Any) -> list[NDArray[Any]]:
+    """The points in the frame of the message.
+
+    Args:
+        axes: x, y and z in the frame of the pose.
+        pose: Pose in the frame of the message; None for the frame itself.
+    """
+    if pose is None:
+        return axes
+    place = [float(getattr(pose.position, name)) for name in _AXES]
+    turn = np.array([float(getattr(pose.orientation, name)) for name in "xyzw"])
+    length = float(np.linalg.norm(turn))
+    if length > 0:  # all zero is what protobuf has where nothing was set
+        x, y, z, w = turn / length
+        matrix = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        if not np.array_equal(matrix, np.eye(3)):
+            axes = list(matrix @ np.stack([axis.astype(np.float64) for axis in axes]))
+    if any(place):
+        axes = [axis.astype(np.float64) + by for axis, by in zip(axes, place, strict=True)]
+    return axes
+
+
+def _origin(axis: NDArray[Any]) -> float:
+    """What to subtract, so that float32 keeps millimetres; 0 if it does."""
+    if axis.dtype.itemsize <= 4 and axis.dtype.kind == "f":
+        return 0.0
+    finite = axis[np.isfinite(axis)]
+    if not len(finite):
+        return 0.0
+    low, middle, high = np.quantile(_some(finite), (0.01, 0.5, 0.99)).tolist()
+    far = max(abs(low), abs(high))
+    return float(round(middle)) if far > _FAR and far > 2 * (high - low) else 0.0
+
+
+def _in_range(ranges: NDArray[np.float32], scan: Any, remarks: list[str]) -> NDArray[np.bool_]:
+    """True for ranges that the scanner can measure."""
+    least, greatest = np.float32(scan.range_min), np.float32(scan.range_max)
+    if not least < greatest:
+        remarks.append(
+            f"range_min {least:g} is not below range_max {greatest:g}: every finite range is drawn."
+        )
+        return np.ones(len(ranges), np.bool_)
+    return (ranges >= least) & (ranges <= greatest)
+
+
+def _offered(rows: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The values of points by name, in the types of the message. Colours are first."""
+    found: dict[str, NDArray[Any]] = {}
+    for name in rows.dtype.names or ():
+        column = rows[name]
+        if name in {"rgb", "rgba"} and column.dtype.itemsize == 4 and column.ndim == 1:
+            whole = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
+            found.setdefault(COLOUR, whole.view(np.uint32) & 0xFFFFFF)
+        elif column.ndim > 1:
+            shown = range(min(column.shape[1], _MAX_VALUES))
+            found |= {f"{name}[{place}]": column[:, place] for place in shown}
+        elif name not in _AXES:
+            found[name] = column
+    for parts in _PARTS:
+        if COLOUR not in found and all(found.get(name, _NONE).dtype == "u1" for name in parts):
+            red, green, blue = (found[name].astype(np.uint32) for name in parts)
+            found = {COLOUR: red << 16 | green << 8 | blue} | found
+    return dict(list(found.items())[:_MAX_VALUES])
+
+
+def _relative(values: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
+    """Values as float32, and what was subtracted so that their differences are kept."""
+    finite = values[np.isfinite(values)].astype(np.float64)
+    if values.dtype.itemsize < 4 or values.dtype == np.float32 or not len(finite):
+        return values.astype(np.float32), 0.0
+    least, greatest = float(finite.min()), float(finite.max())
+    if max(abs(least), abs(greatest)) < (greatest - least) * 8192:
+        return values.astype(np.float32), 0.0
+    return (values - np.float64(least)).astype(np.float32), least
+
+
+def bounds(values: NDArray[np.float32]) -> tuple[float, float, float, float] | None:
+    """Least and greatest finite value, and those without the outermost hundredths.
+
+    Garbage in a few points does not change the latter much. None if no value is finite.
+    """
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return None
+    low, high = np.quantile(_some(finite), (0.01, 0.99))
+    return float(finite.min()), float(finite.max()), float(low), float(high)
+
+
+def _some(values: NDArray[Any]) -> NDArray[Any]:
+    """Values that stand for all in a quantile."""
+    return values[:: max(1, len(values) // 20_000)]
+
+
+def _frame(message: Any) -> str:
+    header = getattr(message, "header", message)
+    return str(getattr(header, "frame_id", ""))

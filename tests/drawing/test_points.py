@@ -1,0 +1,543 @@
+"""Points of scans and clouds, against readers that take each value by hand."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hybridlog as hl
+from hybridlog.drawing.points import Points, bounds, points
+from hybridlog.message import Message
+from hybridlog_storage.errors import PayloadError
+from hybridlog_storage.messages import Channel, Schema
+from tests.data import needs_data
+from tests.ros_values import ROS1
+from tests.test_arrays import decoded
+
+CODES = "?bBhHiIfd"
+
+
+def points_of(kind: str, fields: Any, **options: Any) -> Points:
+    """The points of a message that is decoded already."""
+    return points(cast(Message, SimpleNamespace(type=kind, decode=lambda: fields)), **options)
+
+
+def cloud(
+    described: list[tuple[str, int, int, int]],
+    rows: list[list[bytes]],
+    *,
+    step: int,
+    row_padding: int = 0,
+    is_big: bool = False,
+) -> SimpleNamespace:
+    """A PointCloud2 of rows of points, which are bytes already.
+
+    Args:
+        described: Name, offset, datatype and count of each field.
+    """
+    data = b"".join(b"".join(row) + b"\xa5" * row_padding for row in rows)
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id="lidar"),
+        height=len(rows),
+        width=len(rows[0]),
+        point_step=step,
+        row_step=step * len(rows[0]) + row_padding,
+        is_bigendian=is_big,
+        fields=[
+            SimpleNamespace(name=name, offset=offset, datatype=kind, count=count)
+            for name, offset, kind, count in described
+        ],
+        data=np.frombuffer(data, np.uint8),
+    )
+
+
+def packed(step: int, is_big: bool, parts: list[tuple[int, int, list[Any]]]) -> bytes:
+    """A point: offset, datatype and elements of each field; the rest is no zero."""
+    point = bytearray(b"\xa5" * step)
+    for offset, kind, elements in parts:
+        form = f"{'>' if is_big else '<'}{len(elements)}{CODES[kind]}"
+        struct.pack_into(form, point, offset, *elements)
+    return bytes(point)
+
+
+def simple(xyz: list[tuple[float, ...]], **more: Any) -> SimpleNamespace:
+    """A cloud of float32 x, y and z."""
+    made = cloud(
+        [("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1)],
+        [[struct.pack("<3f", *one) for one in xyz]],
+        step=12,
+    )
+    made.__dict__.update(more)
+    return made
+
+
+# Clouds
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> tuple[Any, list[dict[str, Any]]]:
+    """A PointCloud2 in any layout, and the values of each of its points."""
+    others = draw(st.lists(st.sampled_from(["intensity", "ring", "t", "noise"]), unique=True))
+    names = draw(st.permutations(["x", "y", "z", *others]))
+    offset, described = 0, []
+    for name in names:
+        offset += draw(st.integers(0, 5))
+        kind = draw(st.integers(1, 8))
+        count = 1 if name in {"x", "y", "z"} else draw(st.sampled_from([0, 1, 1, 3]))
+        described.append((name, offset, kind, count))
+        offset += max(count, 1) * struct.calcsize(CODES[kind])
+    step, is_big = offset + draw(st.integers(0, 5)), draw(st.booleans())
+    height, width = draw(st.integers(1, 3)), draw(st.integers(1, 4))
+    values, rows = [], []
+    for _ in range(height):
+        row = []
+        for _ in range(width):
+            point, parts = {}, []
+            for name, at, kind, count in described:
+                elements = [_number(draw, kind) for _ in range(max(count, 1))]
+                parts.append((at, kind, elements))
+                several = {f"{name}[{place}]": value for place, value in enumerate(elements)}
+                point |= several if count > 1 else {name: elements[0]}
+            row.append(packed(step, is_big, parts))
+            values.append(point)
+        rows.append(row)
+    padding = draw(st.integers(0, 7)) if height > 1 else 0
+    shuffled = draw(st.permutations(described))
+    return cloud(shuffled, rows, step=step, row_padding=padding, is_big=is_big), values
+
+
+def _number(draw: st.DrawFn, kind: int) -> float:
+    code = CODES[kind]
+    if code in "fd":
+        common = st.floats(-500, 500, width=32)
+        return draw(st.one_of(common, common, st.sampled_from([math.nan, math.inf, -math.inf])))
+    bits = 8 * struct.calcsize(code)
+    least = 0 if code.isupper() else -(2 ** (bits - 1))
+    return draw(st.integers(least, least + 2**bits - 1))
+
+
+@settings(max_examples=150)
+@given(layouts())
+def test_clouds_of_any_layout(made: tuple[Any, list[dict[str, Any]]]) -> None:
+    message, wanted = made
+    got = points_of("sensor_msgs/PointCloud2", message)
+    kept = [one for one in wanted if all(math.isfinite(one[axis]) for axis in "xyz")]
+    assert got.total == len(wanted)
+    assert got.dropped == ({"not finite": len(wanted) - len(kept)} if kept != wanted else {})
+    assert len(got.xyz) == len(kept)
+    assert set(got.names) == set(wanted[0]) - {"x", "y", "z"}
+    for place, axis in enumerate("xyz"):
+        there = got.xyz[:, place].astype(float) + got.origin[place]
+        _same(there, [float(one[axis]) for one in kept])
+    for name in got.names:
+        _same(got.values[name].astype(float) + got.bases[name], [float(p[name]) for p in kept])
+
+
+def _same(found: Any, wanted: list[float]) -> None:
+    finite = [one for one in wanted if math.isfinite(one)]
+    spread = max(finite) - min(finite) if finite else 0.0
+    # As exact as float32 can tell two values apart, among these or on its own.
+    nearest = max((abs(one) for one in finite), default=0.0)
+    close = max(spread * 2.0**-10, 1e-3 if nearest < 8192 else nearest * 2.0**-22)
+    assert np.allclose(found, wanted, rtol=0, atol=close, equal_nan=True)
+
+
+@pytest.mark.parametrize("kind", [6, 7])
+@pytest.mark.parametrize("is_big", [False, True])
+@pytest.mark.parametrize("name", ["rgb", "rgba"])
+def test_packed_colours(name: str, is_big: bool, kind: int) -> None:
+    order = ">" if is_big else "<"
+    rows = [
+        struct.pack(f"{order}3fI", 1, 2, 3, (alpha << 24) | colour)
+        for alpha, colour in ((255, 0xFF8001), (0, 0x010203), (127, 0))
+    ]
+    described = [("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), (name, 12, kind, 1)]
+    got = points_of("sensor_msgs/msg/PointCloud2", cloud(described, [rows], step=16, is_big=is_big))
+    assert got.names == ("rgb",)
+    assert got.values["rgb"].tolist() == [0xFF8001, 0x010203, 0]
+
+
+def test_colours_in_bytes_and_both_spellings() -> None:
+    rows = [struct.pack("<2f4B", 1, 2, 10, 20, 30, 255)]
+    parts = [(name, 8 + at, 2, 1) for at, name in enumerate(("red", "green", "blue", "alpha"))]
+    described = [("x", 0, 7, 1), ("y", 4, 7, 1)]
+    got = points_of("sensor_msgs/PointCloud2", cloud([*described, *parts], [rows], step=12))
+    assert got.names == ("rgb", "red", "green", "blue", "alpha")
+    assert got.values["rgb"].tolist() == [10 << 16 | 20 << 8 | 30]
+    assert got.xyz.tolist() == [[1, 2, 0]]
+    assert got.is_flat
+    both = [("rgba", 8, 6, 1), ("rgb", 8, 7, 1)]
+    got = points_of("sensor_msgs/PointCloud2", cloud([*described, *both], [rows], step=12))
+    assert got.names == ("rgb",)
+    assert got.values["rgb"].tolist() == [30 << 16 | 20 << 8 | 10]
+
+
+def test_only_values_that_are_asked_for() -> None:
+    described = [("x", 0, 7, 1), ("y", 4, 7, 1), ("ring", 8, 4, 1), ("t", 10, 2, 1)]
+    message = cloud(described, [[struct.pack("<2fHB", 1, 2, 7, 9)]], step=11)
+    got = points_of("sensor_msgs/PointCloud2", message, values=["t", "unknown"])
+    assert list(got.values) == ["t"]
+    assert got.names == ("ring", "t")
+
+
+def test_many_points_are_thinned_after_the_invalid_ones() -> None:
+    xyz = [(math.nan if place % 3 == 0 else place, 0.0, 1.0) for place in range(3000)]
+    got = points_of("sensor_msgs/PointCloud2", simple(xyz), limit=500)
+    valid = [x for x, *_ in xyz if not math.isnan(x)]
+    assert (got.total, got.dropped, got.every) == (3000, {"not finite": 1000}, 4)
+    assert got.xyz[:, 0].tolist() == valid[::4]
+    assert points_of("sensor_msgs/PointCloud2", simple(xyz), limit=2000).every == 1
+    assert points_of("sensor_msgs/PointCloud2", simple(xyz), limit=1999).every == 2
+
+
+def test_far_from_the_origin_keeps_millimetres() -> None:
+    # Coordinates of a map in UTM; times as seconds since the epoch.
+    rows = [
+        struct.pack("<4d", 448_262.001 + at / 1000, 5_411_932.678, 300.0, 1_700_000_000 + at / 1000)
+        for at in range(10)
+    ]
+    described = [(name, 8 * at, 8, 1) for at, name in enumerate(("x", "y", "z", "stamp"))]
+    got = points_of("sensor_msgs/PointCloud2", cloud(described, [rows], step=32))
+    assert got.origin[2] == 0
+    there = got.xyz.astype(float) + got.origin
+    assert np.abs(there[:, 0] - [448_262.001 + at / 1000 for at in range(10)]).max() < 1e-4
+    assert np.abs(there[:, 1] - 5_411_932.678).max() < 1e-4
+    times = got.values["stamp"].astype(float) + got.bases["stamp"]
+    assert np.abs(times - [1_700_000_000 + at / 1000 for at in range(10)]).max() < 1e-6
+
+
+def test_values_that_float32_cannot_hold_are_not_finite() -> None:
+    rows = [struct.pack("<3d", x, 1, 2) for x in (1e300, 5, -1e39)]
+    described = [(name, 8 * at, 8, 1) for at, name in enumerate("xyz")]
+    got = points_of("sensor_msgs/PointCloud2", cloud(described, [rows], step=24))
+    assert got.dropped == {"not finite": 2}
+    assert got.xyz.tolist() == [[5, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"data": np.zeros(35, np.uint8)}, "needs 36 bytes and has 35"),
+        ({"point_step": 0}, "points of 0 bytes"),
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "has rows of"),
+        ({"width": 2**32 - 1, "row_step": 2**32 - 1}, "needs"),
+        ({"fields": []}, "has no x, y and z"),
+        ({"fields": "x"}, "unusual fields"),
+        (
+            {"fields": [SimpleNamespace(name="x", offset=0, datatype=7, count=1)]},
+            "no x, y and z; its fields are x",
+        ),
+        (
+            {
+                "fields": [
+                    SimpleNamespace(name="x", offset=0, datatype=7, count=2),
+                    SimpleNamespace(name="y", offset=0, datatype=7, count=1),
+                ]
+            },
+            "not single numbers",
+        ),
+        (
+            {"fields": [SimpleNamespace(name="x", offset=0, datatype=2, count=1)] * 257},
+            "more than 256 fields",
+        ),
+    ],
+)
+def test_damaged_clouds(change: dict[str, Any], message: str) -> None:
+    damaged = simple([(1, 2, 3)] * 3, **change)
+    with pytest.raises(PayloadError, match=message):
+        points_of("sensor_msgs/PointCloud2", damaged)
+
+
+def test_256_fields_of_one_name() -> None:
+    one = SimpleNamespace(name="x", offset=0, datatype=2, count=1)
+    y = SimpleNamespace(name="y", offset=4, datatype=7, count=1)
+    got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], fields=[one] * 255 + [y]))
+    assert got.names[:2] == ("x_", "x__")
+    assert len(got.names) == 64
+    assert got.xyz[0, 1] == 2
+
+
+def test_empty_messages() -> None:
+    got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], width=0, fields=[]))
+    assert (got.total, got.xyz.shape, got.frame) == (0, (0, 3), "lidar")
+    assert bounds(got.xyz[:, 0]) is None
+
+
+def test_old_clouds() -> None:
+    message = SimpleNamespace(
+        header=SimpleNamespace(frame_id="old"),
+        points=[SimpleNamespace(x=1, y=2, z=3), SimpleNamespace(x=math.nan, y=0, z=0)],
+        channels=[SimpleNamespace(name="intensity", values=np.array([5, 6], np.float32))],
+    )
+    got = points_of("sensor_msgs/PointCloud", message)
+    assert got.xyz.tolist() == [[1, 2, 3]]
+    assert got.values["intensity"].tolist() == [5]
+    assert got.frame == "old"
+    message.channels *= 257
+    with pytest.raises(PayloadError, match="more than 256 channels"):
+        points_of("sensor_msgs/PointCloud", message)
+
+
+# Scans
+
+
+def scan(ranges: list[float], intensities: list[float] | None = None, **more: Any) -> Any:
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id="laser"),
+        angle_min=-1.5,
+        angle_increment=0.5,
+        range_min=0.25,
+        range_max=8.0,
+        ranges=np.array(ranges, np.float32),
+        intensities=np.array(intensities or [], np.float32),
+        **more,
+    )
+
+
+def test_scans() -> None:
+    ranges = [1.0, 0.25, 8.0, math.nan, math.inf, -math.inf, 0.125, 8.5, -1.0, 2.0]
+    got = points_of("sensor_msgs/msg/LaserScan", scan(ranges, [*map(float, range(10))]))
+    kept = [0, 1, 2, 9]
+    wanted = [
+        (ranges[n] * math.cos(-1.5 + n / 2), ranges[n] * math.sin(-1.5 + n / 2), 0) for n in kept
+    ]
+    assert np.allclose(got.xyz, wanted, rtol=0, atol=1e-6)
+    assert got.dropped == {"not finite": 3, "out of range": 3}
+    assert got.total == 10
+    assert got.is_flat
+    assert got.frame == "laser"
+    assert got.names == ("range", "intensity", "angle")
+    assert got.values["intensity"].tolist() == kept
+    assert got.values["range"].tolist() == [1, 0.25, 8, 2]
+
+
+@pytest.mark.parametrize(("least", "greatest"), [(0.0, 0.0), (5.0, 1.0), (math.nan, 8.0)])
+def test_bounds_that_contradict_themselves(least: float, greatest: float) -> None:
+    message = scan([1.0, math.inf, 100.0])
+    message.range_min, message.range_max = least, greatest
+    got = points_of("sensor_msgs/LaserScan", message)
+    assert len(got.xyz) == 2
+    assert got.dropped == {"not finite": 1}
+    assert "is not below range_max" in got.remarks[0]
+
+
+def echoes(*beams: list[float]) -> list[SimpleNamespace]:
+    return [SimpleNamespace(echoes=np.array(beam, np.float32)) for beam in beams]
+
+
+def test_scans_with_several_echoes() -> None:
+    message = scan([])
+    message.ranges = echoes([1, 2], [], [3, 9, 4])
+    message.intensities = echoes([10, 20], [], [30])
+    got = points_of("sensor_msgs/MultiEchoLaserScan", message)
+    last = -1.5 + 2 * 0.5
+    wanted = [(r * math.cos(a), r * math.sin(a), 0) for r, a in ((1, -1.5), (2, -1.5), (3, last))]
+    wanted.append((4 * math.cos(last), 4 * math.sin(last), 0))
+    assert np.allclose(got.xyz, wanted, rtol=0, atol=1e-6)
+    assert got.dropped == {"out of range": 1}
+    assert got.values["echo"].tolist() == [0, 1, 0, 2]
+    assert got.values["intensity"][:3].tolist() == [10, 20, 30]
+    assert math.isnan(got.values["intensity"][3])
+    message.intensities = []
+    got = points_of("sensor_msgs/MultiEchoLaserScan", message)
+    assert got.names == ("range", "angle", "echo")
+    message.ranges = []
+    assert points_of("sensor_msgs/MultiEchoLaserScan", message).total == 0
+
+
+def test_an_empty_scan() -> None:
+    got = points_of("sensor_msgs/LaserScan", scan([]))
+    assert (got.total, got.dropped, got.is_flat) == (0, {}, True)
+
+
+# Foxglove
+
+
+POSE = {
+    "position": {"x": 10.0, "y": 20.0, "z": 0.5},
+    # A quarter to the left, not normalised.
+    "orientation": {"x": 0.0, "y": 0.0, "z": 3.0, "w": 3.0},
+}
+CLOUD_BYTES = struct.pack("<3fH", 1, 2, 3, 7) + struct.pack("<3fH", 4, 5, math.nan, 8)
+
+
+def foxglove_cloud(data: Any) -> dict[str, Any]:
+    names = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 12, 3))
+    return {
+        "timestamp": {"sec": 1, "nsec": 2},
+        "frame_id": "base",
+        "pose": POSE,
+        "point_stride": 14,
+        "fields": [{"name": n, "offset": at, "type": kind} for n, at, kind in names],
+        "data": data,
+    }
+
+
+def foxglove_scan() -> dict[str, Any]:
+    return {
+        "frame_id": "base",
+        "pose": POSE,
+        "start_angle": 0.0,
+        "end_angle": math.pi,
+        "ranges": [1.0, 2.0, 3.0],
+        "intensities": [4.0, 5.0, 6.0],
+    }
+
+
+def foxglove_messages() -> list[tuple[Channel, bytes]]:
+    """A scan and a cloud in protobuf, made by Foxglove's own SDK, and in JSON."""
+    from foxglove import messages as made
+
+    pose = made.Pose(
+        position=made.Vector3(**POSE["position"]),
+        orientation=made.Quaternion(**POSE["orientation"]),
+    )
+    wanted = foxglove_cloud(CLOUD_BYTES)
+    kinds = {7: "Float32", 3: "Uint16"}
+    sdk_cloud = made.PointCloud(
+        frame_id="base",
+        pose=pose,
+        point_stride=14,
+        fields=[
+            made.PackedElementField(
+                name=f["name"],
+                offset=f["offset"],
+                type=getattr(made.PackedElementFieldNumericType, kinds[f["type"]]),
+            )
+            for f in wanted["fields"]
+        ],
+        data=CLOUD_BYTES,
+    )
+    sdk_scan = made.LaserScan(**{**foxglove_scan(), "pose": pose})
+    found = []
+    for topic, one in (("/cloud", sdk_cloud), ("/scan", sdk_scan)):
+        schema = type(one).get_schema()
+        described = Schema(schema.name, "protobuf", schema.data)
+        found.append((Channel(f"/protobuf{topic}", "protobuf", described), one.encode()))
+    as_text = base64.b64encode(CLOUD_BYTES).decode()
+    for topic, kind, value in (
+        ("/cloud", "foxglove.PointCloud", foxglove_cloud(as_text)),
+        ("/cloud_list", "foxglove.PointCloud", foxglove_cloud(list(CLOUD_BYTES))),
+        ("/scan", "foxglove.LaserScan", foxglove_scan()),
+    ):
+        schema = Schema(kind, "jsonschema", b"{}")
+        found.append((Channel(f"/json{topic}", "json", schema), json.dumps(value).encode()))
+    return found
+
+
+def test_foxglove_messages_in_a_store(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("foxglove") as recorder:
+            for channel, payload in foxglove_messages():
+                recorder.write(channel, payload, log_time=10**18)
+        for encoding in ("protobuf", "json"):
+            (message,) = store.topic(f"/{encoding}/cloud")
+            got = points(message)
+            assert np.allclose(got.xyz, [[10 - 2, 20 + 1, 3.5]], rtol=0, atol=1e-5)
+            assert got.values["ring"].tolist() == [7]
+            assert (got.frame, got.total, got.dropped) == ("base", 2, {"not finite": 1})
+            (message,) = store.topic(f"/{encoding}/scan")
+            got = points(message)
+            wanted = [(10, 21, 0.5), (8, 20, 0.5), (10, 17, 0.5)]
+            assert np.allclose(got.xyz, wanted, rtol=0, atol=1e-5)
+            assert got.values["intensity"].tolist() == [4, 5, 6]
+            assert got.is_flat
+            assert message.to_numpy()["angle"].tolist() == pytest.approx([0, math.pi / 2, math.pi])
+        (message,) = store.topic("/json/cloud_list")
+        assert points(message).values["ring"].tolist() == [7]
+
+
+def test_damaged_foxglove_clouds() -> None:
+    for change, message in (
+        ({"data": CLOUD_BYTES[:-1]}, "27 bytes, which is no whole number"),
+        ({"point_stride": 0}, "ends at byte"),
+        ({"point_stride": 0, "fields": []}, "no whole number"),
+        ({"data": "no base64!"}, "unusual fields"),
+        ({"data": [300]}, "unusual fields"),
+        ({"pose": {"position": {}}}, "unusual fields"),
+        ({"fields": [{"name": "x", "offset": 0, "type": 0}]}, "unknown type 0"),
+    ):
+        with pytest.raises(PayloadError, match=message):
+            points_of("foxglove.PointCloud", foxglove_cloud(CLOUD_BYTES) | change)
+    # Where nothing was set, protobuf has zeros, which turn nothing.
+    nothing = {name: dict.fromkeys(part, 0.0) for name, part in POSE.items()}
+    got = points_of("foxglove_msgs/msg/PointCloud", foxglove_cloud(CLOUD_BYTES) | {"pose": nothing})
+    assert got.xyz.tolist() == [[1, 2, 3]]
+
+
+def test_other_types() -> None:
+    with pytest.raises(PayloadError, match=r"nav_msgs/Odometry has no points; .*PointCloud2"):
+        points_of("nav_msgs/Odometry", SimpleNamespace())
+    with pytest.raises(PayloadError, match="without a type"):
+        points_of("", SimpleNamespace())
+    with pytest.raises(PayloadError, match="unusual fields"):
+        points_of("sensor_msgs/LaserScan", SimpleNamespace(ranges=[]))
+
+
+def test_bounds() -> None:
+    values = np.concatenate([np.linspace(0, 100, 1001), [math.nan, 1e30]]).astype(np.float32)
+    least, greatest, low, high = bounds(values) or ()
+    assert (least, greatest) == (0, np.float32(1e30))
+    assert 0 < low < 2
+    assert 98 < high <= 100
+
+
+# Real logs
+
+
+@needs_data
+def test_a_real_scan_and_the_cloud_that_its_driver_made_of_it() -> None:
+    path = "real/sick_laser_radar.bag"
+    scans = {_stamp(one): one for _, one in decoded(path, "LaserScan")}
+    clouds = {_stamp(one): one for _, one in decoded(path, "PointCloud2") if one.width == 541}
+    common = sorted(scans.keys() & clouds.keys())
+    assert len(common) > 20
+    for stamp in common[::10]:
+        laser = scans[stamp]
+        got = points_of("sensor_msgs/LaserScan", laser)
+        made = points_of("sensor_msgs/PointCloud2", clouds[stamp])
+        inside = (laser.ranges >= laser.range_min) & (laser.ranges <= laser.range_max)
+        assert got.dropped["out of range"] == 541 - inside.sum()
+        assert np.abs(got.xyz - made.xyz[inside]).max() < 1e-3
+
+
+def _stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def test_the_ros1_payload_of_a_cloud(tmp_path: Path) -> None:
+    """Through a store, from bytes that rosbags wrote."""
+    rng = np.random.default_rng(3)
+    xyz = rng.normal(size=(50, 3)).astype(np.float32)
+    types = ROS1.types
+    name = "sensor_msgs/msg/PointCloud2"
+    stamp = types["builtin_interfaces/msg/Time"](1, 2)
+    message = types[name](
+        types["std_msgs/msg/Header"](0, stamp, "map"),
+        1,
+        50,
+        [types["sensor_msgs/msg/PointField"](axis, 4 * at, 7, 1) for at, axis in enumerate("xyz")],
+        False,
+        12,
+        600,
+        xyz.view(np.uint8).reshape(-1),
+        True,
+    )
+    text = ROS1.generate_msgdef(name, ros_version=1)[0].encode()
+    channel = Channel("/cloud", "ros1", Schema("sensor_msgs/PointCloud2", "ros1msg", text))
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("one") as recorder:
+            recorder.write(channel, bytes(ROS1.serialize_ros1(message, name)), log_time=10**18)
+        got = points(store.topic("cloud").at("+0s"))
+    assert np.array_equal(got.xyz, xyz)
+    assert (got.frame, got.names, got.is_flat) == ("map", (), False)
