@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from hybridlog.query.times import format_time
-from hybridlog_storage.errors import HybridlogError
+from hybridlog.schema.codec import DecodedArrow
+from hybridlog_storage.errors import HybridlogError, PayloadError
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun
@@ -148,6 +150,24 @@ class Message:
             DefinitionError: no usable definition exists.
         """
         return self._codec.decode(self._view)
+
+    def content(self) -> pa.StructScalar | Mapping[str, Any]:
+        """Its fields with exact values, arrays whole and without a copy where possible.
+
+        A dictionary if messages of its encoding can lack fields. Of a message whose payload was
+        dropped, what `fields` holds.
+
+        Raises:
+            PayloadError: the payload does not fit its definition.
+            DefinitionError: no usable definition exists.
+        """
+        start, size = np.zeros(1, np.int64), np.array([self._view.nbytes], np.int64)
+        objects = self._codec.objects(self._view, start, size)
+        decoded = objects or self._codec.arrow(self._view, start, size, None)
+        if decoded.unreadable:
+            raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
+        values: Any = decoded.records if isinstance(decoded, DecodedArrow) else decoded.objects
+        return cast("pa.StructScalar | Mapping[str, Any]", values[0])
 
     def to_numpy(self) -> NDArray[Any]:
         """An image, scan or point cloud as an array.

@@ -9,9 +9,9 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.completion import complete_topic
-from hybridlog.cli.infer_fields import infer_fields
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import query_of
+from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import hybridlog as hl
 from hybridlog_storage.segment_writer import SegmentSettings
+from tests.odd_messages import write_odd
 
 MS = 10**6
 BASE = 1_748_937_600 * 10**9
@@ -99,3 +100,11 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
             writer.finish()
         store.record(path / "drive.mcap", settings=SegmentSettings(chunk_size=1 << 16))
         yield made
+
+
+@pytest.fixture(scope="session")
+def odd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """A store with a recording of odd messages."""
+    with hl.open(tmp_path_factory.mktemp("odd") / "store", create=True) as store:
+        write_odd(store)
+        yield store
