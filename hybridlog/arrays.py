@@ -49,11 +49,12 @@ _DEPTH_HEADER = struct.Struct("<iff")
 def to_numpy(type_name: str, message: object) -> NDArray[Any]:
     """A message as an array.
 
-    * `Image`: shape (height, width) or (height, width, channels) in the encoding's own
-      channel order; big-endian samples have a big-endian dtype. YUV 4:2:2 has two
-      channels, not separated; NV12, NV21 and NV24 are returned as raw planes, shape
+    * `Image`, also Foxglove's `RawImage`: shape (height, width) or (height, width, channels)
+      in the encoding's own channel order; big-endian samples have a big-endian dtype. YUV
+      4:2:2 has two channels, not separated; NV12, NV21 and NV24 are returned as raw planes, shape
       (rows of all planes, width).
-    * `CompressedImage`: shape (height, width) or (height, width, 3 or 4), red first.
+    * `CompressedImage`, also Foxglove's: shape (height, width) or (height, width, 3 or 4),
+      red first.
       `compressedDepth` gives the depth image: uint16 millimetres or float32 metres
       (NaN for missing measurements).
     * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present)
@@ -117,7 +118,7 @@ def _image(message: Any) -> NDArray[Any]:
         height = height * whole // part
     else:
         sample, channels = _sample(encoding)
-    if message.is_bigendian:
+    if getattr(message, "is_bigendian", False):  # Foxglove's are little-endian
         sample = sample.newbyteorder(">")
     row = width * channels * sample.itemsize
     step = step or row
@@ -152,16 +153,28 @@ def _compressed_image(message: Any) -> NDArray[Any]:
     return _picture(data)
 
 
-def _depth(form: str, data: bytes) -> NDArray[Any]:
-    """A depth image after its header: quantised inverse depth, or plain depth."""
+def depth_picture(form: str, data: bytes) -> bytes | None:
+    """The PNG in a `compressedDepth` image if its values are the depth, uint16 millimetres.
+
+    Raises:
+        PayloadError: no PNG is in it.
+    """
+    if not data:
+        return data
     if len(data) < _DEPTH_HEADER.size or "rvl" in form.lower():
         raise PayloadError(f"a depth image in the form {form[:60]!r} cannot be read: only PNG can")
-    _, scale, shift = _DEPTH_HEADER.unpack_from(data)
+    return None if form.upper().startswith("32FC1") else data[_DEPTH_HEADER.size :]
+
+
+def _depth(form: str, data: bytes) -> NDArray[Any]:
+    """A depth image after its header: quantised inverse depth, or plain depth."""
+    plain = depth_picture(form, data)
     picture = _picture(data[_DEPTH_HEADER.size :])
     if picture.ndim != 2:
         raise PayloadError("a depth image has more than one channel")
-    if not form.upper().startswith("32FC1"):
+    if plain is not None:
         return picture
+    _, scale, shift = _DEPTH_HEADER.unpack_from(data)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.float32(scale) / (picture.astype(np.float32) - np.float32(shift))
     depth[picture == 0] = np.nan
@@ -208,8 +221,15 @@ def _picture(data: bytes) -> NDArray[Any]:
     return array
 
 
+COMPRESSED_IMAGES: Final = frozenset(
+    ("sensor_msgs/CompressedImage", "foxglove.CompressedImage", "foxglove_msgs/CompressedImage")
+)
+"""Types of messages with a picture in a file format, without `/msg/`."""
+_RAW_IMAGES = ("sensor_msgs/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
+IMAGES: Final = COMPRESSED_IMAGES.union(_RAW_IMAGES)
+"""Types of messages with a picture, without `/msg/`."""
 _MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
-    "sensor_msgs/Image": _image,
-    "sensor_msgs/CompressedImage": _compressed_image,
+    **dict.fromkeys(_RAW_IMAGES, _image),
+    **dict.fromkeys(sorted(COMPRESSED_IMAGES), _compressed_image),
     **POINT_MAKERS,
 }

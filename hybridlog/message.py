@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
 
-_PICTURES = {"sensor_msgs/Image", "sensor_msgs/CompressedImage"}
 _MOST_SHOWN = 64 << 20  # bytes of a payload that a thumbnail is made of
 
 
@@ -97,12 +96,12 @@ class Message:
 
     def _thumbnail(self) -> bytes:
         """A small PNG of an image; empty for other messages, and for what cannot be shown."""
-        kind = self.type.replace("/msg/", "/")
-        if kind not in _PICTURES or len(self._view) > _MOST_SHOWN or self._is_reduced:
-            return b""
-        from hybridlog.arrays import to_numpy
-        from hybridlog.thumbnail import thumbnail
+        from hybridlog.arrays import IMAGES, to_numpy
+        from hybridlog.drawing.pixels import thumbnail
 
+        is_image = self.type.replace("/msg/", "/") in IMAGES
+        if not is_image or len(self._view) > _MOST_SHOWN or self._is_reduced:
+            return b""
         try:
             message = self.decode()
             return thumbnail(to_numpy(self.type, message), getattr(message, "encoding", "rgb8"))

@@ -23,7 +23,7 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 
 # Where each third-party package may be imported: a module, or a package and all below it.
 ALLOWED = {
-    "PIL": ("hybridlog.arrays",),
+    "PIL": ("hybridlog.arrays", "hybridlog.drawing.images"),
     "bson": (
         "hybridlog.message",  # whole index documents, for people,
         "hybridlog.query.answers.index_documents",  # and those as MongoDB has them
@@ -36,7 +36,7 @@ ALLOWED = {
     ),
     "click": ("hybridlog.cli",),
     "google": ("hybridlog.schema.protobuf_codec",),
-    "isal": ("hybridlog_storage.checksum",),
+    "isal": ("hybridlog.drawing.pixels", "hybridlog_storage.checksum"),
     "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
     "mcap": (
         "hybridlog.export.mcap",

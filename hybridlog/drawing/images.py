@@ -1,0 +1,126 @@
+"""Image messages as files that viewers and browsers show."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from hybridlog.arrays import COMPRESSED_IMAGES, depth_picture, to_numpy
+from hybridlog.drawing.pixels import pixels, png
+from hybridlog_storage.errors import MissingDependencyError, PayloadError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image as the content of a file.
+
+    Attributes:
+        media_type: Such as `image/png`.
+        suffix: Suffix of such a file, with the dot: `.png`.
+        data: Content of the file.
+    """
+
+    media_type: str
+    suffix: str
+    data: bytes
+
+
+# Media type, suffix, whether browsers show it, and what it begins with: bytes at offsets.
+_KINDS: Final[Sequence[tuple[str, str, bool, dict[int, bytes]]]] = (
+    ("image/jpeg", ".jpg", True, {0: b"\xff\xd8\xff"}),
+    ("image/png", ".png", True, {0: b"\x89PNG\r\n\x1a\n"}),
+    ("image/webp", ".webp", True, {0: b"RIFF", 8: b"WEBP"}),
+    ("image/gif", ".gif", True, {0: b"GIF8"}),
+    ("image/avif", ".avif", True, {4: b"ftypavif"}),
+    ("image/bmp", ".bmp", True, {0: b"BM", 6: bytes(4)}),
+    ("image/tiff", ".tif", False, {0: b"II*\0"}),
+    ("image/tiff", ".tif", False, {0: b"MM\0*"}),
+    ("image/jp2", ".jp2", False, {4: b"jP  \r\n\x87\n"}),
+    ("image/jxl", ".jxl", False, {4: b"JXL \r\n\x87\n"}),
+    ("image/jxl", ".jxl", False, {0: b"\xff\x0a"}),
+)
+_DEEP_GREY: Final = b"\x10\x00"
+"""16 bits, one channel: bytes 24 and 25 of a PNG file."""
+
+
+def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] = "png") -> Picture:
+    """An image message as a file.
+
+    A compressed image is returned as it came; its bytes say what it is, not its `format`. The
+    depth image of `compressedDepth` is PNG with 16 bits, or with 8 from least to greatest
+    where it is of floats. An uncompressed image is encoded: YUV and Bayer patterns become
+    colours, and `mono16` and the like keep 16 bits in PNG; other values than `uint8` and
+    `uint16` are spread from least to greatest.
+
+    Args:
+        message: Its type is one of `hybridlog.arrays.IMAGES`.
+        raw: False for a picture that every browser shows, and that is for the eye: formats
+            which browsers lack are encoded anew, and 16 bits are spread over 8.
+        form: Format for what is encoded.
+
+    Raises:
+        PayloadError: it is no image, is empty, or does not fit its encoding.
+        DefinitionError: no usable definition exists.
+        MissingDependencyError: Pillow is required and not installed.
+    """
+    decoded = message.decode()
+    if message.type.replace("/msg/", "/") in COMPRESSED_IMAGES:
+        found = _as_it_came(decoded, raw=raw)
+        if found is not None:
+            return found
+    image = to_numpy(message.type, decoded)
+    if image.dtype.names is not None:
+        raise PayloadError(f"{message.type} is no image")
+    deep = raw and form == "png"
+    shown = pixels(image, str(getattr(decoded, "encoding", "rgba8")), deep=deep)
+    if not shown.size:
+        raise PayloadError("an image without pixels cannot be a picture")
+    if form == "jpg":
+        return Picture("image/jpeg", ".jpg", _jpeg(shown))
+    return Picture("image/png", ".png", png(shown))
+
+
+def _as_it_came(message: Any, *, raw: bool) -> Picture | None:
+    """A compressed image unchanged; None if it has to be encoded anew.
+
+    Raises:
+        PayloadError: its bytes are of no known format.
+    """
+    data, form = bytes(message.data), str(message.format)
+    if "compressedDepth" in form:
+        data = depth_picture(form, data) or b""
+    if not data:
+        return None
+    for media_type, suffix, is_shown, marks in _KINDS:
+        if all(data.startswith(mark, at) for at, mark in marks.items()):
+            is_deep = suffix == ".png" and data[24:26] == _DEEP_GREY
+            is_fit = raw or (is_shown and not is_deep)
+            return Picture(media_type, suffix, data) if is_fit else None
+    raise PayloadError(
+        f"a compressed image begins like no known format; it says that it is {form[:40]!r}"
+    )
+
+
+def _jpeg(shown: NDArray[np.uint8]) -> bytes:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingDependencyError(
+            "JPEG needs Pillow: pip install 'hybridlog[images]'"
+        ) from error
+
+    file = io.BytesIO()
+    try:
+        Image.fromarray(shown).save(file, "JPEG", quality=90)
+    except OSError as error:
+        raise PayloadError(f"an image cannot be JPEG: {error}") from error
+    return file.getvalue()
