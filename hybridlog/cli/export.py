@@ -15,7 +15,8 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.write_answer import Front, write_answer
+from hybridlog.cli.write_answer import write_answer
+from hybridlog.export.slices import Front
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 from hybridlog_storage.unfinished import undone

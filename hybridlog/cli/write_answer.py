@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.progress import progress_bar
+from hybridlog.export.slices import IN_FORCE, Front, batches_of, profile_of
 from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
@@ -18,25 +18,12 @@ if TYPE_CHECKING:
 Progress = Callable[[], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Front:
-    """The choice of latched messages from before the time range, in MCAP and bag files.
-
-    Attributes:
-        latched: They are written.
-        original_times: They keep their log time.
-    """
-
-    latched: bool = True
-    original_times: bool = False
-
-
 def write_answer(
     query: Query,
     form: str,
     target: Target,
     *,
-    front: Front = Front(),
+    front: Front = IN_FORCE,
     extras: Extras | None = None,
     quiet: bool = False,
 ) -> int:
@@ -80,8 +67,7 @@ def _write_exact(
 ) -> None:
     from hybridlog.export import open_batch_writer, open_log_writer
 
-    before = query.copy()
-    profile = _profile(query)
+    profile = profile_of(query)
     if extras is None:
         writer = open_batch_writer(form, target, profile=profile)
     else:
@@ -89,13 +75,10 @@ def _write_exact(
     with writer as exact:
         if extras is not None:
             _write_extras(log, extras)
-        if form != "raw" and front.latched:
-            for batch, channels in before.latched(original_times=front.original_times):
-                exact.write(batch, [c.channel for c in channels])
-        for batch, channels in query.batches():
-            exact.write(batch, [c.channel for c in channels])
+        given = front if form != "raw" else Front(latched=False)
+        for batch, channels in batches_of(query, given):
+            exact.write(batch, channels)
             progress()
-    query.counters.add(before.counters)
 
 
 def _write_extras(log: LogWriter, extras: Extras) -> None:
@@ -136,8 +119,3 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
     for name in json_columns(schema):
         output.note(f"{name} has values of several types: it is written as JSON text.")
     return written
-
-
-def _profile(query: Query) -> str:
-    encodings = query.encodings()
-    return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -106,11 +107,13 @@ class Worker:
     Args:
         cursor: The connection.
         timeout: Seconds for all calls; None for no limit.
+        stopped: Once it is set, calls end with an error.
     """
 
-    def __init__(self, cursor: Any, timeout: float | None) -> None:
+    def __init__(self, cursor: Any, timeout: float | None, stopped: threading.Event) -> None:
         self._cursor = cursor
         self._timeout = timeout
+        self._stopped = stopped
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="hybridlog-sql")
         self._until = None if timeout is None else time.monotonic() + timeout
 
@@ -118,7 +121,7 @@ class Worker:
         """The result of a call.
 
         Raises:
-            ResourceError: the time is over.
+            ResourceError: the time is over, or it was stopped.
         """
         with at_safe_points():
             future: Future[_T] = self._pool.submit(call)
@@ -132,6 +135,8 @@ class Worker:
     def _wait(self, future: Future[_T]) -> None:
         while not future.done():
             safe_point()  # Ctrl-C
+            if self._stopped.is_set():
+                raise ResourceError("The query was stopped.")
             left = _POLL_S if self._until is None else self._until - time.monotonic()
             if left <= 0:
                 raise ResourceError(

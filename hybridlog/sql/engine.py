@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 Params = Sequence[Any] | Mapping[str, Any] | None
 _BATCH_ROWS: Final = 65_536
+_FEW_ROWS: Final = 64
 _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
@@ -56,11 +57,12 @@ class SqlEngine:
         self._content: StoreContent | None = None
         self._lock = threading.RLock()
 
-    def connect(self, memory: int | None = None) -> SqlConnection:
+    def connect(self, memory: int | None = None, *, only_reads: bool = False) -> SqlConnection:
         """A connection; what is created in it is there until it is closed.
 
         Args:
             memory: Limit of DuckDB's memory, bytes; None for 1 GiB.
+            only_reads: Nothing can be created in it.
 
         Raises:
             MissingDependencyError: DuckDB is not installed.
@@ -70,7 +72,7 @@ class SqlEngine:
         with self._lock:
             if most not in self._bases:
                 self._bases[most] = open_duckdb(most)
-            return SqlConnection(self, self._bases[most].cursor(), most)
+            return SqlConnection(self, self._bases[most].cursor(), most, only_reads=only_reads)
 
     def content(self) -> StoreContent:
         """Recordings and views as they are now."""
@@ -100,12 +102,20 @@ class SqlConnection:
         engine: The engine.
         cursor: A connection of DuckDB.
         memory: Limit of its memory, bytes.
+        only_reads: Statements other than queries are refused.
+
+    Attributes:
+        stopped: Set it in any thread to end the query that runs, and all later ones.
     """
 
-    def __init__(self, engine: SqlEngine, cursor: Any, memory: int) -> None:
+    def __init__(
+        self, engine: SqlEngine, cursor: Any, memory: int, *, only_reads: bool = False
+    ) -> None:
         self.engine = engine
         self.cursor = cursor
         self.memory = memory
+        self.stopped = threading.Event()
+        self._only_reads = only_reads
         self.reading = Reading()
         self._has_own = False  # views and macros of the user read what a query does not name
         self._content: StoreContent | None = None
@@ -148,6 +158,8 @@ class SqlConnection:
             statements = list(self.cursor.extract_statements(text))
         if not statements:
             raise UsageError("The query is empty.")
+        if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
+            raise UsageError("Only queries are possible here, such as select and show.")
         self._names.update(self.engine.content().names.named(text))
         self.register()
         answers = [
@@ -261,6 +273,36 @@ class SqlAnswer:
             return pa.table({})
         return self._computed(self._table)
 
+    def first(self, rows: int, size: int) -> tuple[pa.Table, bool]:
+        """The first rows of a query; the others are not computed.
+
+        Args:
+            rows: Greatest number of rows.
+            size: Bytes after which no further row is taken.
+
+        Returns:
+            The rows, and whether there are more.
+
+        Raises:
+            ResourceError: it needs more memory or time than it may.
+        """
+        import pyarrow as pa
+
+        taken: list[pa.RecordBatch] = []
+        room, bytes_taken = rows, 0
+        # Few rows at a time: each may be an image.
+        for batch in self._batches(_FEW_ROWS, rows + 1):
+            if bytes_taken > size:
+                break
+            taken.append(batch.slice(0, room))
+            if batch.num_rows > room:
+                break
+            room -= batch.num_rows
+            bytes_taken += batch.nbytes
+        else:
+            return pa.Table.from_batches(taken), False
+        return pa.Table.from_batches(taken), True
+
     def to_batches(self) -> Iterator[pa.RecordBatch]:
         """The answer in record batches of bounded size, at least one.
 
@@ -272,9 +314,13 @@ class SqlAnswer:
         if self._result is not None or self._relation is None:
             yield from self.to_arrow().to_batches()
             return
-        worker = Worker(self._connection.cursor, self._timeout)
+        yield from self._batches(_BATCH_ROWS, None)
+
+    def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
+        """The answer in batches of so many rows, up to a limit."""
+        worker = self._worker()
         try:
-            reader, batch = self._tried(lambda: worker.run(self._stream))
+            reader, batch = self._tried(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:
                 yield _empty(reader.schema)
             while batch is not None:
@@ -310,9 +356,13 @@ class SqlAnswer:
         columns = [column.to_pylist(maps_as_pydicts="strict") for column in self.to_arrow().columns]
         return list(zip(*columns, strict=True))
 
-    def _stream(self) -> tuple[Any, pa.RecordBatch | None]:
+    def _worker(self) -> Worker:
+        return Worker(self._connection.cursor, self._timeout, self._connection.stopped)
+
+    def _stream(self, size: int, limit: int | None) -> tuple[Any, pa.RecordBatch | None]:
         """A reader of the answer, and its first batch."""
-        reader = self._relation.to_arrow_reader(_BATCH_ROWS)
+        relation = self._relation if limit is None else self._relation.limit(limit)
+        reader = relation.to_arrow_reader(size)
         return reader, next(reader, None)
 
     def _table(self) -> pa.Table:
@@ -333,7 +383,7 @@ class SqlAnswer:
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
 
     def _computed(self, call: Callable[[], _T]) -> _T:
-        worker = Worker(self._connection.cursor, self._timeout)
+        worker = self._worker()
         try:
             return self._tried(lambda: worker.run(call))
         finally:

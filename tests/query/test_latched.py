@@ -15,7 +15,8 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog import latched_front
-from hybridlog.cli.write_answer import Front, write_answer
+from hybridlog.cli.write_answer import write_answer
+from hybridlog.export.slices import Front
 from hybridlog.latched_front import LatchedFront
 from hybridlog.latching import KEEP_ALL, depth_of
 from hybridlog.query.query import Query

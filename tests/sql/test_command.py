@@ -21,7 +21,7 @@ from click.testing import CliRunner, Result
 
 import hybridlog as hl
 from hybridlog.cli.app import app
-from hybridlog.cli.sql_prompt import Completer
+from hybridlog.sql import completion
 from hybridlog_storage.errors import (
     HybridlogError,
     IncompleteError,
@@ -146,11 +146,11 @@ def test_losses_are_told(root: Path, tmp_path: Path) -> None:
 
 
 def test_completion(store: hl.Store) -> None:
-    completer = Completer(store.sql_engine.connect())
+    connection = store.sql_engine.connect()
 
     def candidates(line: str, text: str | None = None) -> list[str]:
         word = line.rpartition(" ")[2] if text is None else text
-        return completer.candidates(line, word)
+        return completion.candidates(connection, line, word)
 
     assert candidates("select * from sca") == ["scan"]
     assert candidates("select b") == ["base__scan", "between", "by"]

@@ -154,6 +154,35 @@ def test_a_timeout_ends_a_query(store: hl.Store) -> None:
     assert store.sql("select 1", timeout=60).rows() == [(1,)]
 
 
+def test_the_first_rows(store: hl.Store) -> None:
+    for rows, more in ((2, True), (3, False), (4, False)):
+        table, is_cut = store.sql("select range as n from range(3) order by n desc").first(rows, 99)
+        assert (table["n"].to_pylist(), is_cut) == ([2, 1, 0][:rows], more)
+    table, is_cut = store.sql("select range as n from range(1000)").first(900, 64 * 9)
+    assert (table.num_rows, is_cut) == (128, True)
+    table, is_cut = store.sql("select 1 where false").first(5, 99)
+    assert (table.num_rows, is_cut) == (0, False)
+    assert store.sql("show tables").first(9, 9999)[0].column_names == ["name"]
+
+
+def test_a_query_is_stopped_from_another_thread(store: hl.Store) -> None:
+    connection = store.sql_engine.connect()
+    timer = threading.Timer(0.2, connection.stopped.set)
+    timer.start()
+    with pytest.raises(ResourceError, match="The query was stopped"):
+        connection.query(ENDLESS).first(5, 99)
+
+
+@pytest.mark.parametrize(
+    "text", ["create table a as select 1", "select 1; insert into a values (1)", "explain select 1"]
+)
+def test_a_connection_that_only_reads(store: hl.Store, text: str) -> None:
+    connection = store.sql_engine.connect(only_reads=True)
+    with pytest.raises(UsageError, match="Only queries are possible"):
+        connection.query(text)
+    assert connection.query("describe scan").first(9, 9999)[0].num_rows > 9 - 1
+
+
 def test_ctrl_c_ends_a_query(connection: SqlConnection) -> None:
     timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()

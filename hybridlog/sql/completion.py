@@ -1,0 +1,84 @@
+"""Completion of SQL: views, columns, fields and words."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from hybridlog.sql.engine import SqlConnection
+
+_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_WORDS: Final = (
+    "as",
+    "asof",
+    "avg",
+    "between",
+    "by",
+    "count",
+    "describe",
+    "distinct",
+    "from",
+    "group",
+    "having",
+    "in",
+    "is",
+    "join",
+    "like",
+    "limit",
+    "max",
+    "min",
+    "not",
+    "null",
+    "on",
+    "or",
+    "order",
+    "select",
+    "show",
+    "sum",
+    "tables",
+    "union",
+    "using",
+    "where",
+    "with",
+)
+
+
+def candidates(connection: SqlConnection, line: str, text: str) -> list[str]:
+    """Views, columns, fields and words that begin with a text, sorted.
+
+    Args:
+        connection: Knows views and columns.
+        line: The statement so far; columns are those of the views in it.
+        text: The word that is being typed, such as `pose.po`.
+    """
+    names = connection.names()
+    words = {word.casefold() for word in _PLAIN.findall(line)}
+    views = [name for name in names if name.casefold() in words and name != text]
+    columns: dict[str, None] = {}
+    for view in views:
+        schema = connection.schema(view)
+        above, _, _ = text.rpartition(".")
+        columns.update(dict.fromkeys(_below(schema, above)))
+        if above:
+            alias, _, rest = above.partition(".")
+            found = _below(schema, rest) if alias not in schema.names else []
+            columns.update(dict.fromkeys(f"{alias}.{path}" for path in found))
+    known = [*columns] if "." in text else [*map(_spelled, names), *columns, *_WORDS]
+    return sorted({name for name in known if name.casefold().startswith(text.casefold())})
+
+
+def _below(schema: Any, path: str) -> list[str]:
+    """Paths of the fields below a path; of the columns below an empty one."""
+    fields = list(schema)
+    for name in path.split(".") if path else ():
+        found = [f for f in fields if f.name.casefold() == name.casefold()]
+        if not found or not hasattr(found[0].type, "get_field_index"):
+            return []
+        fields = list(found[0].type)
+    return [f"{path}.{field.name}" if path else field.name for field in fields]
+
+
+def _spelled(name: str) -> str:
+    """A name as SQL takes it."""
+    return name if _PLAIN.fullmatch(name) else '"' + name.replace('"', '""') + '"'
