@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.answers.lost import Lost
+    from hybridlog.query.answers.match_times import MatchTimes
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
@@ -555,6 +556,36 @@ class Query:
         if at_least is not None:
             found = found.at_least(at_least)
         return found if length is None else found.cut(length)
+
+    def held(self, max_gap: DurationLike | None = None) -> Iterator[tuple[str, NDArray[np.int64]]]:
+        """The intervals of `intervals`, some at a time: for pictures of any number of them.
+
+        Args:
+            max_gap: Longest time for which a message is valid.
+
+        Returns:
+            Id of a recording, and int64[n, 3]: begin, end, messages, in order.
+
+        Raises:
+            UsageError: as for `intervals`.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        self.counters.reset()
+        return self._intervals().held(max_gap)
+
+    def match_times(self) -> Iterator[MatchTimes]:
+        """The log times and arrival numbers of the messages, some at a time.
+
+        Payloads are read only if nothing else answers the predicate.
+
+        Raises:
+            UsageError: the question has `limit` or `every`.
+            TimeError: a range outside of all recordings.
+        """
+        from hybridlog.query.answers.match_times import match_times
+
+        self.counters.reset()
+        return match_times(self._session, self.question, self.counters)
 
     def changes(
         self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0

@@ -14,6 +14,7 @@ import numpy as np
 
 from hybridlog.losses import extent_of
 from hybridlog.query.answers.lost import lost_times
+from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
@@ -53,6 +54,11 @@ class IntervalQueries:
         self._check("A state")
         if state is not None:
             return self._certain(max_gap, state)
+        return Intervals.of(self.held(max_gap))
+
+    def held(self, max_gap: DurationLike | None) -> Iterator[tuple[str, NDArray[np.int64]]]:
+        """The intervals in which the predicate holds, some at a time; see `Query.held`."""
+        self._check("A state")
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
@@ -61,11 +67,9 @@ class IntervalQueries:
             for part, span in self._spans()
         ]
         self._planner.together([p for *_, inner, before in spans for p in (*before, inner)])
-        return Intervals.of(
-            (part.recording.id, rows)
-            for part, span, inner, before in spans
-            for rows in self._states_in(part, span, gap, inner, before)
-        )
+        for part, span, inner, before in spans:
+            for rows in self._states_in(part, span, gap, inner, before):
+                yield part.recording.id, rows
 
     def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
         """The time in which a state is certain, or the time in which none is."""
@@ -177,9 +181,8 @@ class IntervalQueries:
                 for index in np.unique(run.batch.channel).tolist():
                     yield entry_of[index], run.batch.log_time[run.batch.channel == index]
             return
-        for part in self._planner.together(self._planner.parts()):
-            for found in self._planner.outcomes(part):
-                yield part.recording, found.log_time[found.holds]
+        for found in match_times(self._session, self._question, self._planner.counters):
+            yield found.recording, found.log_time
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""

@@ -1,0 +1,95 @@
+"""Matches against loops over what was written."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from hybridlog.drawing.matches import (
+    Match,
+    bands,
+    count_before,
+    matches_after,
+    matches_before,
+    ticks,
+)
+from hybridlog_storage.errors import UsageError
+
+from .conftest import BASE, MS, Drive
+
+PREDICATE = "linear.z > 0.5 and on == true"
+
+
+def matching(drive: Drive) -> list[Match]:
+    """Arrival numbers are those of the log, which has a message of /loose behind each 50th."""
+    wanted = np.flatnonzero((drive.z > 0.5) & (np.arange(len(drive.z)) % 2 == 1))
+    return [Match(int(drive.times[n]), int(n + (n - 1) // 50 + 1)) for n in wanted]
+
+
+def test_ticks_count_each_match_once(drive: Drive) -> None:
+    query = drive.store.topic("drive").where(PREDICATE)
+    times = [one.time for one in matching(drive)]
+    whole = BASE, times[-1] + 1
+    for pixels, span in ((1, whole), (97, whole), (500, (times[10], times[90])), (8, (0, BASE))):
+        found = ticks(query, span, pixels)
+        inside = [time for time in times if span[0] <= time < span[1]]
+        want = Counter((time - span[0]) // found.width for time in inside)
+        assert dict(zip(found.pixels.tolist(), found.counts.tolist(), strict=True)) == want
+        assert found.first.tolist() == [
+            min(t for t in inside if (t - span[0]) // found.width == pixel)
+            for pixel in sorted(want)
+        ]
+        assert found.width * pixels >= span[1] - span[0]
+    assert len(times) > 500
+
+
+def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
+    query = drive.store.topic("drive").where("linear.z > 0.5")
+    span = BASE + 1234, int(drive.times[-1]) + 10 * MS
+    exact = [(i.begin_ns, i.end_ns) for i in query.between(*span).intervals()]
+    assert len(exact) > 5
+    assert bands(query, span, 5000).tolist() == [list(one) for one in exact]
+    alternating = drive.store.topic("drive").where("on == true")
+    all_of_it = [(i.begin_ns, i.end_ns) for i in alternating.between(*span).intervals()]
+    for pixels in (1, 10, 300):
+        found = bands(alternating, span, pixels).tolist()
+        width = -(-(span[1] - span[0]) // pixels)
+        want: list[list[int]] = []
+        for begin, end in all_of_it:
+            if want and begin - want[-1][1] < width:
+                want[-1][1] = end
+            else:
+                want.append([begin, end])
+        assert found == want
+        assert len(found) <= pixels + 1
+    assert bands(query, (0, BASE - 1), 7).tolist() == []
+
+
+def test_bands_last_until_the_recording_ends(drive: Drive) -> None:
+    query = drive.store.topic("loose").where("name exists")
+    end = int(drive.times[-1])
+    assert bands(query, (end - 5 * MS, end + 1), 9).tolist() == [[end - 5 * MS, end + 1]]
+
+
+@pytest.mark.parametrize("count", [1, 7, 5000])
+def test_matches_step_by_step(drive: Drive, count: int) -> None:
+    query = drive.store.topic("drive").where(PREDICATE)
+    want = matching(drive)
+    middle = want[300]
+    for place in (middle, Match(middle.time, -1), Match(BASE - 9, -1), Match(2**62, -1)):
+        later = [one for one in want if one > place]
+        earlier = [one for one in want if one < place]
+        assert matches_after(query, place, count) == later[:count]
+        assert matches_before(query, place, count) == earlier[-count:]
+        assert count_before(query, place) == len(earlier)
+
+
+def test_pictures_without_width_are_refused(drive: Drive) -> None:
+    query = drive.store.topic("drive")
+    for span, pixels in (((BASE, BASE + 1), 0), ((BASE, BASE), 9)):
+        with pytest.raises(UsageError, match="at least one pixel"):
+            ticks(query, span, pixels)
+    with pytest.raises(UsageError, match="limit"):
+        ticks(query.limit(3), (BASE, BASE + MS), 9)
