@@ -76,8 +76,17 @@ _TOKEN = re.compile(
 _KINDS = {"and": "and", "&&": "and", "or": "or", "||": "or", "not": "not", "!": "not"}
 
 
-class _Token(NamedTuple):
-    kind: str  # topic, (, ), and, or, not, text
+class Token(NamedTuple):
+    """A part of a predicate with conditions on other topics.
+
+    Attributes:
+        kind: `topic`, `(`, `)`, `and`, `or`, `not`, `text`, or `end`.
+        text: As written; a topic without its colon.
+        begin: Index of its first character.
+        end: Index behind its last character.
+    """
+
+    kind: str
     text: str
     begin: int
     end: int
@@ -85,7 +94,7 @@ class _Token(NamedTuple):
 
 def names_topics(text: str) -> bool:
     """True if a predicate has conditions on other topics."""
-    return ":" in text and any(token.kind == "topic" for token in _tokens(text))
+    return ":" in text and any(token.kind == "topic" for token in tokens(text))
 
 
 def parse_across(text: str) -> Condition:
@@ -102,7 +111,8 @@ def parse_across(text: str) -> Condition:
     return _Parser(text).parse()
 
 
-def _tokens(text: str) -> list[_Token]:
+def tokens(text: str) -> list[Token]:
+    """The parts of a predicate, whether it can be parsed or not; spaces are left out."""
     found = []
     for match in _TOKEN.finditer(text):
         kind, word = match.lastgroup, match[0]
@@ -114,14 +124,14 @@ def _tokens(text: str) -> list[_Token]:
             kind = _KINDS.get(word, word)
         else:
             kind = _KINDS.get(word.lower(), "text") if kind == "word" else "text"
-        found.append(_Token(str(kind), word, match.start(), match.end()))
+        found.append(Token(str(kind), word, match.start(), match.end()))
     return found
 
 
 class _Parser:
     def __init__(self, text: str) -> None:
         self._text = text
-        self._tokens = [*_tokens(text), _Token("end", "", len(text), len(text))]
+        self._tokens = [*tokens(text), Token("end", "", len(text), len(text))]
         if len(self._tokens) > MAX_TOKENS * 4:
             raise WhereError(f"the predicate has more than {MAX_TOKENS} words")
         self._at = 0
@@ -135,7 +145,7 @@ class _Parser:
         return found
 
     @property
-    def _now(self) -> _Token:
+    def _now(self) -> Token:
         return self._tokens[self._at]
 
     def _error(self, message: str) -> WhereError:

@@ -1,0 +1,132 @@
+"""Completion of predicates: fields, topics and words that fit at a place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from hybridlog.frames.names import is_summary
+from hybridlog.query.predicate.across import Token, tokens
+from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.predicate.types import STATS
+
+Kind = Literal["field", "topic", "word"]
+
+_WORD: Final = re.compile(r"""[^\s()!&|<>=~,"'{}]*\Z""")
+_COMPARISON: Final = re.compile(r"[<>=~]\Z")
+_BEHIND: Final = ("and", "or", "between", "exists", "in", "missing", "not in")
+_VALUES: Final = ("false", "inf", "nan", "null", "true")
+_BEGINS: Final = frozenset({"and", "or", "not", "(", "topic"})
+_PLAIN: Final = re.compile(r"[^\W\d]\w*")
+_META: Final = ("_meta.t", "_meta.pub", "_meta.seq", "_meta.rec", "_meta.topic", "_meta.error")
+
+Fields = Callable[[str | None], Mapping[str, str] | None]
+"""Types of the fields by path: of a topic, or of the message itself. None if unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A text that may stand at a place.
+
+    Attributes:
+        text: As it is written.
+        kind: Field, topic or word.
+        type: Type of a field, empty for others.
+    """
+
+    text: str
+    kind: Kind
+    type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Completion:
+    """The candidates for the word that ends at a place.
+
+    Attributes:
+        begin: Index of the first character of the word.
+        candidates: Those that begin with the word, then those that contain it.
+    """
+
+    begin: int
+    candidates: tuple[Candidate, ...]
+
+
+def complete(
+    text: str, place: int, topics: Collection[str], fields: Fields, *, most: int = 50
+) -> Completion:
+    """What may be written at a place of a predicate.
+
+    Args:
+        text: The predicate.
+        place: Index of the character that is typed next.
+        topics: Other topics that may be asked.
+        fields: Gives the fields of a topic, by its name as written.
+        most: Greatest number of candidates.
+    """
+    before = text[:place]
+    found = _WORD.search(before)
+    begin = place if found is None else found.start()
+    if len(text) > MAX_TEXT or _is_in_string(before):
+        return Completion(place, ())
+    word, earlier = before[begin:], before[:begin]
+    known = tokens(earlier)
+    offered = [*_offered(earlier, known, topics, fields)]
+    folded = word.casefold()
+    fitting = [one for one in offered if folded in one.text.casefold()]
+    fitting.sort(key=lambda one: not one.text.casefold().startswith(folded))
+    return Completion(begin, tuple(fitting[:most]))
+
+
+def _offered(
+    earlier: str, known: list[Token], topics: Collection[str], fields: Fields
+) -> Iterator[Candidate]:
+    if _COMPARISON.search(earlier.rstrip()):
+        yield from (Candidate(word, "word") for word in _VALUES)
+    elif not known or known[-1].kind in _BEGINS:
+        yield from _fields_of(fields(_topic_at(known)))
+        yield Candidate("not", "word")
+        yield from (Candidate(f"{topic}: ", "topic") for topic in sorted(topics))
+    else:
+        yield from (Candidate(word, "word") for word in _BEHIND)
+
+
+def _fields_of(types: Mapping[str, str] | None) -> Iterator[Candidate]:
+    known = types or {}
+    for path, kind in known.items():
+        yield Candidate(_spelled(path), "field", kind)
+        for name in STATS:
+            if is_summary(f"{path}.{name}", known):
+                yield Candidate(_spelled(f"{path}.{name}"), "field", "summary")
+    yield from (Candidate(path, "field") for path in _META)
+
+
+def _spelled(path: str) -> str:
+    """A path as a predicate takes it: names that are no identifiers in backquotes."""
+    return ".".join(_quoted(part) for part in path.split("."))
+
+
+def _quoted(part: str) -> str:
+    name, bracket, rest = part.partition("[")
+    return part if _PLAIN.fullmatch(name) else f"`{name}`{bracket}{rest}"
+
+
+def _topic_at(known: Iterable[Token]) -> str | None:
+    """The topic that a predicate behind some tokens is about; None for the message itself."""
+    outer: list[str | None] = []
+    topic: str | None = None
+    for token in known:
+        if token.kind == "(":
+            outer.append(topic)
+        elif token.kind == ")" and outer:
+            topic = outer.pop()
+        elif token.kind == "topic":
+            topic = token.text
+    return topic
+
+
+def _is_in_string(before: str) -> bool:
+    """True behind a quote that is not closed."""
+    return any(token.kind == "text" and token.text in {'"', "'"} for token in tokens(before))
