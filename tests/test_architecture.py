@@ -78,6 +78,8 @@ ALLOWED = {
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
+    "starlette": ("hybridlog.view",),
+    "uvicorn": ("hybridlog.view.server",),
     "websockets": (
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",
