@@ -59,6 +59,7 @@ ALLOWED = {
         "hybridlog.across",
         "hybridlog.cli",
         "hybridlog.drawing.series",
+        "hybridlog.drawing.track",
         "hybridlog.drawing.tree",
         "hybridlog.export",
         "hybridlog.frames",
