@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
@@ -680,6 +681,14 @@ class Session:
         except CatalogError:
             put_again(self.directory, self.catalog, recording)
             return self.catalog.chunks(recording, channels, bounds, clock)
+
+    def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
+        """The chunks of a sealed segment of a recording, as columns."""
+        try:
+            return self.catalog.table(recording, number)
+        except CatalogError:
+            put_again(self.directory, self.catalog, recording)
+            return self.catalog.table(recording, number)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a sealed segment of a recording, by id or label. Thread safe."""

@@ -36,7 +36,6 @@ COMMANDS: Final = (
     "gaps",
     "stats",
     "sql",
-    "view",
     "export",
     "attachments",
     "index",

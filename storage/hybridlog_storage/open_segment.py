@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
@@ -19,8 +20,18 @@ from mcap.records import Schema as SchemaRecord
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap_content import RECORD_HEAD, read_record
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_format import ARRIVAL_OPCODE, MAGIC, PADDING_OPCODE, channel_of
+from hybridlog_storage.segment_format import (
+    ARRIVAL_OPCODE,
+    MAGIC,
+    PADDING_OPCODE,
+    channel_of,
+    message_times,
+)
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _SPAN: Final = struct.Struct("<QQ")  # first and last log time, at the beginning of a chunk
 _INDEX: Final = struct.Struct("<HI")  # channel and size, at the beginning of a message index
@@ -66,17 +77,41 @@ class OpenSegment:
         self._schemas: dict[int, SchemaRecord] = {}
         self._chunk: tuple[int, int, int, int] | None = None  # start, length, first, last
         self._indexed: dict[int, int] = {}  # messages of the last chunk, by channel
-        self._walk()
+        self._at = len(MAGIC)
+        self.advance()
 
-    def _walk(self) -> None:
-        at = len(MAGIC)
+    def advance(self) -> None:
+        """Find the chunks that were written since, also if the segment was sealed meanwhile.
+
+        Raises:
+            SegmentError: The file cannot be read.
+        """
+        self.reader.grow()
         size = self.reader.size
-        while at + RECORD_HEAD.size <= size:
-            opcode, length = RECORD_HEAD.unpack(self.reader.read(at, RECORD_HEAD.size))
-            end = at + RECORD_HEAD.size + length
-            if end > size or not self._take(opcode, at, length):
+        while self._at + RECORD_HEAD.size <= size:
+            opcode, length = RECORD_HEAD.unpack(self.reader.read(self._at, RECORD_HEAD.size))
+            end = self._at + RECORD_HEAD.size + length
+            if end > size or not self._take(opcode, self._at, length):
                 return
-            at = end
+            self._at = end
+
+    def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
+        """Log times of the messages of one of `chunks` by channel, without its messages.
+
+        Message indexes have no checksum before the segment is sealed. They are compared with
+        the head of the chunk; if they contradict it, the checked content is read instead.
+
+        Returns:
+            int64[n], ns, ascending, by channel id.
+
+        Raises:
+            SegmentError: The chunk is damaged.
+        """
+        with suppress(SegmentError):
+            times = message_times(self.reader.read(place.offset + place.length, place.trailer))
+            if _is_plausible(times, place):
+                return times
+        return self.reader.read_times(place)
 
     def _take(self, opcode: int, at: int, length: int) -> bool:
         """Take a record; False for one that no open segment has."""
@@ -115,6 +150,15 @@ class OpenSegment:
             self._schemas[record.id] = record
         elif isinstance(record, ChannelRecord):
             self.channels[record.id] = channel_of(record, self._schemas)
+
+
+def _is_plausible(times: dict[int, NDArray[np.int64]], place: ChunkPlace) -> bool:
+    """True if log times are in order and have the span that the head of the chunk says."""
+    columns = list(times.values())
+    if not columns or not all(len(t) and bool((t[1:] >= t[:-1]).all()) for t in columns):
+        return False
+    first, last = min(int(t[0]) for t in columns), max(int(t[-1]) for t in columns)
+    return (first, last) == (place.first, place.last)
 
 
 def open_segment(path: Path, number: int) -> OpenSegment | None:

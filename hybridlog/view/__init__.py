@@ -1,1 +1,0 @@
-"""The local page that shows a store: its server, and the page itself in `static/`."""
