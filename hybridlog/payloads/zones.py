@@ -6,24 +6,35 @@ not read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.query.predicate.tree import And, Compare, Or
+from hybridlog.query.predicate.numbers import is_nan, is_number
+from hybridlog.query.predicate.tree import And, Compare, Or, Slice
 from hybridlog.schema.column import ranges
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.predicate.tree import Node
+    from hybridlog.query.predicate.tree import Node, Parts
 
 MAX_REGIONS: Final = 32
 """Most regions of an array."""
 _MIN_WIDTH = 16
-_SUMMARIES = frozenset({"min", "max", "mean"})
+_ROUNDED = 1e-6  # most relative error of a mean
+_MAY: Final[Mapping[str, Callable[[float, float, float], bool]]] = {
+    "<": lambda low, _, wanted: low < wanted,
+    "<=": lambda low, _, wanted: low <= wanted,
+    ">": lambda _, high, wanted: high > wanted,
+    ">=": lambda _, high, wanted: high >= wanted,
+    "==": lambda low, high, wanted: low <= wanted <= high,
+}
+"""Whether a number between two ends may satisfy a comparison."""
+ALL: Final = Slice(0, None)
+"""All elements."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,33 +90,31 @@ class Zone:
             raise ValueError("a zone contradicts itself")
         return found
 
-    def may_hold(self, order: str, wanted: float, element: int | None) -> bool:
+    def may_hold(self, order: str, wanted: float, elements: Slice = ALL) -> bool:
         """False if no element can satisfy a comparison.
 
         Args:
-            order: The comparison.
-            wanted: The number to compare with.
-            element: Number of the element; None for any.
+            order: The comparison: `<`, `<=`, `>`, `>=` or `==`.
+            wanted: The number to compare with, not NaN.
+            elements: The elements.
         """
-        if element is None:
-            pairs = list(zip(self.low, self.high, strict=True))
-        else:
-            place = element // self.width
-            pairs = [(self.low[place], self.high[place])] if place < len(self.low) else []
-        return any(
-            low is not None and high is not None and _may(order, low, high, wanted)
-            for low, high in pairs
-        )
+        return any(_MAY[order](low, high, wanted) for low, high in self._ends(elements))
 
+    def mean_may_hold(self, order: str, wanted: float, elements: Slice = ALL) -> bool:
+        """False if no mean of elements can satisfy a comparison, as for `may_hold`."""
+        ends = self._ends(elements)
+        if not ends:
+            return False
+        low, high = min(low for low, _ in ends), max(high for _, high in ends)
+        slack = _ROUNDED * max(abs(low), abs(high))  # a sum of floats is rounded
+        return _MAY[order](low - slack, high + slack, wanted)
 
-def _may(order: str, low: float, high: float, wanted: float) -> bool:
-    return {
-        "<": low < wanted,
-        "<=": low <= wanted,
-        ">": high > wanted,
-        ">=": high >= wanted,
-        "==": low <= wanted <= high,
-    }.get(order, True)
+    def _ends(self, elements: Slice) -> list[tuple[float, float]]:
+        """Least and greatest number of each region of some elements."""
+        last = None if elements.end is None else -(-elements.end // self.width)
+        regions = slice(elements.begin // self.width, last)
+        pairs = zip(self.low[regions], self.high[regions], strict=True)
+        return [(low, high) for low, high in pairs if low is not None and high is not None]
 
 
 def may_hold(node: Node, zones: Mapping[str, Zone]) -> bool:
@@ -122,21 +131,22 @@ def may_hold(node: Node, zones: Mapping[str, Zone]) -> bool:
 
 
 def _may_compare(node: Compare, zones: Mapping[str, Zone]) -> bool:
-    value = node.value
     zone, rest = _zone_of(node.field.parts, zones)
-    if zone is None or isinstance(value, bool) or not isinstance(value, int | float):
+    if zone is None or not is_number(node.value) or is_nan(node.value) or node.order not in _MAY:
         return True
-    if rest == () or (len(rest) == 1 and rest[0] in _SUMMARIES):
-        return zone.may_hold(node.order, value, None)
-    element = rest[0] if len(rest) == 1 else None
-    if isinstance(element, int) and element >= 0:
-        return zone.may_hold(node.order, value, element)
+    elements = ALL
+    if rest and isinstance(rest[0], int):
+        elements, rest = Slice(rest[0], rest[0] + 1), rest[1:]
+    elif rest and isinstance(rest[0], Slice):
+        elements, rest = rest[0], rest[1:]
+    if rest in {(), ("min",), ("max",)}:
+        return zone.may_hold(node.order, node.value, elements)
+    if rest == ("mean",):
+        return zone.mean_may_hold(node.order, node.value, elements)
     return True
 
 
-def _zone_of(
-    parts: tuple[str | int, ...], zones: Mapping[str, Zone]
-) -> tuple[Zone | None, tuple[str | int, ...]]:
+def _zone_of(parts: Parts, zones: Mapping[str, Zone]) -> tuple[Zone | None, Parts]:
     """The zone of the array that a path leads to, and the rest of the path."""
     for count in range(len(parts), 0, -1):
         names = parts[:count]

@@ -77,6 +77,8 @@ PREDICATES = [
     "ranges[17] > 2.4 and header.stamp > 30",
     "not ranges.max > 2.9",
     "intensities.n == 200",
+    "ranges[10:20] > 2.95",
+    "not ranges[190:].mean < 2.5 and ranges[5:17].n == 12",
 ]
 
 

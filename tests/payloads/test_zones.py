@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.payloads import writer
 from hybridlog.payloads.zones import MAX_REGIONS, Zone, may_hold
+from hybridlog.query.engines.base import Need
 from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.schema.column import offsets
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.payloads.logs import BASE, COUNT, SCAN, STEP, scan, write_log
@@ -27,34 +29,48 @@ def zone_of(rows: list[list[float]]) -> Zone:
     return Zone.of(values, bounds)
 
 
+def is_slice(text: str) -> bool:
+    begin, end = text[2:-1].split(":")
+    return not end or int(begin or 0) < int(end)
+
+
+COMPARISONS = st.builds(
+    "{} {}".format,
+    st.sampled_from(["<", "<=", ">", ">=", "==", "!="]),
+    st.one_of(FLOATS.filter(math.isfinite).map(repr), st.sampled_from(["0", "1"])),
+)
+CONDITIONS = st.one_of(
+    COMPARISONS, st.sampled_from(["== nan", "!= nan", "== inf", "== -inf", "== null", "exists"])
+)
+ENDS = st.one_of(st.just(""), st.integers(0, 80).map(str))
+PLACES = st.one_of(
+    st.just("a"),
+    st.builds("a[{}]".format, st.integers(0, 80)),
+    st.builds("a[{}:{}]".format, ENDS, ENDS).filter(is_slice),
+)
+STATS = st.sampled_from(["", "", ".min", ".max", ".mean", ".n"])
+
+
+@settings(max_examples=400)
 @given(
     rows=st.lists(st.lists(FLOATS, max_size=70), min_size=1, max_size=6),
-    order=st.sampled_from(["<", "<=", ">", ">=", "=="]),
-    wanted=FLOATS.filter(math.isfinite),
-    element=st.integers(0, 80),
+    place=PLACES,
+    stat=STATS,
+    condition=CONDITIONS,
 )
+@example([[0.0] * 16 + [10.0] * 16], "a", ".mean", "== 5")
+@example([[0.1] * 3], "a", ".mean", "> 0.1")
+@example([[], []], "a", "", "!= 3")
+@example([[math.nan]], "a", "", "== nan")
 def test_no_match_is_excluded(
-    rows: list[list[float]], order: str, wanted: float, element: int
+    rows: list[list[float]], place: str, stat: str, condition: str
 ) -> None:
-    zone = Zone.from_json(zone_of(rows).to_json())
-    zones = {"a": zone}
-    compare = {
-        "<": lambda v: v < wanted,
-        "<=": lambda v: v <= wanted,
-        ">": lambda v: v > wanted,
-        ">=": lambda v: v >= wanted,
-        "==": lambda v: v == wanted,
-    }[order]
-    exact = [[float(np.float32(v)) for v in row] for row in rows]
-    text = repr(wanted)
-    if any(compare(v) for row in exact for v in row):
-        assert may_hold(parse(f"a {order} {text}").root, zones)
-    if any(compare(row[element]) for row in exact if len(row) > element):
-        assert may_hold(parse(f"a[{element}] {order} {text}").root, zones)
-    finite = [[v for v in row if math.isfinite(v)] for row in exact]
-    for name, summary in (("min", min), ("max", max)):
-        if any(compare(summary(row)) for row in finite if row):
-            assert may_hold(parse(f"a.{name} {order} {text}").root, zones)
+    zones = {"a": Zone.from_json(zone_of(rows).to_json())}
+    predicate = parse(f"{place}{stat} {condition}")
+    holds = to_bool(predicate, {"a": "float32[]"})
+    exact = [[float(np.float32(value)) for value in row] for row in rows]
+    if any(holds({"a": row}) for row in exact):
+        assert may_hold(predicate.root, zones)
 
 
 def test_zones_are_by_region() -> None:
@@ -79,6 +95,16 @@ def test_zones_are_by_region() -> None:
         "a < 1 or a > 9": False,
         "a < 1 and b > 3": False,
         "a[3] == true": True,
+        "a[40:80] < 2": True,
+        "a[0:32] < 2": False,  # of the regions of 16 elements
+        "a[:32].min < 2": False,
+        "a[96:] < 2": False,
+        "a[80:96] < 2": False,
+        "a[79:96] < 2": True,
+        "a[500:] > 0": False,
+        "a[:32].mean > 6": False,
+        "a[0:].mean < 0.5": False,
+        "a[0:32].n > 500": True,
     }.items():
         assert may_hold(parse(text).root, zones) is expected, text
 
@@ -117,11 +143,19 @@ def test_only_row_groups_that_may_match_are_read(store: Path) -> None:
     from hybridlog.query.planner import Planner
 
     with hl.open(store) as opened:
-        read = {}
-        for text in ("ranges[350] < 0.5", "ranges[20] < 0.5", "ranges[10] < 1.05", "ranges < 0.5"):
+        read, cost = {}, {}
+        asked = ("ranges[350] < 0.5", "ranges[20] < 0.5", "ranges[10] < 1.05", "ranges < 0.5")
+        slices = (
+            "ranges[340:380] < 0.5",
+            "ranges[340:380].min < 0.5",
+            "ranges[20:40] < 0.5",
+            "ranges > 0",
+        )
+        for text in (*asked, *slices):
             query = opened.topic("scan").where(text)
             planner = Planner(opened.session, query.question, query.counters)
             (part,) = planner.parts()
+            cost[text] = planner._columns.cost(part, Need.COUNT) or math.inf
             counts = [engine.count([part]) for engine in (planner._scan, planner._columns)]
             assert counts[0] == counts[1]
             query.counters.bytes_read = 0
@@ -131,6 +165,12 @@ def test_only_row_groups_that_may_match_are_read(store: Path) -> None:
             query.counters.bytes_read = 0
             planner._columns.count([part])
             read[text] = counts[0], query.counters.bytes_read
-        assert read["ranges[20] < 0.5"] == (0, 0)
+        assert read["ranges[20] < 0.5"] == read["ranges[20:40] < 0.5"] == (0, 0)
+        assert read["ranges[340:380] < 0.5"] == read["ranges[350] < 0.5"]
+        assert read["ranges[340:380].min < 0.5"] == read["ranges[350] < 0.5"]
         assert read["ranges[350] < 0.5"][0] == read["ranges < 0.5"][0] == 5
+        assert cost["ranges[20:40] < 0.5"] < cost["ranges[340:380] < 0.5"] < cost["ranges > 0"]
+        query = opened.topic("scan").where("ranges[340:380] < 0.5")
+        assert (query.count(), query.counters.chunks_read) == (5, 0)
+        assert query.counters.bytes_read < read["ranges[10] < 1.05"][1] / 2
         assert 0 < read["ranges[350] < 0.5"][1] < read["ranges[10] < 1.05"][1] / 5

@@ -239,8 +239,15 @@ number = st.sampled_from(
     ]
 )
 order = st.sampled_from(["==", "!=", "<", "<=", ">", ">="])
-ros_numbers = st.sampled_from(["x", "i", "u", "a", "k", "m[].v", "m[0].q", "a.min", "a.n", "k.max"])
-json_numbers = st.sampled_from(["x", "n", "a", "l", "a.n", "a.min", "l[0]", "o.v", "a[1]"])
+ros_numbers = st.sampled_from(
+    [
+        *("x", "i", "u", "a", "k", "m[].v", "m[0].q", "a.min", "a.n", "k.max"),
+        *("a[1:3]", "a[30:].min", "k[:2].max", "m[:1].q[1:]"),
+    ]
+)
+json_numbers = st.sampled_from(
+    ["x", "n", "a", "l", "a.n", "a.min", "l[0]", "o.v", "a[1]", "a[1:3]", "l[1:].n"]
+)
 pattern = st.sampled_from(["'^slip'", "'(?i)slip'", "'[0-9]$'", "'^$'", "'l.p 1'"])
 
 

@@ -192,6 +192,7 @@ def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> 
         ("select count(*) from scan where ranges_summary.min < 10", 0),
         ("select s.echo.kind from scan s join large l on l.t = s.t", 0),
         ("select ranges[3] from scan where angle < 5", 10),
+        ("select list_min(ranges[41:60]) from scan where angle < 5", 10),
         ("select ranges from scan where ranges_summary.max < 109", 10),
         ("select ranges from scan where ranges_summary.min >= 890", 10),
         ("select echo.far from scan where echo.far_summary.mean > 220 and echo.kind <> 9", 19),
@@ -206,10 +207,14 @@ def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> 
         answer.rows()
         assert answer.counts.payload_bytes == messages * size, query
     found = store.sql(
-        "select ranges[3], echo.far[1], echo.data[50], len(echo.data), echo.kind, "
-        "ranges_summary.max, echo.data_summary.n from scan order by t"
+        "select ranges[3], list_min(ranges[41:60]), echo.far[1], echo.data[50], len(echo.data), "
+        "echo.kind, ranges_summary.max, echo.data_summary.n from scan order by t"
     ).rows()
-    assert found == [(n + 2.0, n / 4, n % 256, 50, n % 7, n + 99.0, 50) for n in range(SCANS)]
+    expected = [(n + 2.0, n + 40.0, n / 4, n % 256, 50, n % 7, n + 99.0, 50) for n in range(SCANS)]
+    assert found == expected
+    near = "select count(*) from scan where list_min(ranges[41:60]) < 50"
+    language = store.topic("scan").where("ranges[40:60] < 50").count()
+    assert store.sql(near).rows() == [(language,)] == [(10,)]
 
 
 def test_each_chunk_is_read_once(store: hl.Store) -> None:

@@ -62,7 +62,8 @@ class PayloadColumns:
             columns = reader.columns_of(part.channels[0].arrow_type(wanted))
             if columns is None:
                 return None
-            size += reader.size(range(reader.file.groups), columns)
+            groups = [g for g in range(reader.file.groups) if not _is_excluded(part, reader, g)]
+            size += reader.size(groups, columns)
         each = _BYTE_S * size + _ROW_S * part.messages
         return _OPEN_S + each * max(part.share, 0.01)
 
@@ -142,8 +143,6 @@ class PayloadColumns:
             own: Columns of ours.
             every: True for rows of all row groups, whatever their zones say.
         """
-        from hybridlog.payloads.zones import may_hold
-
         readers = self._session.payload_readers(part.recording, part.topic)
         if readers is None:
             raise UndecidedError(f"The columns of {part.topic} are missing.")
@@ -159,9 +158,7 @@ class PayloadColumns:
                 _, first, _, last, _ = reader.file.about.bounds[group]
                 if not _touches(part, first, last):
                     continue
-                is_excluded = part.predicate is not None and not may_hold(
-                    part.predicate.root, reader.zones[group]
-                )
+                is_excluded = _is_excluded(part, reader, group)
                 if is_excluded and not every:
                     continue
                 read = ["t", "seq"] if is_excluded else names
@@ -190,6 +187,13 @@ def _taken(records: pa.StructArray, rows: NDArray[np.intp]) -> pa.StructArray:
     if last - first + 1 == len(rows):
         return records.slice(first, len(rows))
     return records.take(rows)
+
+
+def _is_excluded(part: Part, reader: PayloadReader, group: int) -> bool:
+    """True if zones tell that the predicate holds for no row of a row group."""
+    from hybridlog.payloads.zones import may_hold
+
+    return part.predicate is not None and not may_hold(part.predicate.root, reader.zones[group])
 
 
 def _touches(part: Part, first: int, last: int) -> bool:

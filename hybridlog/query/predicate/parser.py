@@ -9,7 +9,7 @@ r"""Predicates over message fields: `ranges.min < 0.5 and header.frame_id == "la
                 | field ("~" | "=~" | "!~") string              a regular expression
                 | field "between" value "and" value             half-open
                 | field ("exists" | "missing")
-    field       = name { "." name | "[" index "]" | "[]" | "[*]" }
+    field       = name { "." name | "[" index "]" | "[" [ begin ] ":" [ end ] "]" | "[]" | "[*]" }
     value       = integer | 0xff | 1e-3 | inf | nan | "string" | true | false | null
                 | t"2015-03-03T18:28:33.5Z" | 5ms | 1m30s
 
@@ -17,8 +17,8 @@ Keywords may be in any case; names are case-sensitive. A name that is no
 identifier, or that is a keyword at the beginning of a condition, needs
 backquotes: `` `a-b` ``. A path through an array (`status[].level`, `status.level`) means
 *any* element. Different elements may satisfy several conditions on one array:
-`0 < x < 5` means `0 < x and x < 5`. Times and durations are integer nanoseconds,
-as stored.
+`0 < x < 5` means `0 < x and x < 5`. A slice `x[3:8]` is an array: the elements 3 to 7 of x,
+as far as there are any. Times and durations are integer nanoseconds, as stored.
 
 `!=`, `not in` and `!~` hold only where the field exists. For an array, they mean that no
 element equals or matches the operand. `not (...)` is plain negation: it also holds where

@@ -7,6 +7,7 @@ cannot decide is neither true nor false, and a predicate holds when it is certai
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +28,9 @@ from hybridlog.query.predicate.tree import (
     Not,
     Opaque,
     Or,
+    Parts,
     Predicate,
+    Slice,
     Test,
     Value,
     root_of,
@@ -41,7 +44,6 @@ Truth: TypeAlias = bool | None
 """None if a summary cannot decide."""
 Decision: TypeAlias = Callable[[Message], Truth]
 
-_Parts: TypeAlias = tuple[str | int, ...]
 _Names: TypeAlias = tuple[str, ...]
 _WITH_NUMBERS = frozenset(STATS)
 _SUMMARIES = (_WITH_NUMBERS, frozenset({"n"}))
@@ -155,6 +157,8 @@ class _Hidden:
 
 _UNKNOWN = _Hidden(None, None, surely=False, elements=False, numeric=False, booleans=None)
 """Result for a name in the summary of an element: nothing, if that is an array."""
+_SOME = dataclasses.replace(_UNKNOWN, surely=True)
+"""A statistic of some elements of an array that is present only as a summary."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,13 +193,14 @@ class _Reader:
         )
         return found
 
-    def _typed_statistic(self, stat: Stat, array: object, parts: _Parts) -> Iterator[object]:
+    def _typed_statistic(self, stat: Stat, array: object, parts: Parts) -> Iterator[object]:
         if isinstance(array, list | bytes):
             kind = self.types.kind(".".join(part for part in parts if isinstance(part, str)))
             if stat == "n" or kind != "other":
                 yield statistic(stat, array)
         elif isinstance(array, _Hidden):
-            yield array
+            # What is known of all elements says nothing of the statistics of some.
+            yield _SOME if isinstance(parts[-1], Slice) else array
         elif isinstance(array, Mapping) and stat in array:
             yield array[stat]
 
@@ -214,7 +219,7 @@ class _Reader:
         return self.summarised and counts and value.keys() in _SUMMARIES
 
     def _reach(
-        self, value: object, parts: _Parts, names: _Names, *, element: bool = False
+        self, value: object, parts: Parts, names: _Names, *, element: bool = False
     ) -> Iterator[object]:
         """The values at a path; through an array, those of each element."""
         if self._is_summary(value, names, element=element):
@@ -227,21 +232,29 @@ class _Reader:
             yield value
             return
         part, rest = parts[0], parts[1:]
-        if isinstance(value, Mapping):
+        if isinstance(part, Slice):
+            if isinstance(value, list):
+                yield from self._reach(part.of(value), rest, names)
+        elif isinstance(value, Mapping):
             if str(part) in value:
                 yield from self._reach(value[str(part)], rest, (*names, str(part)))
         elif isinstance(value, list):
-            if isinstance(part, int) and part < len(value):
-                yield from self._reach(value[part], rest, names, element=True)
-            # MongoDB also accepts a number as a name.
-            for inner in value:
-                if self._is_summary(inner, names, element=True):
-                    yield _UNKNOWN
-                elif isinstance(inner, Mapping):
-                    yield from self._reach(inner, parts, names, element=True)
+            yield from self._into_list(value, parts, names)
+
+    def _into_list(self, values: list[object], parts: Parts, names: _Names) -> Iterator[object]:
+        """The values at a path through an array."""
+        part = parts[0]
+        if isinstance(part, int) and part < len(values):
+            yield from self._reach(values[part], parts[1:], names, element=True)
+        # MongoDB also accepts a number as a name.
+        for inner in values:
+            if self._is_summary(inner, names, element=True):
+                yield _UNKNOWN
+            elif isinstance(inner, Mapping):
+                yield from self._reach(inner, parts, names, element=True)
 
     def _values(
-        self, value: object, parts: _Parts, names: _Names, *, element: bool = False
+        self, value: object, parts: Parts, names: _Names, *, element: bool = False
     ) -> Iterator[object]:
         """The values at a path as a whole: a last array is not split into elements."""
         if not parts:
@@ -251,6 +264,10 @@ class _Reader:
             yield from _hidden(value, parts, self._are_booleans(names))
             return
         part, rest = parts[0], parts[1:]
+        if isinstance(part, Slice):
+            if isinstance(value, list):
+                yield from self._values(part.of(value), rest, names)
+            return
         if isinstance(part, int) and isinstance(value, list) and part < len(value):
             yield from self._values(value[part], rest, names, element=True)
         # MongoDB also accepts a number as a name.
@@ -261,7 +278,7 @@ class _Reader:
 
 def _hidden(
     summary: Mapping[str, object],
-    parts: _Parts,
+    parts: Parts,
     booleans: bool | None,  # noqa: FBT001
 ) -> Iterator[_Hidden]:
     """The hidden values behind a summary when a path continues with these parts."""
@@ -270,6 +287,9 @@ def _hidden(
     if isinstance(first, int) and isinstance(count, int) and first >= count:
         return
     numeric = "min" in summary
+    if isinstance(first, Slice) and len(parts) == 2 and parts[1] in STATS:
+        yield _UNKNOWN  # or a field of that name
+        return
     if numeric and parts and (isinstance(first, str) or len(parts) > 1):
         return  # numbers have no fields
     yield _Hidden(
@@ -278,7 +298,7 @@ def _hidden(
         # Without types, it may also be a message that has a field `n`.
         surely=not parts
         or parts == ("n",)
-        or (booleans is not None and len(parts) == 1 and isinstance(first, int)),
+        or (booleans is not None and len(parts) == 1 and isinstance(first, int | Slice)),
         elements=not parts,
         numeric=numeric,
         booleans=booleans,

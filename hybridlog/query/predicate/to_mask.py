@@ -34,7 +34,9 @@ from hybridlog.query.predicate.tree import (
     Not,
     Opaque,
     Or,
+    Parts,
     Predicate,
+    Slice,
     Value,
     root_of,
 )
@@ -259,7 +261,7 @@ class _Columns:
     def _reach(
         self,
         leaves: _Leaves,
-        parts: tuple[str | int, ...],
+        parts: Parts,
         names: tuple[str, ...],
     ) -> Iterator[_Leaves]:
         """The values at a path, from some values on; through an array, from each element."""
@@ -276,7 +278,10 @@ class _Columns:
             yield leaves._replace(values=values)
             return
         part, rest = parts[0], parts[1:]
-        if pa.types.is_struct(kind):
+        if isinstance(part, Slice):
+            if _is_list(kind):
+                yield from self._reach(_sliced(values, rows, part), rest, names)
+        elif pa.types.is_struct(kind):
             if kind.get_field_index(str(part)) >= 0:
                 values, rows = _some(values, rows, _valid(values))
                 inner = _Leaves(pc.struct_field(values, str(part)), rows)
@@ -287,7 +292,7 @@ class _Columns:
             raise _UnfitError
 
     def _into_list(
-        self, values: pa.Array, rows: Rows, parts: tuple[str | int, ...], names: tuple[str, ...]
+        self, values: pa.Array, rows: Rows, parts: Parts, names: tuple[str, ...]
     ) -> Iterator[_Leaves]:
         """The values at a path through lists."""
         part = parts[0]
@@ -310,7 +315,7 @@ class _Columns:
             return not is_element and ".".join(names) in self._types.arrays
         return set(_names(kind)) in _SUMMARIES
 
-    def _behind(self, leaves: _Leaves, parts: tuple[str | int, ...]) -> Iterator[_Leaves]:
+    def _behind(self, leaves: _Leaves, parts: Parts) -> Iterator[_Leaves]:
         """The values behind summaries when a path continues with some parts."""
         if not self._types.known:
             # It may also be a message with fields of these names.
@@ -414,6 +419,12 @@ def _lengths(values: pa.Array) -> NDArray[np.int64]:
     """Number of elements of each list, 0 for a null."""
     lengths = _numpy(pc.fill_null(pc.list_value_length(values), 0)).astype(np.int64)
     return np.where(_valid(values), lengths, 0)
+
+
+def _sliced(values: pa.Array, rows: Rows, part: Slice) -> _Leaves:
+    """Some elements of each list; a null has none."""
+    values, rows = _some(values, rows, _valid(values))
+    return _Leaves(pc.list_slice(values, part.begin, part.end, return_fixed_size_list=False), rows)
 
 
 def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
@@ -591,7 +602,9 @@ def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldT
     wanted = _values_of(node)
     if None in wanted:
         return _Pair(~none, none)
-    if "min" not in _names(summaries.type):
+    is_sliced = leaves.is_hidden and node.field.is_sliced
+    of_slice = is_sliced and types.statistic(node.field.parts) is not None
+    if of_slice or "min" not in _names(summaries.type):
         return _Pair(there, none)
     path = node.field.names
     if types.kind(path) == "bool":
@@ -601,10 +614,11 @@ def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldT
     possible = none
     for value in wanted:
         rounded = not types.are_floats(path) and _is_rounded(low, value)
-        if is_ordered and is_number(value) and not leaves.is_hidden and not rounded:
+        is_bounded = not leaves.is_hidden or is_sliced
+        if is_ordered and is_number(value) and is_bounded and not rounded:
             assert isinstance(node, Compare)
             found = _compared(low if node.order in {"<", "<="} else high, node.order, value)
-            return _Pair(found, found)
+            return _Pair(found, none if is_sliced else found)
         if is_ordered or rounded:
             possible = possible | (there & is_number(value))
         else:

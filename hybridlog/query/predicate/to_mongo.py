@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 from hybridlog.query.predicate.numbers import HIGH, LOW, for_doubles, is_nan, is_number, nearest
@@ -27,7 +27,9 @@ from hybridlog.query.predicate.tree import (
     Not,
     Opaque,
     Or,
+    Parts,
     Predicate,
+    Slice,
     Value,
     root_of,
 )
@@ -114,6 +116,11 @@ def _any_of(pairs: Sequence[_Pair]) -> _Pair:
     return _joined("$or", kept) if kept else _exact(_NOTHING)
 
 
+def _has(asked: Field) -> Filter:
+    """Finds all documents that may have a value at a path."""
+    return {str(asked.parts[0]): {"$exists": True}}
+
+
 def _perhaps(found: Filter) -> _Pair:
     """Documents that cannot decide."""
     return _Pair(found, _NOTHING)
@@ -163,6 +170,8 @@ class _Compiler:
 
     def _positive(self, node: Compare | Member | Match) -> _Pair:
         """A condition without its negation."""
+        if node.field.is_sliced:
+            return self._of_slice(node)
         match node:
             case Compare(asked, "==" | "!=", value):
                 return self._of_values(asked, "==", (value,))
@@ -172,6 +181,30 @@ class _Compiler:
                 return self._of_values(asked, "==", values)
             case Match(asked, pattern):
                 return self._of_pattern(asked, pattern)
+
+    # Slices. The index does not tell which elements of an array are which.
+
+    def _of_slice(self, node: Compare | Member | Match) -> _Pair:
+        """Finds at least the documents with the condition: those in which any element has it."""
+        asked = node.field
+        if self._stat(asked) is None or not asked.is_of_slice:
+            return _perhaps(self._positive(replace(node, field=asked.without_slices())).possible)
+        array = Field(asked.parts[:-1]).without_slices()
+        is_element = asked.parts[-1] in {"min", "max"} and self._types.kind(array.names) == "number"
+        if is_element and isinstance(node, Compare) and is_number(node.value):
+            return _perhaps(self._positive(replace(node, field=array)).possible)
+        return _perhaps(_has(asked))
+
+    def _slice_exists(self, asked: Field) -> _Pair:
+        """A slice of an array exists if the array does, even if it has no such element."""
+        whole = asked.without_slices()
+        place = len(asked.parts) - (2 if asked.is_of_slice and self._stat(asked) else 1)
+        is_only = sum(isinstance(part, Slice) for part in asked.parts) == 1
+        is_last = is_only and isinstance(asked.parts[place], Slice)
+        array = Field(asked.parts[:place])
+        if is_last and self._may_be_array(array) and not self._types.is_open(array):
+            return self._exists(whole)
+        return _perhaps(_has(asked))
 
     # The structure of the documents.
 
@@ -202,7 +235,7 @@ class _Compiler:
 
     def _is_single(self, asked: Field) -> bool:
         """True if a path leads to at most one value."""
-        return not (
+        return not asked.is_sliced and not (
             self._may_be_array(asked) or self._arrays(asked) or self._stat(asked) is not None
         )
 
@@ -233,6 +266,8 @@ class _Compiler:
         ]
 
     def _exists(self, asked: Field) -> _Pair:
+        if asked.is_sliced:
+            return self._slice_exists(asked)
         found = [_exact({asked.path: {"$exists": True}})]
         stat = self._stat(asked)
         if stat is not None:
@@ -474,9 +509,7 @@ class _Compiler:
         each = _Test(stat, self._types.kind(array.names), test)
         return {"$expr": self._step("", array.parts, (), each)}
 
-    def _step(
-        self, here: str, parts: tuple[str | int, ...], seen: tuple[str, ...], test: _Test
-    ) -> object:
+    def _step(self, here: str, parts: Parts, seen: tuple[str, ...], test: _Test) -> object:
         """An aggregation expression that is true if the test holds for any value at the path."""
         # `here` is "", "$a.b" or "$$v.b"; `seen` are the names passed so far.
         for index, part in enumerate(parts):
@@ -486,8 +519,9 @@ class _Compiler:
                 element = {"$cond": [{"$isArray": [here]}, {"$arrayElemAt": [here, part]}, None]}
                 inner = self._step(f"$${variable}", rest, seen, test)
                 return {"$let": {"vars": {variable: element}, "in": inner}}
-            here = f"{here}.{part}" if here else f"${part}"
-            seen = (*seen, part)
+            name = str(part)
+            here = f"{here}.{name}" if here else f"${name}"
+            seen = (*seen, name)
             is_array = ".".join(seen) in self._types.arrays
             if rest and is_array and not isinstance(rest[0], int):
                 variable = f"m{len(seen)}"
@@ -571,7 +605,7 @@ class _Counted:
         return {"$cond": [{"$isArray": [here]}, found, False]}
 
 
-def _anywhere(parts: tuple[str | int, ...], test: _Counted) -> object:
+def _anywhere(parts: Parts, test: _Counted) -> object:
     """An aggregation expression that is true if a test holds for any value at a path.
 
     Any value above it may be an array.
@@ -579,7 +613,7 @@ def _anywhere(parts: tuple[str | int, ...], test: _Counted) -> object:
     return _further(f"${parts[0]}", parts[1:], test, 0)
 
 
-def _further(here: str, parts: tuple[str | int, ...], test: _Counted, depth: int) -> object:
+def _further(here: str, parts: Parts, test: _Counted, depth: int) -> object:
     if not parts:
         return test.on(here)
     part, rest, variable = parts[0], parts[1:], f"v{depth}"

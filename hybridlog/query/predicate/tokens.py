@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from hybridlog.query.predicate.tree import Parts, Slice
 from hybridlog.query.times import parse_duration, parse_time
 from hybridlog_storage.errors import TimeError, WhereError
 
@@ -21,7 +22,11 @@ _WINDOW = 100
 _PART = r"[^\W\d]\w*|`[^`]*`"
 _FIRST = re.compile(_PART)
 _DIGITS = "0123456789"
-_NEXT = re.compile(rf"\.(?P<name>{_PART}|[0-9]+)|\[\s*(?P<index>[0-9]+|\*)?\s*\]")
+_NEXT = re.compile(
+    rf"""\.(?P<name>{_PART}|[0-9]+)
+    |\[\s*(?:(?P<begin>[0-9]*)\s*(?P<colon>:)\s*(?P<end>[0-9]*)|(?P<index>[0-9]+|\*)?)\s*\]""",
+    re.VERBOSE,
+)
 _NUMBER_WORD = re.compile(r"\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*")
 _HEX = re.compile(r"0[xX][0-9a-fA-F]+")
 _INTEGER = re.compile(r"[0-9]+")
@@ -56,7 +61,7 @@ class Token:
         text: The text as written; for a string, without its quotes.
         position: Index of its first character.
         number: Value of a `number` or `time`.
-        path: Parts of a `path`: names, and ints for array elements. `[]` and `[*]`,
+        path: Parts of a `path`: names, ints for array elements, slices. `[]` and `[*]`,
             any element, add no part.
         keyword: A path of one plain name, in lower case; empty for all others.
     """
@@ -65,7 +70,7 @@ class Token:
     text: str
     position: int
     number: int | float = 0
-    path: tuple[str | int, ...] = ()
+    path: Parts = ()
     keyword: str = ""
 
 
@@ -197,21 +202,25 @@ def _finite(text: str, at: int, number: float) -> float:
 
 def _path(text: str, first: re.Match[str]) -> tuple[Token, int]:
     at = first.start()
-    parts: list[str | int] = [_name(text, at, first[0])]
+    parts: list[str | int | Slice] = [_name(text, at, first[0])]
     end = first.end()
     # `in[1, 2]` is the operator and a list, not an element of a field.
     is_in = first[0].lower() == "in"
     of_any = False
     while (match := _NEXT.match(text, end)) and not (is_in and text[end] == "["):
-        name = match["name"]
+        name, is_slice = match["name"], match["colon"] is not None
         is_element = name is None or name[0] in _DIGITS
         if is_element and of_any:
             raise error_at(
-                text, end, "any element can be asked only of named fields: write x[0][1] or x[*].y"
+                text,
+                end,
+                "any element can be asked only of named fields: write x[0][1], x[0][1:3] or x[*].y",
             )
-        of_any = name is None and match["index"] in {None, "*"}
+        of_any = is_slice or (name is None and match["index"] in {None, "*"})
         if name is not None:
             parts.append(_index(text, end, name) if is_element else _part(text, end + 1, name))
+        elif is_slice:
+            parts.append(_slice(text, end, match["begin"], match["end"]))
         elif not of_any:
             parts.append(_index(text, end, match["index"]))
         end = match.end()
@@ -243,3 +252,10 @@ def _index(text: str, at: int, digits: str) -> int:
     if len(digits) > 9:
         raise error_at(text, at, "the index is too large")
     return int(digits)
+
+
+def _slice(text: str, at: int, begin: str, end: str) -> Slice:
+    found = Slice(_index(text, at, begin or "0"), _index(text, at, end) if end else None)
+    if found.end is not None and found.end <= found.begin:
+        raise error_at(text, at, "the slice is empty: its end is the element after the last one")
+    return found

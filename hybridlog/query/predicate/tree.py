@@ -7,13 +7,14 @@ meaning: their places in the text are ignored, and NaN equals NaN.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
 Value: TypeAlias = bool | int | float | str | None
 """The operand of a comparison; times and durations are integer nanoseconds."""
 Order = Literal["==", "!=", "<", "<=", ">", ">="]
+Element = TypeVar("Element")
 
 
 class _Node:
@@ -42,22 +43,59 @@ def _key_of(value: object) -> object:
     return value
 
 
+class Slice(NamedTuple):
+    """Elements of an array; those that it does not have are left out.
+
+    Attributes:
+        begin: Number of the first element.
+        end: Number of the element after the last one; None for all others.
+    """
+
+    begin: int
+    end: int | None
+
+    def __str__(self) -> str:
+        return f"[{self.begin}:{'' if self.end is None else self.end}]"
+
+    def of(self, values: Sequence[Element]) -> list[Element]:
+        """The elements of an array."""
+        return list(values[self.begin : self.end])
+
+
+Parts: TypeAlias = tuple[str | int | Slice, ...]
+"""Names, numbers of elements, and slices."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Field(_Node):
     """A field path.
 
     Attributes:
-        parts: Names, and ints for elements of arrays.
+        parts: Names, ints for elements of arrays, slices.
         position: Its place in the text.
     """
 
-    parts: tuple[str | int, ...]
+    parts: Parts
     position: int = dataclasses.field(default=0, compare=False)
 
     @property
     def path(self) -> str:
-        """The path as MongoDB writes it: `position.0`."""
+        """The path as MongoDB writes it: `position.0`; it has no slices: `ranges.[0:9]`."""
         return ".".join(map(str, self.parts))
+
+    @property
+    def is_sliced(self) -> bool:
+        """True if the path has a slice."""
+        return any(isinstance(part, Slice) for part in self.parts)
+
+    @property
+    def is_of_slice(self) -> bool:
+        """True if the last name follows a slice, as in `ranges[0:9].min`."""
+        return len(self.parts) > 1 and isinstance(self.parts[-2], Slice)
+
+    def without_slices(self) -> Field:
+        """The path to all elements."""
+        return Field(tuple(part for part in self.parts if not isinstance(part, Slice)))
 
     @property
     def names(self) -> str:
@@ -253,16 +291,17 @@ def spelled(node: Node) -> str:
 
 
 def _condition(node: Condition) -> str:
+    path = node.field.path.replace(".[", "[")
     match node:
-        case Compare(asked, order, value):
-            return f"{asked.path} {order} {_literal(value)}"
-        case Member(asked, values, negated):
+        case Compare(order=order, value=value):
+            return f"{path} {order} {_literal(value)}"
+        case Member(values=values, negated=negated):
             members = ", ".join(map(_literal, values))
-            return f"{asked.path} {'not in' if negated else 'in'} [{members}]"
-        case Exists(asked, present):
-            return f"{asked.path} {'exists' if present else 'missing'}"
-        case Match(asked, pattern, negated):
-            return f"{asked.path} {'!~' if negated else '~'} {pattern!r}"
+            return f"{path} {'not in' if negated else 'in'} [{members}]"
+        case Exists(present=present):
+            return f"{path} {'exists' if present else 'missing'}"
+        case Match(pattern=pattern, negated=negated):
+            return f"{path} {'!~' if negated else '~'} {pattern!r}"
 
 
 def _bracketed(node: Node) -> str:

@@ -17,6 +17,7 @@ from hybridlog.query.predicate.tree import (
     Field,
     Match,
     Member,
+    Parts,
     Predicate,
     Value,
 )
@@ -96,7 +97,7 @@ class FieldTypes:
             or self.statistic(asked.parts) is not None
         )
 
-    def statistic(self, parts: tuple[str | int, ...]) -> Stat | None:
+    def statistic(self, parts: Parts) -> Stat | None:
         """The statistic of an array that a path names; None if it names a field.
 
         If the types are unknown, the path may name either, and each message decides.

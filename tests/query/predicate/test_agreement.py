@@ -250,10 +250,33 @@ json_paths = [
     *("a", "a.n", "a[0]", "a[1][0]", "a[0][1][0]", "a[0].n", "a[5]", "a.a", "a[*].q", "a.q.n"),
     *("m.n", "m.min", "m.max", "m.mean", "m[0].q", "m[1].q.min", "m[*].q.max", "m.a.n", "m.a[0]"),
     *("m[0][0]", "m[1].min", "m.n.n", "m.q.mean", "m.a.q.n", "m[0].a[1].n", "`m`.`0`", "a.max"),
+    *(
+        "a[0:2]",
+        "a[1:4]",
+        "a[4:]",
+        "a[:3].n",
+        "a[1:].min",
+        "a[0][1:3]",
+        "m[0:2].q",
+        "m.a[1:]",
+        "m[1:].n",
+    ),
+    *("a[0:2].a", "a[:1].max", "m.q[1:3].mean", "m[0:2].q[1:].n"),
 ]
 even_paths = [
     *("a", "a.n", "a.min", "a.mean", "a[0]", "a[4]", "m", "m.a", "m.q", "m.q.max", "m[1].q[0]"),
     *("m.n", "d", "d.a", "g", "g[0]", "g[0][1]", "g.n", "g[1].n", "m.q.n", "m[0].a", "m[0].n"),
+    *(
+        "a[1:3]",
+        "a[4:]",
+        "a[:2].min",
+        "a[1:].n",
+        "m[0:2].a",
+        "m[1:].q[0:2]",
+        "m.q[1:].max",
+        "g[0][1:3]",
+    ),
+    *("m[:1].n", "g[0:2]", "g[0:2].n", "d[0:2]", "d[0:2].a"),
 ]
 
 SLOW = settings(
@@ -289,6 +312,7 @@ def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> Non
     st.lists(even_messages, min_size=2, max_size=8),
     st.lists(questions_on(even_paths), min_size=8, max_size=16),
 )
+@example([{"g": [None, [0, 1, 2, 3]]}], ["g[0][1:3] !~ '^$'", "g[1][1:3] == 2"])
 def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
     codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
     documents = [codec.fields(json.dumps(message).encode()) for message in messages]
@@ -316,6 +340,17 @@ def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -
         ("a[0].n == 2", "nested"),
         ("a[1][0] == 5", "nested"),
         ("a.v == 7", "parts"),
+        ("a[1:3] < 3", "short long"),  # the elements 1 and 2
+        ("a[:39] == 500", ""),
+        ("a[39:] == 500", "far"),
+        ("a[2:1000].n == 1", "short parts"),
+        ("a[5:].n == 0", "short none parts nested named"),
+        ("a[5:] != 500", "short long none parts nested named"),
+        ("a[1:].max > 100", "far"),
+        ("a[1:3].mean == 2", "short long"),
+        ("a[1:].min == null", "none"),
+        ("a[1:].v == 7", ""),
+        ("a[0][1:] == 2", "nested"),
     ],
 )
 def test_what_json_arrays_answer(ask: Ask, where: str, expected: str) -> None:
@@ -375,6 +410,13 @@ ros_paths = [
     *(f"{path}.{stat}" for path in ("a", "k", "w", "flags", "m.q") for stat in ("n", "min", "max")),
     *("a.mean", "k.mean", "flags.mean", "m[0].q.mean", "m[1].q.n", "m.leaves.n", "m[0].leaves.n"),
     *("m[*].leaves[*].level", "m[0].leaves[1].level", "m.leaves.level", "w.mean", "y", "m.y"),
+    *("a[0:2]", "a[3:]", "k[1:3]", "w[:2]", "flags[1:4]", "names[0:1]", "m[0:2].v", "m[1:].q[:2]"),
+    *(
+        f"{path}.{stat}"
+        for path in ("a[1:3]", "k[:2]", "w[4:]", "flags[:3]")
+        for stat in ("n", "min", "max")
+    ),
+    *("a[2:].mean", "m.q[1:].min", "m[0:2].q.max", "m[0:1].leaves[1:].level", "m[2:].n", "x[0:2]"),
 ]
 
 
@@ -393,6 +435,8 @@ def test_of_ros_messages(ask: Ask, messages: list[Message], questions: list[str]
 ROS_QUESTIONS = [
     *("m.n == 1", "m[0].n > 0", "m.q.n >= 4", "names.n == 1", "flags.mean > 0.5", "flags == true"),
     *("a > 1", "a < 0", "not a > 1", "a != 1", "not m.v == 1", "a == inf", "k[4] == 1"),
+    *("a[0:2] > 1", "a[1:3].max > 1", "not a[1:].min < 1", "k[1:].n == 3", "w[3:].mean > 1"),
+    *("a[9:] missing", "a[1:3].n >= 2", "flags[2:] == true", "flags[1:].max >= 1"),
     *("w.max >= 9223372036854775809", "u < 9223372036854775809", "w == 9223372036854775809"),
 ]
 

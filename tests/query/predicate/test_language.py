@@ -97,6 +97,7 @@ LONG_STATUS = {"status.n": {"$exists": True}, "status.min": {"$exists": False}}
             "`a-b`.`in`[3] == 2",
             {"$or": [{"a-b.in.3": {"$eq": 2}}, {"a-b.in.n": {"$exists": True}}]},
         ),
+        ("x[3:8] == 2", {"x": {"$eq": 2}}),  # for candidates
         ("`not` == 2", {"not": {"$eq": 2}}),
         ("_meta.t >= 5", {"_meta.t": {"$gte": 5}}),
         ("not x < 1", {"$nor": [{"x": {"$lt": 1}}]}),
@@ -168,6 +169,10 @@ def test_nan() -> None:
         ("x[*][0] == 1", "only of named", 4),
         ("x[][*] == 1", "only of named", 3),
         ("x[].0 == 1", "only of named", 3),
+        ("x[0:2][0] == 1", "only of named", 6),
+        ("x[2:2] == 1", "slice is empty", 1),
+        ("x[3:2] == 1", "slice is empty", 1),
+        ("x[0:99999999999] == 1", "index", 1),
         ("x < 1 < 2", "expected 'and'", 6),
         ("_id == 5", "_meta.t", 0),
         ("_meta.inserted_at < 5", "milliseconds", 20),
