@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
+CRASH = "cut short by a crash"
+"""Cause of the loss of what was not stored yet when a recorder died."""
+
 _LAST = 2**63 - 1  # ns
 _JOINED_NS = 12_000_000_000
 _SLOW_NS = 10_000_000_000  # interval between rows for losses that the user wants
@@ -146,6 +149,26 @@ def lost_spans(entry: RecordingEntry) -> Iterator[tuple[int, int]]:
     for row in _lost_from_store(entry):
         if row["from"] is not None:
             yield row["from"], row["to"]
+
+
+def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
+    """The loss ledger of a recording, with a row for what a crash cut off."""
+    losses = [dict(loss) for loss in entry.end.get("losses", [])]
+    if entry.status == "unfinished":
+        losses.append(
+            _uncounted(CRASH, "its last segment is read once the store can be written again")
+        )
+    if was_cut_short(entry):
+        losses.append(_uncounted(CRASH, "what came after its last message was not stored"))
+        damage = entry.end.get("damage", [])
+        losses.extend(_uncounted("damaged segment", str(reason)) for reason in damage)
+    return losses
+
+
+def _uncounted(cause: str, reason: str) -> dict[str, Any]:
+    """A loss of nobody knows how many messages."""
+    row: dict[str, Any] = {"cause": cause, "file": "", "offset": None, "reason": reason}
+    return row | {"count": None, "topic": None}
 
 
 def was_cut_short(entry: RecordingEntry) -> bool:

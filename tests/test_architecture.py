@@ -59,6 +59,7 @@ ALLOWED = {
         "hybridlog.across",
         "hybridlog.cli",
         "hybridlog.drawing.series",
+        "hybridlog.drawing.track",
         "hybridlog.drawing.tree",
         "hybridlog.export",
         "hybridlog.frames",
@@ -78,6 +79,8 @@ ALLOWED = {
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
+    "starlette": ("hybridlog.view",),
+    "uvicorn": ("hybridlog.view.server",),
     "websockets": (
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",

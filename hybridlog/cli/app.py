@@ -36,6 +36,7 @@ COMMANDS: Final = (
     "gaps",
     "stats",
     "sql",
+    "view",
     "export",
     "attachments",
     "index",

@@ -6,50 +6,11 @@ from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli.output import counted
-from hybridlog.losses import Cause, was_cut_short
+from hybridlog.losses import Cause, losses_of, was_cut_short
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
-
-
-def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
-    """The loss ledger of a recording, with a row for what a crash cut off."""
-    losses = [dict(loss) for loss in entry.end.get("losses", [])]
-    if entry.status == "unfinished":
-        losses.append(
-            {
-                "cause": "cut short by a crash",
-                "file": "",
-                "offset": None,
-                "reason": "its last segment is read once the store can be written again",
-                "count": None,
-                "topic": None,
-            }
-        )
-    if was_cut_short(entry):
-        losses.append(
-            {
-                "cause": "cut short by a crash",
-                "file": "",
-                "offset": None,
-                "reason": "what came after its last message was not stored",
-                "count": None,
-                "topic": None,
-            }
-        )
-        losses.extend(
-            {
-                "cause": "damaged segment",
-                "file": "",
-                "offset": None,
-                "reason": str(reason),
-                "count": None,
-                "topic": None,
-            }
-            for reason in entry.end.get("damage", [])
-        )
-    return losses
 
 
 def describe(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:

@@ -16,6 +16,7 @@ from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
+from hybridlog.losses import losses_of
 from hybridlog.wording import MOST_LISTED
 from hybridlog_storage.errors import SegmentError
 
@@ -121,8 +122,8 @@ def _as_dict(
     return {
         **recording_summary.as_dict(summary_of(entry)),
         "chunks": entry.chunks,
-        "coverage": coverage.describe(entry, coverage.losses_of(entry)),
-        "losses": coverage.losses_of(entry),
+        "coverage": coverage.describe(entry, losses_of(entry)),
+        "losses": losses_of(entry),
         "notes": entry.notes,
         "marks": entry.marks,
         "attachments": [attachment_as_dict(each) for each in attachments],
@@ -178,7 +179,7 @@ def _print_recording(
     from hybridlog.query.times import format_duration, format_time
 
     span = entry.span
-    losses = coverage.losses_of(entry)
+    losses = losses_of(entry)
     source = entry.source
     summary = summary_of(entry)
     has_content = recording_summary.has_content(summary)

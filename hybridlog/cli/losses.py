@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.coverage import losses_of
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
+from hybridlog.losses import losses_of
 
 if TYPE_CHECKING:
     from hybridlog.choice import Choice

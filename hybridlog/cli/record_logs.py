@@ -17,6 +17,7 @@ from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
 from hybridlog.cli.signals import if_stopped
+from hybridlog.losses import losses_of
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -582,7 +583,7 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
         )
         problems.append(DatabaseError(str(report.failure)))
     if report.damage:
-        losses = coverage.losses_of(report.entry)
+        losses = losses_of(report.entry)
         output.note(
             f"{path} is damaged: {output.stored(report.entry.messages)}; "
             f"{coverage.describe(report.entry, losses)}."

@@ -18,7 +18,7 @@ import bson
 from pymongo import MongoClient
 
 import hybridlog as hl
-from hybridlog.cli.coverage import losses_of
+from hybridlog.losses import losses_of
 from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
 from hybridlog.tables.layout import PARTS, TABLES

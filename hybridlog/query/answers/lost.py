@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.losses import Cause, was_cut_short
+from hybridlog.losses import CRASH, Cause, losses_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 _EVERYTHING = np.array([[0, TIME_LIMIT - 1]], np.int64)
-_CRASH = "cut short by a crash"
-_UNPROVEN = "journal lost"
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,22 +133,15 @@ def _asked(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np
     return asked[asked[:, 1] > asked[:, 0]]
 
 
-def _ledger(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:
-    """The loss ledger of a recording, with rows for what nobody could count."""
-    yield from entry.end.get("losses", ())
-    nothing: dict[str, Any] = {"count": None, "topic": None, "from": None, "to": None}
-    if entry.status == "unfinished" or was_cut_short(entry):
-        yield nothing | {"cause": _CRASH}
-    if entry.status == "unproven":
-        yield nothing | {"cause": _UNPROVEN}
-    if was_cut_short(entry):
-        for reason in entry.end.get("damage", ()):
-            yield nothing | {"cause": Cause.SEGMENT, "reason": str(reason)}
+def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
+    """The loss ledger of a recording, with a row for what a lost journal leaves open."""
+    unproven = {"cause": "journal lost", "count": None, "topic": None}
+    return losses_of(entry) + [unproven] * (entry.status == "unproven")
 
 
 def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
     """First and last log time of a loss, ns; None if it may be anywhere."""
-    if row["cause"] == _CRASH and entry.span is not None:
+    if row["cause"] == CRASH and entry.span is not None:
         return entry.span[1] + 1, TIME_LIMIT - 2
     if row.get("from") is None or row.get("to") is None:
         return None

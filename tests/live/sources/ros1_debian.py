@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
-import textwrap
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.live.sources.peer_cache import made_once
+from tests.debian import libraries, unpack
+from tests.peer_cache import made_once
 
 PACKAGES = (
     "python3-rosmaster",
@@ -25,9 +24,7 @@ PACKAGES = (
     "python3-rosbag",
 )
 _SYSTEM = Path("/")
-_STATUS = Path("/var/lib/dpkg/status")
 _OF_ROS = re.compile("^Source: ros-", re.MULTILINE)
-_TIMEOUT_S = 200
 
 
 class Ros1(NamedTuple):
@@ -49,8 +46,6 @@ def ros1() -> Ros1 | str:
     installed = _in(_SYSTEM)
     if not _failure(installed):
         return installed
-    if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
-        return "it is not installed, and there is no apt to fetch it with"
     place = made_once("ros1-debian", _made)
     if isinstance(place, str):
         return place
@@ -60,12 +55,7 @@ def ros1() -> Ros1 | str:
 
 def _made(place: Path) -> str:
     """Fetch everything; returns why it could not."""
-    try:
-        _fetch(place)
-    except subprocess.SubprocessError as error:
-        said = getattr(error, "stderr", None) or str(error)
-        return f"apt cannot fetch it: {(said.strip().splitlines() or [''])[-1]}"
-    return ""
+    return unpack(place, PACKAGES, _without_ros)
 
 
 def _in(root: Path) -> Ros1:
@@ -73,13 +63,12 @@ def _in(root: Path) -> Ros1:
     own_python = root / "usr/bin/python3"
     environment = {"PYTHONPATH": ""}
     if root != _SYSTEM:
-        libraries = [*root.glob("usr/lib/*-linux-gnu"), *root.glob("lib/*-linux-gnu")]
         environment = {
             "PYTHONPATH": str(root / "usr/lib/python3/dist-packages"),
             # Where the player looks for the package that reads bags, and for its plugin.
             "ROS_PACKAGE_PATH": str(root / "usr/share"),
             "CMAKE_PREFIX_PATH": str(_plugins(root)),
-            "LD_LIBRARY_PATH": ":".join(map(str, libraries)),
+            "LD_LIBRARY_PATH": libraries(root),
         }
         if own_python.exists():
             # Debian's Python was missing, too.
@@ -123,45 +112,3 @@ def _without_ros(status: str) -> str:
     """What dpkg says of a system, as if that had nothing of ROS: a tree has all or nothing."""
     packages = status.split("\n\n")
     return "\n\n".join(package for package in packages if not _OF_ROS.search(package))
-
-
-def _fetch(place: Path) -> None:
-    """Fetches the packages and all that they need, and unpacks them.
-
-    Raises:
-        subprocess.SubprocessError: apt cannot.
-    """
-    for folder in ("state/lists/partial", "cache/archives/partial", "tree"):
-        (place / folder).mkdir(parents=True)
-    status = place / "state" / "status"
-    status.write_text(_without_ros(_STATUS.read_text()))
-    settings = place / "apt.conf"
-    settings.write_text(
-        textwrap.dedent(
-            f"""\
-            Dir::State "{place}/state";
-            Dir::State::status "{status}";
-            Dir::Cache "{place}/cache";
-            Debug::NoLocking "true";
-            APT::Install-Recommends "false";
-            APT::Sandbox::User "";
-            """
-        )
-    )
-
-    def run(*command: str | Path) -> None:
-        subprocess.run(
-            command,
-            env={**os.environ, "APT_CONFIG": str(settings)},
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=_TIMEOUT_S,
-        )
-
-    run("apt-get", "update", "-qq")
-    run("apt-get", "install", "-qq", "--yes", "--download-only", *PACKAGES)
-    for package in sorted((place / "cache" / "archives").glob("*.deb")):
-        run("dpkg", "-x", package, place / "tree")
-    for done in ("state", "cache"):
-        shutil.rmtree(place / done)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tests.live.sources.heard import Heard
-from tests.live.sources.peer_cache import made_once
+from tests.peer_cache import made_once
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

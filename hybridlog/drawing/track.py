@@ -1,0 +1,330 @@
+"""The track of a satellite receiver on a local metric grid, of bounded length."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.drawing.series import GAP_PERIODS
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import Span
+
+_RADIUS = 6_378_137.0  # m, semi-major axis of WGS 84
+_ECCENTRICITY = 6.694379990141317e-3  # squared
+_CHI = 5.991464547107979  # square of the radius that holds 95 % of a normal distribution in 2-D
+_KEPT = 6  # positions of a pixel at most
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A local metric grid: east and north of an origin, on the ellipsoid of WGS 84.
+
+    Lengths are right near the origin; 100 km away from it, they are wrong by a few percent.
+
+    Attributes:
+        latitude: Of the origin, degrees.
+        longitude: Of the origin, degrees.
+        east: Metres of a degree of longitude at the origin.
+        north: Metres of a degree of latitude at the origin.
+    """
+
+    latitude: float
+    longitude: float
+    east: float
+    north: float
+
+    @classmethod
+    def at(cls, latitude: float, longitude: float) -> Grid:
+        """The grid with its origin at a position in degrees."""
+        angle = math.radians(latitude)
+        part = 1 - _ECCENTRICITY * math.sin(angle) ** 2
+        east = _RADIUS / math.sqrt(part) * math.cos(angle)
+        north = _RADIUS * (1 - _ECCENTRICITY) / part**1.5
+        return cls(latitude, longitude, math.radians(max(east, 0.0)), math.radians(north))
+
+    def metres(
+        self, latitude: NDArray[np.float64], longitude: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Positions in degrees as float64[n, 2], metres east and north of the origin."""
+        turn = (longitude - self.longitude + 180) % 360 - 180  # the short way round
+        return np.stack([turn * self.east, (latitude - self.latitude) * self.north], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Positions in order of time.
+
+    Attributes:
+        times: int64[n], log time, ns since the epoch.
+        xy: float64[n, 2], metres east and north of the origin. NaN where no line goes: for
+            messages without a fix, and in the middle of times without messages that are longer
+            than `GAP_PERIODS` usual periods.
+        grid: The grid, with its origin at the first fix; None without any.
+        messages: Number of messages.
+        fixes: Number of those that have a fix.
+        exact: True if each message is here. Else each pixel of time has its first fix, those
+            farthest east, north, west and south, and one without a fix if it has any.
+    """
+
+    times: NDArray[np.int64]
+    xy: NDArray[np.float64]
+    grid: Grid | None
+    messages: int
+    fixes: int
+    exact: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """One position.
+
+    Attributes:
+        time: Log time, ns since the epoch.
+        has_fix: False if the receiver says that it has none, or the position is none.
+        latitude: Degrees.
+        longitude: Degrees.
+        altitude: Metres; None if it is unknown.
+        status: Number that the receiver gives; None if the message has none.
+        ellipse: Half axes of the ellipse that holds the position with 95 %, metres, and the
+            angle of the first one, radians from east to north. None if it is unknown.
+    """
+
+    time: int
+    has_fix: bool
+    latitude: float
+    longitude: float
+    altitude: float | None
+    status: int | None
+    ellipse: tuple[float, float, float] | None
+
+
+def position_of(query: Query) -> str | None:
+    """Path in front of `latitude` and `longitude` in the messages (`""`, `position.`).
+
+    None if they have no such fields.
+    """
+    known = query.field_types()
+    if known is None:
+        return ""
+    ends = (path for path in known if path == "latitude" or path.endswith(".latitude"))
+    found = (path.removesuffix("latitude") for path in ends)
+    return next((path for path in found if f"{path}longitude" in known), None)
+
+
+def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
+    """The positions of a topic, such as NavSatFix, over log time.
+
+    A message has a fix if its position is one and its `status.status`, if there is one, is not
+    negative. The counters of the query are set to the cost.
+
+    Args:
+        query: About one topic of one recording.
+        pixels: Steps of time. Up to six times as many messages are returned exactly.
+        span: Log time `[begin, end)`, ns; None for that of the messages.
+
+    Raises:
+        UsageError: several topics or recordings, no positions, `reverse`, or no pixel.
+        TimeError: the range of the query is outside all recordings.
+    """
+    prefix = position_of(query)
+    if prefix is None:
+        raise UsageError(f"{', '.join(query.topics)} has no latitude and longitude.")
+    if pixels < 1 or query.question.reverse:
+        raise UsageError("A track goes forward in time, in at least one pixel.")
+    spans = query.spans()
+    if len(query.topics) != 1 or len(spans) > 1:
+        raise UsageError(
+            f"A track is of one topic in one recording; these are {len(query.topics)} topics in "
+            f"{len(spans)} recordings."
+        )
+    paths = [f"{prefix}latitude", f"{prefix}longitude"]
+    if "status.status" in (query.field_types() or {"status.status"}):
+        paths.append("status.status")
+    asked = query.fields(*paths)
+    recording, (begin, end) = next(iter(spans.items()), ("", (0, 0)))
+    if span is not None and recording:
+        begin, end = max(begin, span[0]), min(end, span[1])
+        window = np.array([[begin, max(begin, end), 0]], np.int64)
+        asked = asked.during(Intervals.of([(recording, window)]))
+    made = _Builder(begin, end, pixels)
+    if begin < end:
+        with query.counters.timed():
+            for table in asked.to_tables():
+                made.add(table, paths)
+            query.counters.add(asked.counters)
+    return made.track()
+
+
+class _Builder:
+    """Collects positions, and thins them as soon as they are many.
+
+    Args:
+        begin: Log time of the first pixel, ns.
+        end: Log time of the end of the last one.
+        pixels: Number of pixels.
+    """
+
+    def __init__(self, begin: int, end: int, pixels: int) -> None:
+        self._begin = begin
+        self._width = max(1, -(-(end - begin) // pixels))
+        self._limit = _KEPT * pixels
+        self._times = np.empty(0, np.int64)
+        self._xy = np.empty((0, 2))
+        self._grid: Grid | None = None
+        self._messages = 0
+        self._fixes = 0
+        self._exact = True
+
+    def add(self, table: pa.Table, paths: list[str]) -> None:
+        """Add messages, which are in order of time."""
+        latitude, longitude, *status = (_numbers(table, path) for path in paths)
+        has_fix = _is_position(latitude, longitude)
+        if status:
+            has_fix &= ~(status[0] < 0)
+        self._messages += len(has_fix)
+        self._fixes += int(np.count_nonzero(has_fix))
+        if self._grid is None and has_fix.any():
+            first = int(np.argmax(has_fix))
+            self._grid = Grid.at(float(latitude[first]), float(longitude[first]))
+        xy = np.full((len(has_fix), 2), np.nan)
+        if self._grid is not None:
+            xy[has_fix] = self._grid.metres(latitude[has_fix], longitude[has_fix])
+        times = table["log_time"].combine_chunks().cast("int64").to_numpy()
+        self._times = np.concatenate([self._times, times])
+        self._xy = np.concatenate([self._xy, xy])
+        if len(self._times) > self._limit:
+            self._thin()
+
+    def _thin(self) -> None:
+        self._exact = False
+        # Of messages of a running recording that are later than its known end, too.
+        pixel = (self._times - self._begin) // self._width
+        has_fix = ~np.isnan(self._xy[:, 0])
+        kept = np.zeros(len(pixel), np.bool_)
+        kept[_first_of_each(pixel, np.flatnonzero(~has_fix))] = True
+        places = np.flatnonzero(has_fix)
+        kept[_first_of_each(pixel, places)] = True
+        if len(places):
+            begins = np.flatnonzero(np.diff(pixel[places], prepend=pixel[places[0]] - 1))
+            counts = np.diff(begins, append=len(places))
+            for values in self._xy[places].T:
+                for extreme in (np.minimum, np.maximum):
+                    found = extreme.reduceat(values, begins).repeat(counts)
+                    kept[_first_of_each(pixel, places[values == found])] = True
+        self._times, self._xy = self._times[kept], self._xy[kept]
+
+    def track(self) -> Track:
+        """What was collected."""
+        steps = np.diff(self._times)
+        usual = float(self._width)
+        if self._exact and (steps > 0).any():
+            usual = float(np.median(steps[steps > 0]))
+        gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1
+        middles = self._times[gaps - 1] + steps[gaps - 1] // 2
+        return Track(
+            times=np.insert(self._times, gaps, middles),
+            xy=np.insert(self._xy, gaps, np.nan, axis=0),
+            grid=self._grid,
+            messages=self._messages,
+            fixes=self._fixes,
+            exact=self._exact,
+        )
+
+
+def _first_of_each(pixel: NDArray[np.int64], places: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The first place of each pixel; places ascend."""
+    if not len(places):
+        return places
+    chosen = pixel[places]
+    return places[np.flatnonzero(np.diff(chosen, prepend=chosen[0] - 1))]
+
+
+def _is_position(
+    latitude: NDArray[np.float64], longitude: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    return (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
+
+
+def _numbers(table: pa.Table, path: str) -> NDArray[np.float64]:
+    """A column as float64; NaN for null, and for a column that is not there.
+
+    Raises:
+        UsageError: it has no numbers.
+    """
+    import pyarrow as pa
+
+    if path not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    kind = table.schema.field(path).type
+    if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)):
+        raise UsageError(f"{path} is no number but {kind}: only numbers can be drawn.")
+    values: NDArray[np.float64] = table[path].cast(pa.float64(), safe=False).to_numpy()
+    return values
+
+
+def fix_of(message: Message, prefix: str = "") -> Fix:
+    """The position of a message.
+
+    Args:
+        message: A message with a latitude and a longitude.
+        prefix: Path in front of them, from `position_of`.
+
+    Raises:
+        UsageError: it has no position.
+    """
+    fields: Any = message.fields
+    inner = fields
+    for name in prefix.split(".")[:-1]:
+        inner = inner.get(name) if isinstance(inner, Mapping) else None
+    if not isinstance(inner, Mapping) or not {"latitude", "longitude"} <= inner.keys():
+        raise UsageError(f"This message of {message.topic} has no latitude and longitude.")
+    latitude, longitude, altitude = (
+        _number(inner.get(name)) for name in ("latitude", "longitude", "altitude")
+    )
+    given = fields.get("status")
+    number = given.get("status") if isinstance(given, Mapping) else None
+    status = number if isinstance(number, int) and not isinstance(number, bool) else None
+    is_there = bool(_is_position(np.array(latitude), np.array(longitude)))
+    return Fix(
+        time=message.log_time_ns,
+        has_fix=is_there and (status is None or status >= 0),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude if math.isfinite(altitude) else None,
+        status=status,
+        ellipse=_ellipse(fields),
+    )
+
+
+def _number(value: Any) -> float:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_number else math.nan
+
+
+def _ellipse(fields: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """Half axes and angle of the ellipse of 95 % from the covariance, if it is known."""
+    given = fields.get("position_covariance")
+    if not isinstance(given, list) or len(given) != 9:
+        return None
+    if fields.get("position_covariance_type") == 0:  # unknown
+        return None
+    matrix = np.array([_number(given[at]) for at in (0, 1, 3, 4)]).reshape(2, 2)
+    if not np.isfinite(matrix).all():
+        return None
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    if values[0] < 0 or values[1] <= 0:
+        return None
+    small, large = np.sqrt(values * _CHI).tolist()
+    return large, small, math.atan2(vectors[1, 1], vectors[0, 1])

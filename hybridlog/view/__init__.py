@@ -1,0 +1,1 @@
+"""The local page that shows a store: its server, and the page itself in `static/`."""

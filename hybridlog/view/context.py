@@ -1,0 +1,130 @@
+"""What the routes of the view have in common: the store, bounds, and answers."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from starlette.responses import Response
+from starlette.routing import Route
+
+from hybridlog.view.asked import Asked
+from hybridlog_storage.errors import HybridlogError, TopicError
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
+
+MAX_WORKING: Final = 4
+"""Number of answers that are worked out at once; others wait for their turn."""
+
+REFRESH_S: Final = 2.0
+"""Least time between two looks for new recordings."""
+
+
+class Context:
+    """The store that is shown.
+
+    Args:
+        store: An open store. It is only read.
+
+    Attributes:
+        store: That store.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._refreshing = threading.Lock()
+        self._refreshed = time.monotonic()
+        self._working = threading.BoundedSemaphore(MAX_WORKING)
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Wait until few enough answers are being worked out, and be one of them."""
+        with self._working:
+            yield
+
+    def refresh(self) -> None:
+        """See what other processes have recorded since; at most every other second."""
+        with self._refreshing:
+            now = time.monotonic()
+            if now - self._refreshed >= REFRESH_S:
+                self.store.refresh()
+                self._refreshed = now
+
+    def recording(self, asked: Asked) -> RecordingEntry:
+        """The recording that the parameter `recording` names by its label or id.
+
+        Raises:
+            TopicError: There is none.
+            UsageError: The parameter is missing.
+        """
+        return self.store.entry(asked.text("recording"))
+
+    def query(self, recording: RecordingEntry, *topics: str) -> Query:
+        """A query about topics, by their full names, of one recording.
+
+        Raises:
+            TopicError: The recording has no such topic.
+        """
+        known = {channel.topic for channel in recording.channels}
+        for topic in topics:
+            if topic not in known:
+                raise TopicError(f"{recording.label} has no topic {topic!r}.")
+        return self.store.query(topics, [recording.id])
+
+
+def start_of(recording: RecordingEntry) -> int:
+    """The time that offsets count from, ns: of the first message, else of the recording."""
+    span = recording.span
+    return recording.created if span is None else span[0]
+
+
+Answer: TypeAlias = "Callable[[Context, Asked], Any]"
+"""Works out an answer: plain values, which become JSON, or a response."""
+
+
+def route(path: str, answer: Answer) -> Route:
+    """A route that answers in a thread, when it is its turn.
+
+    Args:
+        path: Path below the token.
+        answer: Works out the answer.
+    """
+
+    def endpoint(request: Request) -> Response:
+        context: Context = request.app.state.context
+        try:
+            with context.turn():
+                found = answer(context, Asked(request.query_params))
+            return found if isinstance(found, Response) else json_response(found)
+        except HybridlogError as error:
+            return error_response(error)
+
+    return Route(path, endpoint, name=path)
+
+
+def json_response(values: Any, status: int = 200) -> Response:
+    """Plain values as JSON."""
+    text = json.dumps(values, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return Response(text, status, media_type="application/json")
+
+
+def error_response(error: HybridlogError) -> Response:
+    """An error that hybridlog raised on purpose: its text, which may have a line with a caret."""
+    return json_response({"error": str(error)}, 404 if isinstance(error, TopicError) else 400)
+
+
+def broken_response(_: Request, error: Exception) -> Response:
+    """An error in hybridlog itself: its trace goes to standard error, not to the page."""
+    traceback.print_exception(error, file=sys.stderr)
+    return json_response({"error": "hybridlog failed; its terminal has the details."}, 500)

@@ -1,0 +1,175 @@
+"""The recordings of the store, and one of them in detail."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.choice import Choice
+from hybridlog.losses import extent_of, losses_of
+from hybridlog.view.context import Context, route, start_of
+
+if TYPE_CHECKING:
+    from hybridlog.view.asked import Asked
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
+
+_MAX_ROWS: Final = 200
+_MAX_CONDITIONS: Final = 16
+_MAX_PARTS: Final = 64
+"""Parts of a coverage bar that are told apart."""
+
+_KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
+    "start": lambda one: one.extent[0],
+    "name": lambda one: one.label,
+    "duration": lambda one: one.extent[1] - one.extent[0],
+    "topics": lambda one: one.topic_count,
+    "messages": lambda one: one.messages,
+    "size": lambda one: one.stored_bytes,
+}
+"""What recordings can be ordered by."""
+
+
+def recordings(context: Context, asked: Asked) -> dict[str, Any]:
+    """A part of the recordings that satisfy some conditions, in some order."""
+    context.refresh()
+    first = asked.integer("first", 0, 1 << 31, 0)
+    count = asked.integer("count", 1, _MAX_ROWS, _MAX_ROWS)
+    key = _KEYS[asked.word("order", _KEYS, "start")]
+    is_ascending = asked.word("direction", ("up", "down"), "down") == "up"
+    store = context.store
+    summaries = store.choose(_choice(asked)).summaries
+    ordered = sorted(summaries, key=key, reverse=not is_ascending)
+    shown = ordered[first : first + count]
+    return {
+        "store": str(store.directory.path),
+        "all": len(store.session.snapshot().summaries),
+        "found": len(ordered),
+        "messages": sum(one.messages for one in ordered),
+        "bytes": sum(one.stored_bytes for one in ordered),
+        "first": first,
+        "rows": [_row(context, one) for one in shown],
+    }
+
+
+def recording(context: Context, asked: Asked) -> dict[str, Any]:
+    """One recording: its topics, marks, losses and times."""
+    entry = context.recording(asked)
+    start = start_of(entry)
+    begin, end = _extent(entry)
+    return {
+        "id": entry.id,
+        "label": entry.label,
+        "name": entry.name,
+        "status": entry.status,
+        "start": str(start),
+        "begin": begin - start,
+        "end": end - start,
+        "messages": entry.messages,
+        "bytes": entry.stored_bytes,
+        "tags": entry.tags,
+        "notes": [note["text"] for note in entry.notes],
+        "marks": [_mark(mark, start) for mark in entry.marks],
+        "losses": [_loss(loss, start) for loss in losses_of(entry)],
+        "topics": _topics(entry, start),
+    }
+
+
+def _choice(asked: Asked) -> Choice:
+    begin, end = asked.text("begin", ""), asked.text("end", "")
+    return Choice.of(
+        _globs(asked.text("name", "")),
+        tag=asked.texts("tag", most=_MAX_CONDITIONS),
+        has=asked.texts("topic", most=_MAX_CONDITIONS),
+        type=asked.texts("type", most=_MAX_CONDITIONS),
+        during=(begin or None, end or None) if begin or end else None,
+        where=asked.texts("where", most=_MAX_CONDITIONS),
+    )
+
+
+def _globs(text: str) -> Sequence[str]:
+    """Globs for names that contain any of the words."""
+    words = text.split()
+    return [word if set(word) & set("*?") else f"*{word.replace('[', '[[]')}*" for word in words]
+
+
+def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
+    begin, end = summary.extent
+    losses = context.store.entry(summary.id) if summary.has_losses else None
+    return {
+        "id": summary.id,
+        "label": summary.label,
+        "name": summary.name,
+        "tags": summary.tags,
+        "status": summary.status,
+        "start": str(begin if summary.span else summary.created),
+        "duration": end - begin,
+        "topics": summary.topic_count,
+        "messages": summary.messages,
+        "bytes": summary.stored_bytes,
+        "lost": [] if losses is None else _lost_parts(losses, begin, end),
+        "incomplete": summary.has_losses or summary.has_lost_segments,
+    }
+
+
+def _lost_parts(entry: RecordingEntry, begin: int, end: int) -> list[tuple[float, float]]:
+    """Parts of a recording in which messages were lost, as fractions of its time."""
+    length = max(end - begin, 1)
+    found = set()
+    for loss in losses_of(entry):
+        if loss.get("from") is None or loss.get("to") is None or loss["count"] == 0:
+            continue
+        low = round((loss["from"] - begin) / length * _MAX_PARTS)
+        high = round((loss["to"] - begin) / length * _MAX_PARTS)
+        low = min(max(low, 0), _MAX_PARTS - 1)
+        found.add((low / _MAX_PARTS, min(max(high, low + 1), _MAX_PARTS) / _MAX_PARTS))
+    return sorted(found)
+
+
+def _extent(entry: RecordingEntry) -> tuple[int, int]:
+    begin, end = extent_of(entry)
+    return (begin, end) if end > begin else (entry.created, entry.created)
+
+
+def _mark(mark: Mapping[str, Any], start: int) -> dict[str, Any]:
+    return {"at": mark["time"] - start, "text": mark["text"], "tags": mark["tags"]}
+
+
+def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:
+    begin, end = loss.get("from"), loss.get("to")
+    return {
+        "topic": loss["topic"],
+        "count": loss["count"],
+        "cause": str(loss["cause"]),
+        "reason": loss.get("reason", ""),
+        "begin": None if begin is None else begin - start,
+        "end": None if end is None else end - start,
+    }
+
+
+def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    for channel in entry.channels:
+        stats = channel.stats
+        row = found.setdefault(
+            channel.topic,
+            {
+                "topic": channel.topic,
+                "type": channel.type,
+                "encoding": channel.message_encoding,
+                "messages": 0,
+                "bytes": 0,
+                "first": None,
+                "last": None,
+            },
+        )
+        row["messages"] += stats.messages
+        row["bytes"] += stats.payload_bytes
+        if stats.first is not None and stats.last is not None:
+            first, last = stats.first - start, stats.last - start
+            row["first"] = first if row["first"] is None else min(row["first"], first)
+            row["last"] = last if row["last"] is None else max(row["last"], last)
+    return [found[topic] for topic in sorted(found)]
+
+
+routes = [route("/recordings", recordings), route("/recording", recording)]

@@ -1,0 +1,198 @@
+/** The list of recordings: search, filter, order, and a bar for what is there and what is lost. */
+
+import { ApiError, get, isAborted } from "./api.js";
+import { element, fill } from "./dom.js";
+import * as state from "./state.js";
+import { count, duration, moment, size } from "./words.js";
+
+const ROWS = 100;
+
+const COLUMNS = [
+  { key: "name", title: "Recording" },
+  { key: "start", title: "Start (UTC)" },
+  { key: "duration", title: "Duration", isNumber: true },
+  { key: null, title: "Coverage" },
+  { key: "topics", title: "Topics", isNumber: true },
+  { key: "messages", title: "Messages", isNumber: true },
+  { key: "size", title: "Stored", isNumber: true },
+  { key: null, title: "Tags" },
+];
+
+const FILTERS = [
+  { name: "name", title: "Name", hint: "lab monday*", isWide: true },
+  { name: "tag", title: "Tag", hint: "robot=7", isList: true },
+  { name: "topic", title: "Topic", hint: "scan", isList: true },
+  { name: "type", title: "Type", hint: "sensor_msgs/Imu", isList: true },
+  { name: "begin", title: "From", hint: "2026-11-27 10:00" },
+  { name: "end", title: "To", hint: "2026-11-27 12:00" },
+  { name: "where", title: "With a message", hint: "scan: ranges.min < 0.5", isWide: true },
+];
+
+/** Shows the list in an element. Returns a function that takes it away. */
+export function mountList(main) {
+  const order = { key: "start", direction: "down" };
+  const inputs = new Map();
+  let shown = 0;
+  let found = 0;
+  let timer = 0;
+
+  const summary = element("p", { class: "summary", "aria-live": "polite" }, "…");
+  const body = element("tbody");
+  const head = element("tr");
+  const more = element("button", { type: "button", onclick: () => load(true) }, "Show more");
+  const problem = element("pre", { class: "problem", role: "alert", hidden: true });
+  const form = element(
+    "form",
+    { class: "filters", role: "search", onsubmit: (event) => event.preventDefault() },
+    ...FILTERS.map(filter),
+  );
+  main.append(
+    form,
+    problem,
+    summary,
+    element(
+      "div",
+      { class: "scrolls" },
+      element("table", { class: "recordings" }, element("thead", {}, head), body),
+    ),
+    more,
+  );
+
+  function filter({ name, title, hint, isWide }) {
+    const input = element("input", {
+      name,
+      placeholder: hint,
+      autocomplete: "off",
+      spellcheck: "false",
+      type: "search",
+      oninput: () => {
+        clearTimeout(timer);
+        timer = setTimeout(() => load(false), 200);
+      },
+    });
+    inputs.set(name, input);
+    return element("label", { class: isWide ? "wide" : "" }, title, input);
+  }
+
+  function drawHead() {
+    fill(
+      head,
+      ...COLUMNS.map(({ key, title, isNumber }) => {
+        const isSorted = key === order.key;
+        const sorted = { up: "ascending", down: "descending" }[order.direction];
+        const cell = { class: isNumber ? "number" : "", scope: "col" };
+        if (key === null) return element("th", cell, title);
+        const press = () => {
+          order.direction = isSorted && order.direction === "down" ? "up" : "down";
+          order.key = key;
+          load(false);
+        };
+        const arrow = isSorted ? { up: " ↑", down: " ↓" }[order.direction] : "";
+        return element(
+          "th",
+          { ...cell, "aria-sort": isSorted ? sorted : "none" },
+          element("button", { type: "button", class: "plain", onclick: press }, title + arrow),
+        );
+      }),
+    );
+  }
+
+  function conditions() {
+    const asked = {};
+    for (const { name, isList } of FILTERS) {
+      const text = inputs.get(name).value.trim();
+      if (text) asked[name] = isList ? text.split(/[\s,]+/) : text;
+    }
+    return asked;
+  }
+
+  async function load(isMore) {
+    drawHead();
+    const first = isMore ? shown : 0;
+    const asked = { ...conditions(), order: order.key, direction: order.direction };
+    try {
+      const answer = await get("recordings", { ...asked, first, count: ROWS }, { slot: "list" });
+      if (!isMore) fill(body);
+      body.append(...answer.rows.map(row));
+      shown = first + answer.rows.length;
+      found = answer.found;
+      problem.hidden = true;
+      summary.textContent = summaryOf(answer);
+    } catch (error) {
+      if (isAborted(error)) return;
+      if (!(error instanceof ApiError)) throw error;
+      problem.hidden = false;
+      problem.textContent = error.message;
+    }
+    more.hidden = shown >= found;
+  }
+
+  drawHead();
+  load(false);
+  inputs.get("name").focus({ preventScroll: true });
+  return () => clearTimeout(timer);
+}
+
+function summaryOf(answer) {
+  if (!answer.all) return "The store is empty: hybridlog record FILE fills it.";
+  const which = answer.found === answer.all ? "" : ` of ${count(answer.all)}`;
+  const content = `${count(answer.messages)} messages, ${size(answer.bytes)}`;
+  const noun = answer.all === 1 ? "recording" : "recordings";
+  return `${count(answer.found)}${which} ${noun}: ${content}.`;
+}
+
+function row(one) {
+  const open = (event) => {
+    if (event.metaKey || event.ctrlKey) return;
+    event.preventDefault();
+    state.show(one.label);
+  };
+  const link = element("a", { href: state.link({ recording: one.label }), onclick: open }, one.label);
+  const name = one.name === one.label ? null : element("small", {}, ` ${one.name}`);
+  const status = STATUS[one.status];
+  const badge = status ? element("span", { class: "badge" }, status) : null;
+  const tags = Object.entries(one.tags).map(([key, value]) =>
+    element("span", { class: "tag" }, value ? `${key}=${value}` : key),
+  );
+  return element(
+    "tr",
+    {},
+    element("th", { scope: "row" }, link, name, badge),
+    element("td", { class: "time" }, moment(BigInt(one.start), 0)),
+    element("td", { class: "number" }, duration(one.duration)),
+    element("td", {}, coverage(one)),
+    element("td", { class: "number" }, count(one.topics)),
+    element("td", { class: "number" }, count(one.messages)),
+    element("td", { class: "number" }, size(one.bytes)),
+    element("td", {}, ...tags),
+  );
+}
+
+const STATUS = {
+  open: "being recorded",
+  damaged: "damaged",
+  recovered: "cut short",
+  unfinished: "cut short",
+  unproven: "journal lost",
+};
+
+/** A bar over the time of a recording; parts with losses are striped. */
+function coverage(one) {
+  const said = one.incomplete ? "Messages are lost in the striped parts." : "Complete.";
+  const bar = element("meter", { class: "sr-only", min: 0, max: 1, value: 1 }, said);
+  const picture = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  picture.setAttribute("class", one.incomplete && !one.lost.length ? "coverage unknown" : "coverage");
+  picture.setAttribute("viewBox", "0 0 64 8");
+  picture.setAttribute("preserveAspectRatio", "none");
+  picture.setAttribute("aria-hidden", "true");
+  picture.append(part("whole", 0, 64), ...one.lost.map(([a, b]) => part("lost", a * 64, (b - a) * 64)));
+  return element("span", { title: said }, bar, picture);
+}
+
+function part(kind, x, width) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", "rect");
+  for (const [name, value] of Object.entries({ class: kind, x, y: 0, width, height: 8 })) {
+    made.setAttribute(name, value);
+  }
+  return made;
+}

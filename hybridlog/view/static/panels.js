@@ -1,0 +1,143 @@
+/** The panels at the cursor: a grid, a head for each, and a menu to add one. */
+
+import { element, fill, notice } from "./dom.js";
+import * as state from "./state.js";
+
+/**
+ * The kinds of panels, in the order of the menu.
+ *
+ * @typedef {Object} Kind
+ * @property {string} kind name in addresses
+ * @property {string} title name for people
+ * @property {boolean} [isFirst] whether a recording is first shown with one
+ * @property {function({topic: string, type: string, encoding: string}): boolean} accepts
+ * @property {function(HTMLElement, Panel): {update: function(), destroy: function()}} mount
+ * @property {function(Panel): string} python code that gets the same from the store
+ *
+ * @typedef {Object} Panel
+ * @property {{topic: string, type: string}} topic
+ * @property {Object} options the panel's own, kept in the address
+ * @property {function(Object)} setOptions changes some of them
+ * @property {import("./recording.js").Recording} recording
+ * @property {function(): number} cursor ns since the start
+ * @property {function(): {begin: number, end: number}} range the visible one
+ * @property {function(number)} seek moves the cursor
+ */
+const KINDS = [];
+
+/** The panels that a recording is first shown with: one of each kind that says so. */
+function firstPanels(topics) {
+  const found = [];
+  for (const { kind, isFirst, accepts } of KINDS) {
+    const topic = isFirst && topics.find((one) => one.messages && accepts(one));
+    if (topic) found.push({ kind, topic: topic.topic, options: {} });
+  }
+  return found;
+}
+
+/** Shows the panels of a recording. Returns a function that takes them away. */
+export function mountPanels(main, recording) {
+  const topics = recording.info.topics;
+  const grid = element("section", { class: "panels", "aria-label": "Panels" });
+  const shown = [];
+  main.append(grid, menu());
+  draw();
+  const ends = [
+    state.on(["panels"], draw),
+    state.on(["at", "begin", "end"], () => shown.forEach(({ running }) => running?.update())),
+  ];
+  return () => {
+    ends.forEach((end) => end());
+    shown.splice(0).forEach(({ running }) => running?.destroy());
+  };
+
+  function panels() {
+    return state.get("panels") ?? firstPanels(topics);
+  }
+
+  function draw() {
+    const wanted = panels();
+    // What is shown already stays as it is, so that nothing jumps or loads again.
+    const kept = shown.splice(0);
+    for (const panel of wanted) {
+      const place = kept.findIndex(({ panel: { kind, topic } }) => kind === panel.kind && topic === panel.topic);
+      if (place >= 0) shown.push({ ...kept.splice(place, 1)[0], panel });
+      else shown.push(made(panel));
+    }
+    kept.forEach(({ running }) => running?.destroy());
+    fill(grid, ...shown.map(({ frame }) => frame));
+  }
+
+  function made(panel) {
+    const kind = KINDS.find((one) => one.kind === panel.kind);
+    const topic = topics.find((one) => one.topic === panel.topic);
+    const body = element("div", { class: "body" });
+    const close = () => state.set({ panels: panels().filter((one) => !isSame(one, panel)) });
+    const copy = async () => {
+      await navigator.clipboard.writeText(kind.python(seen));
+      notice("Copied as Python.");
+    };
+    const title = kind?.title ?? panel.kind;
+    const frame = element(
+      "article",
+      { class: `panel ${panel.kind}`, "aria-label": `${title} of ${panel.topic}` },
+      element(
+        "header",
+        {},
+        element("h2", {}, panel.topic, element("small", {}, ` ${title}`)),
+        kind && topic ? element("button", { type: "button", onclick: copy }, "Copy as Python") : null,
+        element("button", { type: "button", onclick: close, "aria-label": "Close" }, "×"),
+      ),
+      body,
+    );
+    const seen = {
+      topic,
+      recording,
+      get options() {
+        return panels().find((one) => isSame(one, panel))?.options ?? {};
+      },
+      setOptions: (changes) => {
+        const merged = (one) =>
+          isSame(one, panel) ? { ...one, options: { ...one.options, ...changes } } : one;
+        state.set({ panels: panels().map(merged) });
+      },
+      cursor: () => state.get("at"),
+      range: () => ({
+        begin: state.get("begin") ?? recording.info.begin,
+        end: state.get("end") ?? recording.info.end,
+      }),
+      seek: (at) => state.set({ at: Math.round(at) }),
+    };
+    if (!kind || !topic) {
+      body.append(element("p", {}, kind ? "This recording has no such topic." : "No such panel."));
+      return { panel, frame, running: null };
+    }
+    return { panel, frame, running: kind.mount(body, seen) };
+  }
+
+  function menu() {
+    const choice = element("select", { "aria-label": "Panel to add" });
+    for (const topic of topics) {
+      for (const { kind, title, accepts } of KINDS) {
+        if (!accepts(topic)) continue;
+        const value = JSON.stringify({ kind, topic: topic.topic, options: {} });
+        choice.append(element("option", { value }, `${topic.topic} – ${title}`));
+      }
+    }
+    const add = () => {
+      const panel = JSON.parse(choice.value);
+      if (panels().some((one) => isSame(one, panel))) notice("This panel is shown already.");
+      else state.set({ panels: [...panels(), panel] });
+    };
+    return element(
+      "p",
+      { class: "menu" },
+      choice,
+      element("button", { type: "button", onclick: add }, "Add panel"),
+    );
+  }
+}
+
+function isSame(a, b) {
+  return a.kind === b.kind && a.topic === b.topic;
+}

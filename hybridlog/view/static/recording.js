@@ -1,0 +1,57 @@
+/** One recording: its head, and below it the parts of the page that show it. */
+
+import { ApiError, get } from "./api.js";
+import { element, fill } from "./dom.js";
+import { mountPanels } from "./panels.js";
+import { count, duration, moment, size } from "./words.js";
+
+/**
+ * @typedef {Object} Recording
+ * @property {string} label
+ * @property {Object} info the answer of the server: topics, marks, losses, begin, end
+ * @property {BigInt} start the time that all other times count from, ns since 1970
+ * @property {function(number): BigInt} toTime ns since 1970 of a time since the start
+ */
+
+/** Shows a recording in an element. Returns a function that takes it away. */
+export function mountRecording(main, label) {
+  const ends = [];
+  let isGone = false;
+  const head = element("p", { class: "summary" }, "…");
+  main.append(head);
+  load();
+  return () => {
+    isGone = true;
+    ends.forEach((end) => end());
+  };
+
+  async function load() {
+    try {
+      const info = await get("recording", { recording: label });
+      if (isGone) return;
+      const start = BigInt(info.start);
+      const toTime = (offset) => start + BigInt(Math.round(offset));
+      const recording = { label: info.label, info, start, toTime };
+      fill(head, summaryOf(recording));
+      ends.push(mountPanels(main, recording));
+    } catch (error) {
+      if (!(error instanceof ApiError)) throw error;
+      fill(main, element("pre", { class: "problem", role: "alert" }, error.message));
+    }
+  }
+}
+
+function summaryOf({ info, start }) {
+  const lost = info.losses.reduce((sum, loss) => sum + (loss.count ?? 0), 0);
+  const parts = [
+    moment(start, 0),
+    duration(info.end - info.begin),
+    `${count(info.topics.length)} topics`,
+    `${count(info.messages)} messages`,
+    size(info.bytes),
+    info.status === "open" ? "being recorded" : null,
+    info.losses.length ? `${lost ? count(lost) : "messages"} lost` : null,
+    ...Object.entries(info.tags).map(([key, value]) => `${key}=${value}`),
+  ];
+  return parts.filter(Boolean).join(" · ");
+}

@@ -1,0 +1,44 @@
+/** Numbers, sizes and times in words. Times are whole nanoseconds, as numbers or as BigInt. */
+
+const SIZES = ["B", "kB", "MB", "GB", "TB"];
+
+/** `12,345`. */
+export function count(number) {
+  return number.toLocaleString("en-US");
+}
+
+/** `1.2 MB`. */
+export function size(bytes) {
+  let place = 0;
+  let value = bytes;
+  while (value >= 1000 && place < SIZES.length - 1) {
+    value /= 1000;
+    place += 1;
+  }
+  return `${place ? value.toFixed(1) : value} ${SIZES[place]}`;
+}
+
+/** `1:02:03`, `4.2 s` or `35 ms`, of nanoseconds. */
+export function duration(ns) {
+  const seconds = ns / 1e9;
+  if (seconds < 1) return `${(seconds * 1000).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
+  if (seconds < 60) return `${seconds.toFixed(1)} s`;
+  const whole = Math.round(seconds);
+  const parts = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+  const [hours, minutes, rest] = parts.map((part) => String(part).padStart(2, "0"));
+  return parts[0] ? `${parts[0]}:${minutes}:${rest}` : `${parts[1]}:${rest}`;
+}
+
+/** `+12.345 s`: a time since the start of a recording, ns. */
+export function offset(ns, digits = 3) {
+  return `${ns < 0 ? "−" : "+"}${Math.abs(ns / 1e9).toFixed(digits)} s`;
+}
+
+/** `2026-11-27 10:20:30.123`, UTC, of nanoseconds since 1970 as BigInt. */
+export function moment(ns, digits = 3) {
+  const milliseconds = Number(ns / 1000000n);
+  const date = new Date(milliseconds);
+  if (Number.isNaN(date.getTime())) return `${ns} ns`;
+  const [day, time] = date.toISOString().slice(0, -1).split("T");
+  return `${day} ${digits ? time : time.slice(0, 8)}`;
+}

@@ -1,0 +1,59 @@
+"""`hybridlog view` as a process."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from hybridlog_storage.directory import StoreDirectory
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    StoreDirectory.create(tmp_path / "store")
+    return tmp_path / "store"
+
+
+def start(store: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "hybridlog", "view", "--store", str(store), *options]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_stopped(store: Path, number: signal.Signals) -> None:
+    running = start(store, "--json")
+    assert running.stdout is not None
+    said = json.loads("".join(iter(running.stdout.readline, "}\n")) + "}")
+    with urllib.request.urlopen(said["url"] + "recordings") as answer:
+        assert json.load(answer)["all"] == 0
+    running.send_signal(number)
+    _, errors = running.communicate(timeout=20)
+    assert running.returncode == 128 + number
+    assert "Traceback" not in errors
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(said["url"])
+
+
+def test_a_port_that_is_taken_is_refused(store: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        running = start(store, "--port", str(other.getsockname()[1]))
+        _, errors = running.communicate(timeout=20)
+    assert running.returncode == 2
+    assert "is in use. Without --port a free one is taken." in errors
+
+
+def test_an_unknown_recording_is_refused_before_anything_is_served(store: Path) -> None:
+    running = start(store, "monday")
+    output, errors = running.communicate(timeout=20)
+    assert (running.returncode, output) == (2, "")
+    assert "monday" in errors

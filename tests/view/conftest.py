@@ -1,0 +1,129 @@
+"""A store of the demo's robot, its view, and a browser to look at it with."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from starlette.testclient import TestClient
+
+import hybridlog as hl
+from hybridlog.demo.topics import RobotConfig
+from hybridlog.demo.write import write_bag
+from hybridlog.view.app import make_app
+from hybridlog.view.server import ViewServer
+from tests.view.chromium import chromium
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, ConsoleMessage, Page
+
+TOKEN, PORT = "a-token", 4242
+ROBOT = RobotConfig(image_size=(64, 48), scan_beams=180, cloud_columns=60)
+
+Asking = Callable[[hl.Store], TestClient]
+
+
+@pytest.fixture(scope="session")
+def demo_store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """An open store with 20 seconds of the demo's robot as `robot`. Tests only read it."""
+    place = tmp_path_factory.mktemp("view")
+    write_bag(place / "robot.bag", duration_s=20, config=ROBOT)
+    with hl.open(place / "store", create=True) as store:
+        store.record(place / "robot.bag", name="robot", tags={"place": "lab"})
+        yield store
+
+
+@pytest.fixture(scope="session")
+def asking() -> Asking:
+    """Makes a client of the view of a store, without a server; paths are below the token."""
+
+    def client(store: hl.Store) -> TestClient:
+        app = make_app(store, TOKEN, PORT)
+        return TestClient(app, base_url=f"http://127.0.0.1:{PORT}/{TOKEN}/")
+
+    return client
+
+
+@pytest.fixture(scope="session")
+def client(demo_store: hl.Store, asking: Asking) -> TestClient:
+    """A client of the view of `demo_store`."""
+    return asking(demo_store)
+
+
+@contextmanager
+def served(store: hl.Store) -> Iterator[str]:
+    """Serve the view of a store; gives its address."""
+    server = ViewServer(store)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        yield server.url
+    finally:
+        server.stop()
+        thread.join()
+
+
+@pytest.fixture(scope="session")
+def demo_url(demo_store: hl.Store) -> Iterator[str]:
+    """Address of the view of `demo_store`."""
+    with served(demo_store) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`."""
+    from playwright.sync_api import sync_playwright
+
+    found = chromium()
+    if isinstance(found, str):
+        pytest.skip(f"The page was NOT tested in a browser, {found}: apt-get install chromium")
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(
+            executable_path=found.path,
+            env=found.environment or dict(os.environ),
+            args=["--no-sandbox", "--enable-unsafe-swiftshader"],
+        )
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    """An empty page; the test fails if a script fails or writes an error to the console."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(15_000)
+    opened = context.new_page()
+    problems: list[str] = []
+    opened.on("pageerror", lambda error: problems.append(str(error)))
+
+    def heard(said: ConsoleMessage) -> None:
+        # The browser itself writes that of every question that the server refuses.
+        if said.type == "error" and not said.text.startswith("Failed to load resource"):
+            problems.append(said.text)
+
+    opened.on("console", heard)
+    yield opened
+    context.close()
+    assert not problems
+
+
+@pytest.fixture
+def picture_of(tmp_path: Path) -> Callable[[Page, str], Path]:
+    """Takes a picture of a page; kept in the directory HYBRIDLOG_TEST_PICTURES, if that is set."""
+
+    def take(page: Page, name: str) -> Path:
+        path = tmp_path / f"{name}.png"
+        page.screenshot(path=path)
+        kept = os.environ.get("HYBRIDLOG_TEST_PICTURES")
+        if kept:
+            shutil.copy(path, kept)
+        return path
+
+    return take

@@ -1,0 +1,108 @@
+"""The list of recordings, asked by itself and seen in a browser."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+import hybridlog as hl
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+    from starlette.testclient import TestClient
+
+
+def test_a_row_says_what_the_store_says(client: TestClient, demo_store: hl.Store) -> None:
+    answer = client.get("recordings").json()
+    (summary,) = demo_store.summaries()
+    assert (answer["all"], answer["found"], answer["messages"]) == (1, 1, summary.messages)
+    (row,) = answer["rows"]
+    assert (row["label"], row["tags"], row["topics"]) == ("robot", {"place": "lab"}, 18)
+    assert row["start"] == str(summary.extent[0])
+    assert row["duration"] == summary.extent[1] - summary.extent[0]
+    assert (row["lost"], row["incomplete"]) == ([], False)
+
+
+@pytest.mark.parametrize(
+    ("conditions", "found"),
+    [
+        ({"name": "obo"}, 1),
+        ({"name": "r*t"}, 1),
+        ({"name": "[x"}, 0),
+        ({"name": "other"}, 0),
+        ({"tag": "place=lab"}, 1),
+        ({"tag": ["place", "place=home"]}, 0),
+        ({"topic": "scan"}, 1),
+        ({"type": "sensor_msgs/NavSatFix"}, 0),
+        ({"where": "scan: ranges.min < 0.5"}, 1),
+        ({"where": "odom: pose.pose.position.x > 1000"}, 0),
+        ({"begin": "2001-01-01"}, 1),
+        ({"end": "2001-01-01"}, 0),
+    ],
+)
+def test_conditions(client: TestClient, conditions: dict[str, str], found: int) -> None:
+    answer = client.get("recordings", params=conditions).json()
+    assert (answer["all"], answer["found"], len(answer["rows"])) == (1, found, found)
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    [
+        {"order": "colour"},
+        {"direction": "sideways"},
+        {"count": "0"},
+        {"count": "201"},
+        {"count": "1e3"},
+        {"count": "٣"},
+        {"first": "-1"},
+        {"first": "9" * 30},
+        {"name": "x" * 1025},
+        {"name": ["a", "b"]},
+        {"tag": ["a"] * 17},
+        {"tag": "=1"},
+        {"begin": "soon"},
+        {"where": "scan: ranges.min <"},
+    ],
+)
+def test_impossible_conditions_are_refused(client: TestClient, conditions: dict[str, str]) -> None:
+    answer = client.get("recordings", params=conditions)
+    assert answer.status_code == 400
+    assert answer.json()["error"]
+
+
+def test_a_recording_says_what_the_store_says(client: TestClient, demo_store: hl.Store) -> None:
+    answer = client.get("recording", params={"recording": "robot"}).json()
+    (entry,) = demo_store.recordings()
+    assert entry.span is not None
+    assert (int(answer["start"]), answer["begin"]) == (entry.span[0], 0)
+    assert answer["end"] == entry.span[1] - entry.span[0] + 1
+    topics = {row["topic"]: row for row in answer["topics"]}
+    assert sorted(topics) == demo_store.topics()
+    for topic, row in topics.items():
+        times = demo_store.topic(topic).to_arrow()["log_time"].cast("int64").to_numpy()
+        assert row["messages"] == len(times)
+        assert (row["first"], row["last"]) == (times[0] - entry.span[0], times[-1] - entry.span[0])
+
+
+def test_an_unknown_recording_is_not_found(client: TestClient) -> None:
+    answer = client.get("recording", params={"recording": "<img>"})
+    assert answer.status_code == 404
+    assert "<img>" in answer.json()["error"]
+
+
+@pytest.mark.peer("browser")
+def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
+    page.goto(demo_url)
+    page.wait_for_selector("text=1 recording:")
+    page.get_by_label("Topic").fill("nothing_like_that")
+    page.wait_for_selector("text=0 of 1 recording:")
+    page.get_by_label("Topic").fill("")
+    page.get_by_label("With a message").fill("scan: ranges.min <")
+    assert "^" in page.get_by_role("alert").inner_text()
+    page.get_by_label("With a message").fill("scan: ranges.min < 0.5")
+    page.get_by_role("link", name="robot").click()
+    page.wait_for_selector("text=18 topics")
+    assert page.url.endswith("#recording=robot")
+    page.go_back()
+    page.wait_for_selector("text=1 recording:")
