@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from itertools import chain, islice
 from pathlib import Path
 
 import click
@@ -10,6 +12,8 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
+
+_MAX_FOLDERS = 1000
 
 
 @click.command()
@@ -51,6 +55,8 @@ def command(
 
     from hybridlog.view.server import ViewServer
 
+    if store is None and not os.environ.get("HYBRIDLOG_STORE"):
+        store = _only_store_near()
     with opened_store(store, mongo, quiet=as_json) as opened:
         server = ViewServer(opened, port)
         url = server.url
@@ -66,3 +72,20 @@ def command(
         if opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
         server.run()
+
+
+def _only_store_near() -> Path | None:
+    """The only store in the folders here and in theirs, where no other one is meant."""
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import NAME
+
+    if store_path().exists():
+        return None
+    folders = chain.from_iterable(
+        islice(Path().glob(depth), _MAX_FOLDERS) for depth in ("*", "*/*")
+    )
+    found = [folder for folder in folders if (folder / NAME).is_file()]
+    if len(found) != 1:
+        return None
+    output.note(f"Showing {found[0]}, the only store below this folder.")
+    return found[0]

@@ -119,7 +119,10 @@ def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEF
             _print(f"The tour stops here; its files remain in {directory}\n")
             sys.stderr.write(f"error: `{step.command}` {fault}\n")
             return code
-    _print(f"\nAll files remain in {directory}; continue with --store {directory / STORE}\n")
+    _print(
+        f"\nAll files remain in {directory}; continue with --store {directory / STORE}, or look "
+        "at it: hybridlog view\n"
+    )
     return 0
 
 

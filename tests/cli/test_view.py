@@ -15,6 +15,8 @@ import pytest
 
 from hybridlog_storage.directory import StoreDirectory
 
+from .running import environment
+
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
@@ -22,16 +24,21 @@ def store(tmp_path: Path) -> Path:
     return tmp_path / "store"
 
 
-def start(store: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "hybridlog", "view", "--store", str(store), *options]
+def start(*options: str | Path, folder: Path | None = None) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+        [sys.executable, "-m", "hybridlog", "view", *map(str, options)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+        cwd=folder,
+        env=environment(),
     )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_serves_until_it_is_stopped(store: Path, number: signal.Signals) -> None:
-    running = start(store, "--json")
+    running = start("--store", store, "--json")
     assert running.stdout is not None
     said = json.loads("".join(iter(running.stdout.readline, "}\n")) + "}")
     with urllib.request.urlopen(said["url"] + "recordings") as answer:
@@ -46,14 +53,33 @@ def test_it_serves_until_it_is_stopped(store: Path, number: signal.Signals) -> N
 
 def test_a_port_that_is_taken_is_refused(store: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
-        running = start(store, "--port", str(other.getsockname()[1]))
+        running = start("--store", store, "--port", str(other.getsockname()[1]))
         _, errors = running.communicate(timeout=20)
     assert running.returncode == 2
     assert "is in use. Without --port a free one is taken." in errors
 
 
 def test_an_unknown_recording_is_refused_before_anything_is_served(store: Path) -> None:
-    running = start(store, "monday")
+    running = start("--store", store, "monday")
     output, errors = running.communicate(timeout=20)
     assert (running.returncode, output) == (2, "")
     assert "monday" in errors
+
+
+def test_the_only_store_below_the_folder_is_shown(tmp_path: Path) -> None:
+    StoreDirectory.create(tmp_path / "demo" / "robot-logs")
+    running = start("--json", folder=tmp_path)
+    assert running.stdout is not None
+    assert running.stdout.readline() == "{\n"
+    running.terminate()
+    _, errors = running.communicate(timeout=20)
+    assert "Showing demo/robot-logs, the only store below this folder." in errors
+
+
+def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        StoreDirectory.create(tmp_path / name)
+    running = start(folder=tmp_path)
+    _, errors = running.communicate(timeout=20)
+    assert running.returncode == 5
+    assert "hybridlog-store" in errors
