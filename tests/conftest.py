@@ -85,6 +85,7 @@ SLOW = frozenset(
         "cli/test_maintain.py",
         "cli/test_record.py",
         "cli/test_record_live.py",
+        "cli/test_serve.py",
         "cli/test_start.py",
         "cli/test_stopping.py",
         "cli/test_terminal.py",

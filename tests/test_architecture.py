@@ -82,6 +82,7 @@ ALLOWED = {
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
     "websockets": (
+        "hybridlog.playback.server",
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",
     ),

@@ -38,6 +38,7 @@ COMMANDS: Final = (
     "sql",
     "view",
     "export",
+    "serve",
     "attachments",
     "index",
     "reindex",

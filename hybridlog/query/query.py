@@ -188,6 +188,10 @@ class Query:
         )
         return self._with(bounds=tuple(bounds))
 
+    def at_all_times(self) -> Query:
+        """The same question without `between` and `during`."""
+        return self._with(bounds=None, during=None, clock="log")
+
     def clock(self, clock: str) -> Query:
         """The time that `between` refers to: `log` (default), `publish` or `header`.
 
@@ -360,13 +364,13 @@ class Query:
         summaries = self._session.snapshot().summaries
         return self._on(self.topics, [summaries[n].id for n in chosen.places.tolist()])
 
-    def with_topic(self, topic: str) -> Query:
-        """The same question about one of its topics.
+    def with_topic(self, *names: str) -> Query:
+        """The same question about one or some of its topics, by their full names.
 
         If the question is about several recordings, tables of each topic name them.
         """
         several = self.question.names_recording or len(self._session.chosen(self.question)) > 1
-        topics, chosen = self._session.having([topic], self.question.recordings)
+        topics, chosen = self._session.having(names, self.question.recordings)
         return self._with(topics=topics, recordings=chosen, names_recording=several)
 
     def during(self, intervals: Intervals) -> Query:

@@ -1,0 +1,1 @@
+"""Playback: plays messages of a store to viewers over the Foxglove WebSocket protocol."""

@@ -1,0 +1,142 @@
+"""The messages that a playback sends, from any time on, and those that are current at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybridlog.latching import depth_of
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage.errors import TimeError, TopicError
+
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog_storage.messages import Batch, Channel
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedChannel:
+    """A channel for viewers: those of all recordings with the same topic, encoding and type.
+
+    Attributes:
+        id: Its number, from 1 on.
+        channel: The first of them.
+        publishers: Nodes that have published it, as far as the recordings name them.
+    """
+
+    id: int
+    channel: Channel
+    publishers: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Messages in order of log time.
+
+    Attributes:
+        batch: The messages.
+        channels: Number of the played channel, by `batch.channel`.
+    """
+
+    batch: Batch
+    channels: Sequence[int]
+
+
+class PlayedLog:
+    """The messages of a query, as a log that is played.
+
+    Args:
+        query: Topics, recordings, range of log time and predicate.
+
+    Attributes:
+        channels: What viewers can subscribe to. Messages whose payload was dropped under
+            pressure are not among them.
+        begin: First log time, ns.
+        end: Last log time, ns.
+
+    Raises:
+        TimeError: The range is outside of all recordings, or these have no messages.
+    """
+
+    def __init__(self, query: Query) -> None:
+        spans = query.spans()
+        if not spans:
+            raise TimeError("There are no messages to play.")
+        times = np.array([(begin, end, 0) for begin, end in spans.values()], np.int64)
+        self.begin = int(times[:, 0].min())
+        self.end = int(times[:, 1].max()) - 1
+        self._whole = query.at_all_times()
+        asked = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
+        during = query.question.during
+        self._during = asked if during is None else during.common(asked)
+        order = times[:, 0].argsort()
+        self._begins = times[order, 0]
+        self._ends = np.maximum.accumulate(times[order, 1])
+        self._ids: dict[tuple[str, int], int] = {}
+        self._latching: set[str] = set()
+        self.channels = self._merge(query.channels())
+
+    def _merge(self, recorded: Sequence[RecordedChannel]) -> list[PlayedChannel]:
+        """The channels as viewers see them."""
+        alike: dict[object, list[RecordedChannel]] = {}
+        for each in recorded:
+            if not each.is_reduced:
+                own = each.channel
+                alike.setdefault((own.topic, own.message_encoding, own.schema), []).append(each)
+                if depth_of(own):
+                    self._latching.add(own.topic)
+        merged = []
+        for number, group in enumerate(alike.values(), 1):
+            self._ids.update({(one.recording.id, one.channel_id): number for one in group})
+            names = (one.channel.metadata.get("callerid", "") for one in group)
+            publishers = tuple(dict.fromkeys(name for name in names if name))
+            merged.append(PlayedChannel(number, group[0].channel, publishers))
+        return merged
+
+    def next_span(self, position: int) -> int:
+        """The next log time that a recording covers, ns: the same one, mostly."""
+        row = int(np.searchsorted(self._begins, position, "right"))
+        if not row or position < self._ends[row - 1] or row == len(self._begins):
+            return position
+        return int(self._begins[row])
+
+    def after(self, topics: Collection[str], position: int) -> Iterator[Block]:
+        """All messages of some topics behind a log time, ns, in order."""
+        if not topics or position >= self.end:
+            return
+        query = self._whole.with_topic(*topics).during(self._during).between(position + 1, None)
+        for batch, channels in query.batches():
+            yield self._block(batch, channels)
+
+    def current(self, topics: Collection[str], position: int) -> Iterator[Block]:
+        """The messages of some topics that are current at a log time, ns.
+
+        They are the latched ones that a subscriber receives which joins then, and the last
+        message of every other topic. Messages from before the played range are not current,
+        unless they are latched.
+        """
+        if not topics:
+            return
+        if self._latching.intersection(topics) and position < self.end:
+            latched = self._whole.with_topic(*self._latching.intersection(topics))
+            for batch, channels in latched.between(position + 1, None).latched(original_times=True):
+                yield self._block(batch, channels)
+        for topic in topics:
+            if topic not in self._latching:
+                yield from self._last(topic, position)
+
+    def _last(self, topic: str, position: int) -> Iterator[Block]:
+        """The last message of a topic until a log time, ns, if the range has one."""
+        try:
+            query = self._whole.with_topic(topic).at_time(position)
+        except TopicError:
+            return  # the topic has none yet
+        for batch, channels in query.during(self._during).batches():
+            yield self._block(batch, channels)
+
+    def _block(self, batch: Batch, channels: Sequence[RecordedChannel]) -> Block:
+        return Block(batch, [self._ids.get((c.recording.id, c.channel_id), 0) for c in channels])

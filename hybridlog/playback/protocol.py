@@ -1,0 +1,239 @@
+"""Messages of the Foxglove WebSocket protocol, as a server that plays recordings speaks it."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from struct import Struct, error
+from typing import Final
+
+from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, TIME
+from hybridlog.playback.played import PlayedChannel
+
+_BASE64 = frozenset({"protobuf", "flatbuffer"})
+_DATA = Struct("<BIQ")  # opcode, subscription, log time
+_TIME = Struct("<BQ")
+_STATE = Struct("<BBQfBI")  # opcode, status, time, speed, did seek, length of the request's id
+_CONTROL = Struct("<BBfBQI")  # opcode, command, speed, seeks, time, length of the id
+_PLAYBACK_STATE: Final = 5
+_PLAYBACK_CONTROL: Final = 3
+_PLAY: Final = 0
+_PAUSE: Final = 1
+_MAX_ID: Final = 1 << 32
+
+
+class RequestError(Exception):
+    """A client violates the protocol; the message is for the client."""
+
+
+class Status(IntEnum):
+    """What a playback does."""
+
+    PLAYING = 0
+    PAUSED = 1
+    ENDED = 3
+
+
+class Level(IntEnum):
+    """Severity of a status message."""
+
+    WARNING = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Subscribe:
+    """A request for channels: their numbers by number of the subscription."""
+
+    channels: Mapping[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Unsubscribe:
+    """A request to end subscriptions, by their numbers."""
+
+    subscriptions: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SubscribeGraph:
+    """A request for the publishers of the topics."""
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """A request to play, to pause, to go to a time, or to change the speed.
+
+    Attributes:
+        plays: Play, or pause.
+        speed: Seconds of log time a second, as asked.
+        seek: Log time to go to, ns; None to stay.
+        id: The client's name of the request.
+    """
+
+    plays: bool
+    speed: float
+    seek: int | None
+    id: bytes
+
+
+Request = Subscribe | Unsubscribe | SubscribeGraph | Control
+
+
+def server_info(name: str, session: str, begin: int, end: int) -> str:
+    """The first message to a client.
+
+    Args:
+        name: Name of the server.
+        session: Names this run of the server.
+        begin: First log time that can be played, ns.
+        end: Last log time, ns.
+    """
+    return json.dumps(
+        {
+            "op": "serverInfo",
+            "name": name,
+            "capabilities": ["playbackControl", "time", "connectionGraph"],
+            "sessionId": session,
+            "dataStartTime": _seconds(begin),
+            "dataEndTime": _seconds(end),
+        }
+    )
+
+
+def advertise(channels: Iterable[PlayedChannel]) -> str:
+    """The message that offers channels. Channels without a definition have an empty one."""
+    return json.dumps({"op": "advertise", "channels": [_described(each) for each in channels]})
+
+
+def connection_graph(channels: Iterable[PlayedChannel]) -> str:
+    """The message with the publishers of the topics, as far as the recordings name them."""
+    publishers: dict[str, list[str]] = {}
+    for each in channels:
+        publishers.setdefault(each.channel.topic, []).extend(each.publishers)
+    published = [{"name": t, "publisherIds": p} for t, p in publishers.items() if p]
+    return json.dumps(
+        {
+            "op": "connectionGraphUpdate",
+            "publishedTopics": published,
+            "subscribedTopics": [],
+            "advertisedServices": [],
+            "removedTopics": [],
+            "removedServices": [],
+        }
+    )
+
+
+def status(level: Level, text: str) -> str:
+    """A message for the user of the client."""
+    return json.dumps({"op": "status", "level": level, "message": text})
+
+
+def message_data(subscription: int, log_time: int, payload: memoryview) -> bytes:
+    """A message of a subscription; its log time is in ns."""
+    return b"".join((_DATA.pack(MESSAGE_DATA, subscription, log_time), payload))
+
+
+def time_now(position: int) -> bytes:
+    """The log time of the playback, ns."""
+    return _TIME.pack(TIME, position)
+
+
+def playback_state(
+    status: Status, position: int, speed: float, *, did_seek: bool, request: bytes
+) -> bytes:
+    """What the playback does now.
+
+    Args:
+        status: What it does.
+        position: Log time, ns.
+        speed: Seconds of log time a second.
+        did_seek: The log time was set: what clients have shown no longer holds.
+        request: Id of the request that this answers; empty if it answers none.
+    """
+    head = _STATE.pack(_PLAYBACK_STATE, status, position, speed, did_seek, len(request))
+    return head + request
+
+
+def parse(message: str | bytes) -> Request:
+    """A message of a client.
+
+    Raises:
+        RequestError: It is malformed, or asks for what a playback does not have.
+    """
+    return _parse_text(message) if isinstance(message, str) else _parse_binary(message)
+
+
+def _parse_binary(message: bytes) -> Control:
+    if message[:1] != bytes([_PLAYBACK_CONTROL]):
+        raise RequestError("a playback takes no messages of clients")
+    try:
+        _, command, speed, seeks, position, length = _CONTROL.unpack_from(message)
+    except error as problem:
+        raise RequestError("a playback control request is cut short") from problem
+    name = message[_CONTROL.size :]
+    if command not in {_PLAY, _PAUSE} or len(name) != length:
+        raise RequestError("a playback control request is malformed")
+    return Control(command == _PLAY, speed, position if seeks else None, name)
+
+
+def _parse_text(text: str) -> Request:
+    try:
+        message = json.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise RequestError(f"a message is not JSON: {problem}") from problem
+    operation = message.get("op") if isinstance(message, dict) else None
+    if operation == "subscribe":
+        return Subscribe(dict(map(_subscription, _entries(message, "subscriptions"))))
+    if operation == "unsubscribe":
+        return Unsubscribe(tuple(map(_number, _entries(message, "subscriptionIds"))))
+    if operation == "subscribeConnectionGraph":
+        return SubscribeGraph()
+    if operation == "unsubscribeConnectionGraph":
+        return Unsubscribe(())  # the graph never changes, so nothing more would come
+    raise RequestError(f"a playback does not know the operation {str(operation)[:100]!r}")
+
+
+def _entries(message: Mapping[str, object], key: str) -> list[object]:
+    entries = message.get(key)
+    if not isinstance(entries, list):
+        raise RequestError(f"a request lacks its list of {key}")
+    return entries
+
+
+def _subscription(entry: object) -> tuple[int, int]:
+    if not isinstance(entry, dict):
+        raise RequestError("a subscription is not a JSON object")
+    return _number(entry.get("id")), _number(entry.get("channelId"))
+
+
+def _number(value: object) -> int:
+    if type(value) is not int or not 0 <= value < _MAX_ID:
+        raise RequestError("a subscription or a channel is not named by a number")
+    return value
+
+
+def _seconds(time: int) -> dict[str, int]:
+    return {"sec": time // 10**9, "nsec": time % 10**9}
+
+
+def _described(each: PlayedChannel) -> dict[str, object]:
+    channel = each.channel
+    schema = channel.schema
+    found: dict[str, object] = {
+        "id": each.id,
+        "topic": channel.topic,
+        "encoding": channel.message_encoding,
+        "schemaName": schema.name if schema is not None else "",
+        "schema": "",
+    }
+    if schema is not None and schema.encoding:
+        found["schemaEncoding"] = schema.encoding
+        if schema.encoding in _BASE64:
+            found["schema"] = base64.b64encode(schema.data).decode()
+        else:
+            found["schema"] = schema.data.decode("utf-8", "replace")
+    return found

@@ -1,0 +1,504 @@
+"""A Foxglove WebSocket server that plays a log to its clients.
+
+All clients share one playback, as the protocol has it: whoever pauses or seeks does it for all.
+One task plays. It obeys the requests of clients one after the other, and between two of them it
+sends what is due. It waits for the slowest client: the log time then runs slower, and no
+message is dropped. Only subscribed topics are read.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import time
+from collections.abc import Callable, Collection, Coroutine, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
+
+import numpy as np
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+
+from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS
+from hybridlog.playback.clock import PlaybackClock
+from hybridlog.playback.played import Block
+from hybridlog.playback.protocol import (
+    Control,
+    Level,
+    Request,
+    RequestError,
+    Status,
+    Subscribe,
+    SubscribeGraph,
+    Unsubscribe,
+    advertise,
+    connection_graph,
+    message_data,
+    parse,
+    playback_state,
+    server_info,
+    status,
+    time_now,
+)
+from hybridlog_storage.errors import HybridlogError, UsageError
+
+if TYPE_CHECKING:
+    from websockets.http11 import Request as HttpRequest
+    from websockets.http11 import Response
+    from websockets.typing import Subprotocol
+
+    from hybridlog.playback.played import PlayedLog
+
+HOST: Final = "127.0.0.1"
+_WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
+_MAX_CLIENTS: Final = 32
+_MAX_REQUEST: Final = 8 << 20  # bytes; subscriptions to 65,535 channels take 3 MB
+_MAX_WAITING: Final = 64  # requests; then clients have to wait
+_MAX_SENT: Final = 1 << 20  # bytes of payload between two looks at requests
+_TICK_S: Final = 1 / 30  # between two messages with the time
+_STEP_S: Final = 0.002  # of waiting, at least, so that many messages are sent at once
+_LATE_S: Final = 0.1  # of playing; later than this, the clock waits for the clients
+_PING_S: Final = 10.0
+_CLOSE_S: Final = 1.0
+_OWN_HOSTS: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_VIEWERS: Final = ".foxglove.dev"
+
+
+@dataclass(frozen=True, slots=True)
+class PlaybackOptions:
+    """How a log is played.
+
+    Attributes:
+        port: TCP port on the loopback interface; 0 for a free one.
+        speed: Seconds of log time a second at first.
+        loops: Begin again at the end.
+        is_paused: Wait for a client to play; otherwise the first subscription begins it.
+        origins: Web origins that may connect, beside those of Foxglove and of this computer.
+    """
+
+    port: int = 8765
+    speed: float = 1.0
+    loops: bool = False
+    is_paused: bool = False
+    origins: tuple[str, ...] = ()
+
+
+@dataclass(eq=False, slots=True)
+class _Client:
+    """A client, and the subscriptions that it has by number of the channel."""
+
+    connection: ServerConnection
+    subscriptions: dict[int, int] = field(default_factory=dict)
+
+    async def send(self, message: str | bytes) -> None:
+        """Send a message and wait until the client takes it, if it is slow."""
+        with contextlib.suppress(ConnectionClosed):  # its own task ends with it
+            await self.connection.send(message)
+
+    async def send_state(self, state: bytes) -> None:
+        """Send what the playback does, if the client's protocol has that."""
+        if self.connection.subprotocol == _WITH_PLAYBACK:
+            await self.send(state)
+
+
+class _Reading:
+    """Reads blocks of messages in a thread of their own, one ahead.
+
+    Args:
+        blocks: The blocks.
+        executor: Its only thread reads.
+    """
+
+    def __init__(self, blocks: Iterator[Block], executor: ThreadPoolExecutor) -> None:
+        self._blocks = blocks
+        self._executor = executor
+        self._ahead = executor.submit(next, blocks, None)
+        self._block: Block | None = None
+        self._row = 0
+        self._is_over = False
+
+    async def next_time(self) -> int | None:
+        """Log time of the next message, ns; None at the end."""
+        while self._block is None or self._row == len(self._block.batch):
+            if self._is_over:
+                return None
+            self._block, self._row = await asyncio.wrap_future(self._ahead), 0
+            if self._block is None:
+                self._is_over = True
+            else:
+                self._ahead = self._executor.submit(next, self._blocks, None)
+        return int(self._block.batch.log_time[self._row])
+
+    def take(self, until: int) -> tuple[Block, int]:
+        """Messages until a log time, ns, about `_MAX_SENT` bytes; the log time of the last one.
+
+        At least one. Those of the same time in the same block are never taken apart. Call
+        `next_time` first.
+        """
+        assert self._block is not None
+        batch, row = self._block.batch, self._row
+        times = batch.log_time[row:]
+        count = max(int(np.searchsorted(times, until, "right")), 1)
+        sizes = np.cumsum(batch.length[row : row + count])
+        last = int(times[np.searchsorted(sizes[:-1], _MAX_SENT)])
+        count = int(np.searchsorted(times, last, "right"))
+        self._row += count
+        return Block(batch.take(slice(row, self._row)), self._block.channels), last
+
+    def close(self) -> None:
+        """Read no more."""
+        self._ahead.cancel()
+        self._is_over, self._block = True, None
+        close = getattr(self._blocks, "close", None)
+        if close is not None:
+            self._executor.submit(close)
+
+
+class PlaybackServer:
+    """Plays a log to Foxglove clients.
+
+    Args:
+        log: The messages.
+        name: What clients call the server.
+        options: How they are played.
+        say: Takes lines for the user who has started the server.
+    """
+
+    def __init__(
+        self, log: PlayedLog, name: str, options: PlaybackOptions, say: Callable[[str], None]
+    ) -> None:
+        self._log = log
+        self._name = name
+        self._options = options
+        self._say = say
+        self._session = secrets.token_hex(8)
+        self._topics = {each.id: each.channel.topic for each in log.channels}
+        self._clients: list[_Client] = []
+        self._requests: asyncio.Queue[tuple[_Client, Request | None]] = asyncio.Queue(_MAX_WAITING)
+        self._executor = ThreadPoolExecutor(1, "hybridlog-playback")
+        self._refused: set[str] = set()
+        self._reading: _Reading | None = None
+        self._rewind()
+
+    def _rewind(self) -> None:
+        """Be as at the beginning: nothing is sent, and the clock stands still."""
+        self._clock = PlaybackClock(self._log.begin, self._options.speed)
+        self._sent = self._log.begin - 1  # log time until which everything is sent
+        self._next: int | None = None  # log time of the next message that is read
+        self._told = 0.0  # when clients were told the time
+        self._has_begun = self._options.is_paused
+        self._has_ended = False
+        self._read(())
+
+    async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> None:
+        """Serve until stopped.
+
+        Args:
+            stop: Set to end this; clients are told goodbye.
+            ready: Called with the port when clients can connect.
+
+        Raises:
+            UsageError: The port is taken.
+        """
+        try:
+            server = await self._listen()
+        except OSError as error:
+            raise UsageError(
+                f"Port {self._options.port} cannot be used: {error.strerror}. Choose another one "
+                "with --port, or 0 for any."
+            ) from error
+        playing = asyncio.create_task(self._play())
+        stopping = asyncio.create_task(stop.wait())
+        try:
+            async with server:
+                ready(int(next(iter(server.sockets)).getsockname()[1]))
+                await asyncio.wait((playing, stopping), return_when=asyncio.FIRST_COMPLETED)
+            if playing.done():
+                playing.result()  # raises what has ended it
+        finally:
+            playing.cancel()
+            stopping.cancel()
+            await asyncio.gather(playing, stopping, return_exceptions=True)
+            self._read(())
+            self._executor.shutdown()
+
+    async def _listen(self) -> Server:
+        protocols: Sequence[Subprotocol] = SUBPROTOCOLS  # type: ignore[assignment]
+        return await serve(
+            self._serve,
+            HOST,
+            self._options.port,
+            subprotocols=protocols,
+            process_request=self._check,
+            compression=None,
+            max_size=_MAX_REQUEST,
+            ping_interval=_PING_S,
+            ping_timeout=_PING_S,
+            close_timeout=_CLOSE_S,
+        )
+
+    # Clients.
+
+    def _check(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
+        """Refuse web pages that are no viewers, and more clients than are served."""
+        origin = request.headers.get("Origin")
+        if not _is_own_host(request.headers.get("Host", "")):
+            return connection.respond(HTTPStatus.FORBIDDEN, "Only localhost is served.\n")
+        if origin is not None and not self._is_welcome(origin):
+            if origin not in self._refused and len(self._refused) < _MAX_CLIENTS:
+                self._refused.add(origin)
+                self._say(f"Refused a page of {origin}: --allow-origin {origin} admits it.")
+            return connection.respond(HTTPStatus.FORBIDDEN, "This origin is not allowed.\n")
+        if len(self._clients) >= _MAX_CLIENTS:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "Too many clients.\n")
+        return None
+
+    def _is_welcome(self, origin: str) -> bool:
+        """True for desktop programs, pages of this computer, Foxglove, and allowed origins."""
+        try:
+            parts = urlsplit(origin)
+            host = parts.hostname or ""
+        except ValueError:
+            return False
+        if origin in self._options.origins:
+            return True
+        if parts.scheme == "https" and host.endswith(_VIEWERS):
+            return True
+        if parts.scheme in {"http", "https"}:
+            return host in _OWN_HOSTS
+        return bool(parts.scheme)  # such as file://; a page in a sandbox has "null"
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        """Serve a client until it goes."""
+        client = _Client(connection)
+        info = server_info(self._name, self._session, self._log.begin, self._log.end)
+        await client.send(info)
+        await client.send(advertise(self._log.channels))
+        self._clients.append(client)
+        try:
+            await client.send_state(self._state())
+            async for message in connection:
+                try:
+                    request = parse(message)
+                except RequestError as error:
+                    await client.send(status(Level.ERROR, str(error)))
+                else:
+                    await self._requests.put((client, request))
+        except ConnectionClosed:
+            pass  # it has gone without a farewell
+        finally:
+            self._clients.remove(client)
+            await self._requests.put((client, None))
+
+    async def _broadcast(self, message: str | bytes) -> None:
+        await asyncio.gather(*(client.send(message) for client in self._clients))
+
+    async def _broadcast_state(self, *, seek: int | None = None, request: bytes = b"") -> None:
+        state = self._state(seek=seek, request=request)
+        await asyncio.gather(*(client.send_state(state) for client in self._clients))
+
+    def _state(self, *, seek: int | None = None, request: bytes = b"") -> bytes:
+        """What the playback does, perhaps after a seek to a log time."""
+        doing = Status.PLAYING if self._clock.is_running else Status.PAUSED
+        if self._has_ended:
+            doing = Status.ENDED
+        position = min(self._clock.position, self._log.end) if seek is None else seek
+        return playback_state(
+            doing, position, self._clock.speed, did_seek=seek is not None, request=request
+        )
+
+    # The task that plays.
+
+    async def _play(self) -> None:
+        """Obey requests, and send what is due, until cancelled."""
+        while True:
+            try:
+                async with asyncio.timeout(self._seconds_to_wait()):
+                    client, request = await self._requests.get()
+            except TimeoutError:
+                pass
+            else:
+                await self._guarded(self._obey(client, request))
+            await self._guarded(self._send_due())
+
+    async def _guarded(self, work: Coroutine[object, object, None]) -> None:
+        """Pause where messages cannot be read, and say so."""
+        try:
+            await work
+        except HybridlogError as error:
+            self._clock.pause()
+            self._read(())
+            self._say(str(error))
+            await self._broadcast(status(Level.ERROR, str(error)))
+            await self._broadcast_state()
+
+    def _seconds_to_wait(self) -> float | None:
+        """Seconds until something is to be sent; None if nothing is."""
+        if not self._clock.is_running:
+            return None
+        if self._next is None:
+            return _TICK_S
+        return min(max(self._clock.seconds_until(self._next), _STEP_S), _TICK_S)
+
+    async def _obey(self, client: _Client, request: Request | None) -> None:
+        if request is None:
+            if not self._clients:
+                self._rewind()
+            else:
+                self._read_subscribed()
+        elif isinstance(request, Subscribe):
+            await self._subscribe(client, request)
+        elif isinstance(request, Unsubscribe):
+            ended = set(request.subscriptions)
+            own = client.subscriptions
+            client.subscriptions = {c: s for c, s in own.items() if s not in ended}
+            self._read_subscribed()
+        elif isinstance(request, SubscribeGraph):
+            await client.send(connection_graph(self._log.channels))
+        else:
+            await self._control(request)
+
+    async def _subscribe(self, client: _Client, request: Subscribe) -> None:
+        """Begin subscriptions with the messages that are current now."""
+        new = []
+        taken = set(client.subscriptions.values())
+        for number, channel in request.channels.items():
+            if channel not in self._topics:
+                await client.send(status(Level.ERROR, f"there is no channel {channel}"))
+            elif channel in client.subscriptions or number in taken:
+                text = f"there is a subscription {number}, or one to channel {channel}"
+                await client.send(status(Level.WARNING, text))
+            else:
+                client.subscriptions[channel] = number
+                new.append(channel)
+        self._read_subscribed()
+        await self._send_current([client], set(new))
+        if new and not self._has_begun:
+            self._has_begun = True
+            self._clock.play()
+            await self._broadcast_state()
+
+    async def _control(self, request: Control) -> None:
+        """Play, pause, seek or change the speed, for all clients."""
+        self._has_begun = True
+        self._clock.set_speed(request.speed)
+        seek = request.seek
+        if seek is not None:
+            seek = min(max(seek, self._log.begin), self._log.end)
+            self._has_ended = False
+        if request.plays and not self._has_ended:
+            self._clock.play()
+            if self._reading is None:  # after an error, or nothing is subscribed
+                self._read_subscribed()
+        else:
+            self._clock.pause()
+        if seek is None:
+            await self._broadcast_state(request=request.id)
+        else:
+            await self._go_to(seek, request.id)
+
+    async def _go_to(self, position: int, request: bytes = b"") -> None:
+        """Set the clock to a log time, and show what is current there."""
+        self._sent = position - 1
+        self._clock.set(position)
+        await self._broadcast_state(seek=position, request=request)
+        await self._broadcast(time_now(position))
+        self._read_subscribed()
+        await self._send_current(self._clients, set(self._topics))
+
+    async def _send_current(self, clients: Sequence[_Client], channels: Collection[int]) -> None:
+        """Send the messages of channels that are current to their subscribers among clients."""
+        wanted = {c for client in clients for c in client.subscriptions if c in channels}
+        topics = sorted({self._topics[channel] for channel in wanted})
+        reading = _Reading(self._log.current(topics, self._sent), self._executor)
+        while await reading.next_time() is not None:
+            block, _ = reading.take(self._sent)
+            await self._send(clients, block, wanted)
+
+    async def _send_due(self) -> None:
+        """Send all messages until the time of the clock."""
+        if self._reading is None and not self._clock.is_running:
+            return  # the first subscriber gets all messages of this time
+        before = self._sent
+        self._next = await self._next_time()
+        while self._next is not None:
+            # Messages of the same time belong together, even if others wait.
+            if self._next > self._sent and not self._requests.empty():
+                break
+            now = max(self._clock.position, self._sent)
+            if self._next > now:
+                break
+            assert self._reading is not None
+            block, self._sent = self._reading.take(now)
+            await self._send(self._clients, block, self._topics)
+            self._clock.wait_for(self._sent, _LATE_S)
+            self._next = await self._next_time()
+        last = self._log.end if self._next is None else self._next - 1
+        self._sent = max(self._sent, min(self._clock.position, last))
+        if self._sent > before and time.monotonic() - self._told > _TICK_S:
+            self._told = time.monotonic()
+            await self._broadcast(time_now(self._sent))
+        await self._go_on()
+
+    async def _next_time(self) -> int | None:
+        return await self._reading.next_time() if self._reading is not None else None
+
+    async def _go_on(self) -> None:
+        """Pass over the time between two recordings; at the end, stop or begin again."""
+        if not self._clock.is_running:
+            return
+        if self._sent >= self._log.end:
+            if self._options.loops:
+                await self._go_to(self._log.begin)
+                return
+            self._clock.pause()
+            self._clock.set(self._log.end)
+            self._has_ended = True
+            await self._broadcast(time_now(self._log.end))
+            await self._broadcast_state()
+            return
+        then = self._log.next_span(self._sent)
+        if then > self._sent:
+            self._sent = then - 1
+            self._clock.set(then)
+            await self._broadcast_state()
+
+    async def _send(
+        self, clients: Sequence[_Client], block: Block, channels: Collection[int]
+    ) -> None:
+        """Send a block of messages to the subscribers of its channels."""
+        await asyncio.gather(*(self._send_to(client, block, channels) for client in clients))
+
+    async def _send_to(self, client: _Client, block: Block, channels: Collection[int]) -> None:
+        own = {c: s for c, s in client.subscriptions.items() if c in channels}
+        subscriptions = [own.get(channel) for channel in block.channels]
+        batch = block.batch
+        rows = zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)
+        for row, (index, log_time) in enumerate(rows):
+            subscription = subscriptions[index]
+            if subscription is not None:
+                await client.send(message_data(subscription, log_time, batch.payload(row)))
+
+    def _read_subscribed(self) -> None:
+        """Read the subscribed topics behind what is sent already."""
+        self._read({self._topics[c] for client in self._clients for c in client.subscriptions})
+
+    def _read(self, topics: Collection[str]) -> None:
+        if self._reading is not None:
+            self._reading.close()
+            self._reading = None
+        if topics:
+            blocks = self._log.after(sorted(topics), self._sent)
+            self._reading = _Reading(blocks, self._executor)
+
+
+def _is_own_host(host: str) -> bool:
+    """True for names of this computer, with any port: a request may come through a tunnel."""
+    try:
+        return urlsplit(f"//{host}").hostname in _OWN_HOSTS
+    except ValueError:
+        return False

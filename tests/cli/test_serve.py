@@ -1,0 +1,53 @@
+"""`hybridlog serve`, in a process of its own."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
+
+from tests.independent import Seen, read_bag
+from tests.playback.viewer import Viewer
+
+from .running import run, started, wait_for
+
+
+def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    command = ("serve", "robot", "-t", "/imu/data", "-t", "/map", "--store", store)
+    with started(*command, "--port", 0, "--speed", 100, output=output) as process:
+        wait_for(lambda: "Ctrl-C ends it." in output.read_text())
+        lines = output.read_text().splitlines()
+        address = lines[0]
+        assert lines[2].startswith("In a browser: https://app.foxglove.dev/?ds=foxglove-websocket")
+        assert lines[2].endswith(address.replace(":", "%3A").replace("/", "%2F"))
+        with Viewer(address) as viewer:
+            viewer.subscribe()
+            found = viewer.until_end()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+    wanted = [m for m in read_bag(logs / "robot.bag") if m.topic in {"/imu/data", "/map"}]
+    assert [Seen(*m) for m in found] == wanted
+    assert output.read_text().splitlines() == lines
+
+
+def test_wrong_ways(store: Path) -> None:
+    assert "0.01<=x<=100" in run("serve", "--speed", 0, store=store, code=2).err
+    assert "nothing" in run("serve", "nothing", store=store, code=2).err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = run("serve", "robot", "-t", "/map", "--port", port, store=store, code=2)
+    assert f"Port {port} cannot be used" in done.err
+    assert done.out == ""
+
+
+def test_topics_that_viewers_cannot_show_are_said(store: Path, tmp_path: Path) -> None:
+    with started("serve", "odd", "--store", store, "--port", 0, output=tmp_path / "out") as process:
+        wait_for(lambda: "Ctrl-C ends it." in (tmp_path / "out").read_text())
+        assert "Viewers cannot show" in (tmp_path / "out").read_text()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0

@@ -1,0 +1,444 @@
+"""Playback over the Foxglove WebSocket protocol, as a viewer sees it."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
+
+from mcap.writer import Writer
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+import hybridlog as hl
+from hybridlog.playback.clock import PlaybackClock
+from hybridlog.playback.played import PlayedLog
+from hybridlog_storage.errors import TimeError, UsageError
+from tests.independent import Seen, read_mcap
+from tests.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
+
+S = 10**9
+BEGIN = 1_700_000_000 * S
+LATER = BEGIN + 3600 * S
+TEXT = b"string data\n"
+
+
+def write_log(path: Path, begin: int, seconds: int = 3) -> Path:
+    """A log with latched and many-published topics, several encodings, and equal times."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000)
+        writer.start()
+        text = writer.register_schema("std_msgs/String", "ros1msg", TEXT)
+        proto = writer.register_schema("a.B", "protobuf", b"\n\x00\xff\xfe")
+        odd = writer.register_schema("pkg/Odd", "ros1msg", b"string data # \xff\n")
+        channels = {
+            "/map": writer.register_channel(
+                "/map", "ros1", text, {"callerid": "/server", "latching": "1"}
+            ),
+            "/tf a": writer.register_channel("/tf", "ros1", text, {"callerid": "/a"}),
+            "/tf b": writer.register_channel("/tf", "ros1", text, {"callerid": "/b"}),
+            "/n": writer.register_channel("/n", "json", 0),
+            "/proto": writer.register_channel("/proto", "protobuf", proto),
+            "/odd": writer.register_channel("/odd", "ros1", odd),
+            "/bare": writer.register_channel("/bare", "cdr", 0),
+            "/silent": writer.register_channel("/silent", "json", 0),
+        }
+
+        def add(name: str, time: int, payload: bytes) -> None:
+            writer.add_message(channels[name], time, payload, time)
+
+        add("/map", begin, b"\x03\x00\x00\x00map")
+        for n in range(seconds * 100):
+            time = begin + n * S // 100
+            add("/n", time, b'{"n": %d}' % n)
+            add("/tf a", time, b"\x01\x00\x00\x00a")
+            add("/tf b", time, b"\x01\x00\x00\x00b")
+            if n % 100 == 50:
+                add("/proto", time, b"\x08" + bytes([n % 128]))
+                add("/bare", time, b"\x00\x01\x00\x00" + bytes([n % 128]))
+                add("/odd", time, b"\x01\x00\x00\x00o")
+        writer.finish()
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("played")
+    write_log(directory / "one.mcap", BEGIN)
+    write_log(directory / "two.mcap", LATER)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def store(logs: Path) -> Iterator[hl.Store]:
+    with hl.open(logs / "store", create=True) as opened:
+        for name in ("one", "two"):
+            opened.record(logs / f"{name}.mcap")
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def one(store: hl.Store) -> PlayedLog:
+    return PlayedLog(store.all_topics().in_recording("one"))
+
+
+@pytest.fixture(scope="module")
+def seen(logs: Path) -> list[Seen]:
+    return read_mcap(logs / "one.mcap")
+
+
+def data(found: list[Any]) -> list[Data]:
+    return [each for each in found if isinstance(each, Data)]
+
+
+def test_every_message_comes_once_in_order_and_as_it_was(one: PlayedLog, seen: list[Seen]) -> None:
+    with served(one) as url, Viewer(url) as viewer:
+        assert viewer.connection.subprotocol == SDK
+        assert viewer.info["capabilities"] == ["playbackControl", "time", "connectionGraph"]
+        assert viewer.info["dataStartTime"] == {"sec": BEGIN // S, "nsec": 0}
+        assert viewer.info["dataEndTime"] == {"sec": BEGIN // S + 2, "nsec": 990_000_000}
+        assert viewer.first_state == State("paused", BEGIN, 100.0, False, b"")
+        viewer.subscribe()
+        found = viewer.until_end()
+    assert [m.time for m in found] == sorted(m.time for m in found)
+    for topic in ("/map", "/tf", "/n", "/proto", "/odd", "/bare"):
+        wanted = [m for m in seen if m.topic == topic]
+        assert [Seen(*m) for m in found if m.topic == topic] == wanted, topic
+    assert len(found) == len(seen)
+
+
+def test_channels_are_those_of_the_sdk(one: PlayedLog) -> None:
+    """The SDK's own server describes the same channels in the same way."""
+    foxglove = pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
+    context = foxglove.Context()
+    made = []
+    for each in one.channels:
+        own = each.channel
+        if own.topic == "/bare" or own.topic == "/odd":
+            continue  # the SDK offers neither a type without definition nor one that is no UTF-8
+        schema = own.schema and foxglove.Schema(
+            name=own.schema.name, encoding=own.schema.encoding, data=own.schema.data
+        )
+        made.append(
+            foxglove.Channel(
+                own.topic, schema=schema, message_encoding=own.message_encoding, context=context
+            )
+        )
+    peer = foxglove.start_server(name="sdk", host="127.0.0.1", port=0, context=context)
+    try:
+        with connect(f"ws://127.0.0.1:{peer.port}", subprotocols=[SDK], proxy=None) as theirs:  # type: ignore[list-item]
+            theirs.recv()
+            wanted = {c["topic"]: c for c in json.loads(theirs.recv())["channels"]}
+    finally:
+        peer.stop()
+    with served(one) as url, Viewer(url) as viewer:
+        found = {c["topic"]: c for c in viewer.channels}
+    assert set(found) == {*wanted, "/bare", "/odd"}
+    assert len(viewer.channels) == len(found), "publishers of a topic are one channel"
+    for topic, channel in wanted.items():
+        ours, theirs_ = dict(found[topic]), dict(channel)
+        ours.pop("id"), theirs_.pop("id")
+        if channel["encoding"] == "json":  # without a schema, the SDK makes up a name
+            assert ours["schema"] == theirs_["schema"] == ""
+        else:
+            assert ours == theirs_, topic
+    assert found["/bare"]["schema"] == ""
+    assert found["/odd"]["schema"] == "string data # \ufffd\n"
+
+
+def test_a_seek_shows_what_is_current_and_then_plays_on(one: PlayedLog, seen: list[Seen]) -> None:
+    there = BEGIN + 2 * S
+    with served(one, is_paused=True) as url, Viewer(url) as viewer:
+        viewer.subscribe()
+        assert [Seen(*m) for m in data(viewer.quiet())] == [m for m in seen if m.log_time == BEGIN]
+        assert viewer.control(plays=False, seek=there) == State("paused", there, 1.0, True, b"id")
+        shown = viewer.quiet()
+        assert shown[0] == Time(there)
+        before = [m for m in data(shown) if m.time < there]
+        last = {}
+        for message in seen:
+            if message.log_time < there:
+                last[message.topic] = message
+        assert {Seen(*m) for m in before} == set(last.values())
+        now = [m for m in data(shown) if m.time >= there]
+        assert [Seen(*m) for m in now] == [m for m in seen if m.log_time == there]
+        assert viewer.control(plays=True, speed=100).status == "playing"
+        rest = viewer.until_end()
+        assert [Seen(*m) for m in rest] == [m for m in seen if m.log_time > there]
+        # At the end, only a seek goes on.
+        assert viewer.control(plays=True).status == "ended"
+        assert viewer.control(plays=True, speed=100, seek=0).time == BEGIN
+        assert [Seen(*m) for m in viewer.until_end()] == seen
+
+
+def test_pause_and_speed(one: PlayedLog) -> None:
+    with served(one, is_paused=True) as url, Viewer(url) as viewer:
+        viewer.subscribe("/n")
+        assert viewer.control(plays=True, speed=0.0).speed == pytest.approx(0.01)
+        paused = viewer.control(plays=False, speed=math.nan)
+        assert (paused.status, paused.speed) == ("paused", pytest.approx(0.01))
+        assert paused.time < BEGIN + S
+        viewer.quiet()
+        assert viewer.control(plays=False, speed=math.inf).speed == 100
+        assert viewer.quiet() == [], "time stands still"
+        assert viewer.control(plays=False, seek=2**63).time == one.end
+
+
+def test_subscriptions_may_change_while_it_plays(one: PlayedLog, seen: list[Seen]) -> None:
+    """Others that come and go neither double nor lose messages of a topic that stays."""
+    with served(one, speed=10.0) as url, Viewer(url) as viewer, Viewer(url) as other:
+        viewer.subscribe("/tf")
+        for _ in range(6):
+            other.subscribe("/n")
+            while not isinstance(other.read(), Data):
+                pass
+            other.unsubscribe("/n")
+        found = viewer.until_end()
+    assert [Seen(*m) for m in found] == [m for m in seen if m.topic == "/tf"]
+
+
+def test_a_late_subscriber_gets_what_is_current(one: PlayedLog) -> None:
+    with served(one, is_paused=True) as url, Viewer(url) as viewer:
+        viewer.control(plays=False, seek=BEGIN + S)
+        viewer.quiet()
+        viewer.subscribe("/map", "/proto")
+        found = data(viewer.quiet())
+        assert [(m.topic, m.time) for m in found] == [
+            ("/map", BEGIN),
+            ("/proto", BEGIN + S // 2),
+        ]
+        viewer.subscribe("/map")
+        (warning,) = viewer.quiet()
+        assert isinstance(warning, dict)
+        assert warning["level"] == 1
+
+
+def test_a_slow_viewer_loses_nothing(tmp_path: Path) -> None:
+    """The log time waits for it: with 64 MB in a tenth of a second, anything else would drop."""
+    size, count = 1 << 20, 64
+    with (tmp_path / "big.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/big", "json", 0)
+        for n in range(count):
+            writer.add_message(channel, BEGIN + n * S // 10, bytes([n]) * size, 0)
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True) as opened:
+        opened.record(tmp_path / "big.mcap")
+        log = PlayedLog(opened.all_topics())
+        with served(log) as url, Viewer(url, small_buffers=True) as viewer:
+            viewer.subscribe()
+            viewer.until(State, status="playing")
+            found = []
+            while len(found) < count:
+                one = viewer.read()
+                if isinstance(one, Time):
+                    # What is under way fits into the buffers of the two sockets.
+                    assert one.time < BEGIN + (len(found) + 24) * S // 10
+                elif isinstance(one, Data):
+                    found.append(one.payload[0])
+            assert found == list(range(count))
+
+
+def test_recordings_follow_one_another_at_once(store: hl.Store, logs: Path) -> None:
+    log = PlayedLog(store.topic("/n", "/map"))
+    assert (log.begin, log.end) == (BEGIN, LATER + 2_990_000_000)
+    wanted = [m for n in ("one", "two") for m in read_mcap(logs / f"{n}.mcap")]
+    with served(log) as url, Viewer(url) as viewer:
+        viewer.subscribe()
+        found = viewer.until_end()
+        assert [Seen(*m) for m in found] == [m for m in wanted if m.topic in {"/n", "/map"}]
+        # Between them, the first one is over: nothing of it is in force any more.
+        viewer.control(plays=False, seek=BEGIN + 1800 * S)
+        assert data(viewer.quiet()) != []
+
+
+def test_range_and_predicate(store: hl.Store, seen: list[Seen]) -> None:
+    query = store.topic("/n", "/map").in_recording("one").between("+1s", "+2s")
+    log = PlayedLog(query)
+    assert (log.begin, log.end) == (BEGIN + S, BEGIN + 2 * S - 1)
+    with served(log) as url, Viewer(url) as viewer:
+        viewer.subscribe()
+        found = viewer.until_end()
+    # The map is latched, so it is in force; the last /n from before is not.
+    wanted = [m for m in seen if m.topic == "/n" and BEGIN + S <= m.log_time < BEGIN + 2 * S]
+    assert [Seen(*m) for m in found] == [seen[0], *wanted]
+    odd = PlayedLog(store.topic("/n").in_recording("one").where("n >= 290"))
+    with served(odd) as url, Viewer(url) as viewer:
+        viewer.subscribe()
+        assert [json.loads(m.payload)["n"] for m in viewer.until_end()] == [*range(290, 300)]
+    with pytest.raises(TimeError, match="Nothing was recorded"):
+        PlayedLog(store.topic("/n").between("1999-01-01", "1999-01-02"))
+
+
+def test_it_begins_again_at_the_end(one: PlayedLog, seen: list[Seen]) -> None:
+    with served(one, loops=True) as url, Viewer(url) as viewer:
+        viewer.subscribe("/n", "/map")
+        found: list[Data] = []
+        while len(found) < 500:
+            if isinstance(each := viewer.read(), Data):
+                found.append(each)
+            elif isinstance(each, State):
+                assert each.status == "playing"
+    wanted = [m for m in seen if m.topic in {"/n", "/map"}]
+    assert [Seen(*m) for m in found] == [*wanted, *wanted][:500]
+
+
+def test_the_last_viewer_that_leaves_rewinds(one: PlayedLog, seen: list[Seen]) -> None:
+    with served(one) as url:
+        for _ in range(2):
+            with Viewer(url) as viewer:
+                assert viewer.first_state is not None
+                assert viewer.first_state.time == BEGIN
+                viewer.subscribe()
+                assert len(viewer.until_end()) == len(seen)
+
+
+def test_the_older_protocol_has_no_playback_control(one: PlayedLog, seen: list[Seen]) -> None:
+    """Its clients take a message that they do not know for an error, so none is sent."""
+    with served(one) as url, Viewer(url, protocols=[WEBSOCKET]) as viewer:
+        assert viewer.connection.subprotocol == WEBSOCKET
+        viewer.subscribe()
+        found = viewer.quiet(0.5)
+    assert len(data(found)) == len(seen)
+    assert {type(each) for each in found} == {Data, Time}
+
+
+def test_publishers(one: PlayedLog) -> None:
+    with served(one) as url, Viewer(url) as viewer:
+        viewer.connection.send('{"op": "subscribeConnectionGraph"}')
+        graph = viewer.text("connectionGraphUpdate")
+        viewer.connection.send('{"op": "unsubscribeConnectionGraph"}')
+    assert graph["publishedTopics"] == [
+        {"name": "/map", "publisherIds": ["/server"]},
+        {"name": "/tf", "publisherIds": ["/a", "/b"]},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "is_welcome"),
+    [
+        (None, None, True),
+        ("https://app.foxglove.dev", None, True),
+        ("http://localhost:8080", "localhost", True),
+        ("http://127.0.0.1:1", None, True),
+        ("file://", None, True),
+        ("https://viewer.example", None, True),
+        ("https://evil.example", None, False),
+        ("https://foxglove.dev.evil.example", None, False),
+        ("http://app.foxglove.dev", None, False),
+        ("https://evilfoxglove.dev", None, False),
+        ("http://localhost.evil.example", None, False),
+        ("http://[", None, False),
+        ("null", None, False),
+        ("", None, False),
+        (None, "evil.example", False),
+    ],
+)
+def test_web_pages(origin: str | None, host: str | None, is_welcome: bool, one: PlayedLog) -> None:
+    said: list[str] = []
+    with served(one, said, origins=("https://viewer.example",)) as url:
+        if is_welcome:
+            with Viewer(url, origin=origin, host=host):
+                pass
+        else:
+            with pytest.raises(InvalidStatus) as refused:
+                Viewer(url, origin=origin, host=host)
+            assert refused.value.response.status_code == 403
+    assert len(said) == (origin is not None and not is_welcome)
+
+
+def test_a_client_has_to_speak_the_protocol(one: PlayedLog) -> None:
+    with served(one) as url, pytest.raises(InvalidStatus, match="400"):
+        Viewer(url, protocols=[])
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        "",
+        "[]",
+        "[" * 100_000,
+        '{"op": "advertise", "channels": []}',
+        '{"op": "subscribe"}',
+        '{"op": "subscribe", "subscriptions": [7]}',
+        '{"op": "subscribe", "subscriptions": [{"id": true, "channelId": 1}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 4294967296}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 99}]}',
+        '{"op": "unsubscribe", "subscriptionIds": ["1"]}',
+        b"",
+        b"\x01\x00\x00\x00\x00",
+        b"\x03\x00",
+        b"\x03\x07" + bytes(17),
+        b"\x03\x00" + bytes(13) + b"\xff\xff\xff\xff",
+    ],
+)
+def test_requests_that_are_none_are_answered(request_: str | bytes, one: PlayedLog) -> None:
+    with served(one) as url, Viewer(url) as viewer:
+        viewer.connection.send(request_)
+        assert viewer.text("status")["level"] == 2
+        viewer.subscribe("/proto")
+        assert len(viewer.until_end()) == 3
+
+
+def test_a_damaged_log_is_said(store: hl.Store, tmp_path: Path) -> None:
+    copied = tmp_path / "store"
+    shutil.copytree(store.directory.path, copied, ignore=shutil.ignore_patterns("mongod*"))
+    (segment,) = copied.glob("recordings/one/*.mcap")
+    said: list[str] = []
+    with hl.open(copied) as opened:
+        log = PlayedLog(opened.topic("/n").in_recording("one"))
+        content = bytearray(segment.read_bytes())
+        begin, end = len(content) // 10, len(content) // 2
+        content[begin:end] = bytes(end - begin)
+        segment.write_bytes(content)
+        with served(log, said) as url, Viewer(url) as viewer:
+            viewer.subscribe()
+            error = None
+            while error is None:
+                one = viewer.read()
+                error = one if isinstance(one, dict) else None
+            assert error["level"] == 2
+            assert viewer.until(State).status == "paused"
+            assert said == [error["message"]]
+            viewer.control(plays=True)
+            assert viewer.text("status")["level"] == 2, "playing on meets the damage again"
+
+
+def test_a_port_that_is_taken(one: PlayedLog) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(UsageError, match="--port"), served(one, port=port):
+            pass
+
+
+def test_the_clock() -> None:
+    now = [0]
+    clock = PlaybackClock(1000, 2.0, lambda: now[0])
+    now[0] = 50
+    assert clock.position == 1000
+    clock.play()
+    now[0] = 150
+    assert clock.position == 1200
+    assert clock.seconds_until(1400) == 100e-9
+    assert clock.seconds_until(0) == 0
+    clock.wait_for(1100, 50e-9)
+    assert clock.position == 1200, "it is not too far ahead"
+    clock.wait_for(1050, 50e-9)
+    assert clock.position == 1050
+    clock.set_speed(0.5)
+    now[0] = 250
+    assert clock.position == 1100
+    clock.pause()
+    now[0] = 999
+    assert clock.position == 1100
+    clock.wait_for(0, 0)
+    assert clock.position == 1100, "a clock that stands still waits for nobody"
