@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.cli.output import note, say
 from hybridlog.cli.sql_answer import print_remarks, write_answer
 from hybridlog.consent import state_directory
-from hybridlog.sql.completion import candidates
+from hybridlog.sql.completion import DELIMITERS, candidates
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import at_safe_points
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 _PROMPT: Final = "sql> "
 _MORE: Final = "...> "
 _ENDS: Final = frozenset({"exit", "quit", ".exit", ".quit", "\\q"})
-_DELIMITERS: Final = " \t\n,;()[]<>=!+-*/'"
 _HISTORY: Final = "sql_history"
 _MAX_HISTORY: Final = 1000
 
@@ -138,7 +137,7 @@ def _line_editing(completer: Completer) -> Iterator[None]:
         if path.exists():
             readline.read_history_file(path)
     readline.set_history_length(_MAX_HISTORY)
-    readline.set_completer_delims(_DELIMITERS)
+    readline.set_completer_delims(DELIMITERS)
     readline.set_completer(completer)
     readline.parse_and_bind("tab: complete")
     try:

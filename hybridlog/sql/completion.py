@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlConnection
 
+DELIMITERS: Final = " \t\n,;()[]<>=!+-*/'"
+"""Characters between words."""
 _PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _WORDS: Final = (
     "as",
@@ -42,6 +44,11 @@ _WORDS: Final = (
     "where",
     "with",
 )
+
+
+def word_before(text: str) -> str:
+    """The word at the end of a text."""
+    return text[max(text.rfind(mark) for mark in DELIMITERS) + 1 :]
 
 
 def candidates(connection: SqlConnection, line: str, text: str) -> list[str]:

@@ -17,7 +17,7 @@ from hybridlog.view.guard import Guard
 if TYPE_CHECKING:
     from hybridlog.store import Store
 
-ROUTES: Final = ("recordings",)
+ROUTES: Final = ("ask", "export", "recordings")
 """The modules of `routes/`."""
 
 _STATIC: Final = Path(__file__).parent / "static"

@@ -1,0 +1,160 @@
+"""A question that the page asks: its query, and the same as a command line and as Python."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from hybridlog.choice import Choice
+from hybridlog.query.predicate.across import Near, names_topics, parse_across
+from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.times import format_time
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import Span
+    from hybridlog.store import Store
+    from hybridlog.view.asked import Asked
+    from hybridlog.view.context import Context
+    from hybridlog_storage.catalog import RecordingEntry
+
+_EVERY_TOPIC: Final = "**"
+_NO_NAME: Final = re.compile(r"[^\w.+-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class PageQuestion:
+    """A question about one recording.
+
+    Attributes:
+        store: The store.
+        recording: The recording.
+        topics: Full names; none for all.
+        where: Predicate, empty for every message.
+        within: Greatest distance in time of messages of other topics, empty without any.
+        span: Log time `[begin, end)`, ns; None for all of it.
+    """
+
+    store: Store
+    recording: RecordingEntry
+    topics: tuple[str, ...]
+    where: str
+    within: str
+    span: Span | None
+
+    def query(self) -> Query:
+        """Its messages.
+
+        Raises:
+            WhereError: The predicate cannot be parsed, or does not fit the fields.
+            UsageError: `within` is missing or in vain.
+            TimeError: The range is empty or outside of the recording.
+        """
+        query = self.store.query(self._topics(), [self.recording.id])
+        if self.span is not None:
+            # First, so that conditions on other topics are asked in this range only.
+            query = query.between(*self.span)
+        if self.where:
+            query = query.where(self.where, self.within or None)
+        return query
+
+    def around(self, distance: str) -> PageQuestion:
+        """The messages of all topics near the matches in time.
+
+        Args:
+            distance: Greatest distance, a duration.
+
+        Raises:
+            UsageError: The predicate has conditions on other topics already, or there is none.
+        """
+        if not self.where or names_topics(self.where):
+            raise UsageError(
+                "Messages around matches need a predicate on one topic: without other topics."
+            )
+        (topic,) = self.topics
+        where = f"{topic}: ({self.where})"
+        condition = parse_across(where)
+        if not isinstance(condition, Near) or condition.topic != topic:
+            raise UsageError(f"The name {topic!r} cannot stand in a predicate.")
+        return PageQuestion(self.store, self.recording, (), where, distance, self.span)
+
+    def command(self) -> str:
+        """The command line that writes it to a file of `file_name`."""
+        words = ["hybridlog", "fetch", "--store", str(self.store.directory.path)]
+        words += ["-r", self._name()]
+        for topic in self.topics or [_EVERY_TOPIC]:
+            words += ["-t", topic]
+        if self.span is not None:
+            words += ["--between", *map(format_time, self.span)]
+        if self.where:
+            words += ["--where", self.where]
+        if self.within:
+            words += ["--within", self.within]
+        return shlex.join([*words, "-o", self.file_name()])
+
+    def python(self) -> str:
+        """A program that asks the same."""
+        steps = [f"store.query({list(self._topics())!r}, [{self._name()!r}])"]
+        if self.span is not None:
+            steps.append(f".between({self.span[0]}, {self.span[1]})")
+        if self.where:
+            within = f", within={self.within!r}" if self.within else ""
+            steps.append(f".where({self.where!r}{within})")
+        lines = "".join(f"\n        {step}" for step in steps)
+        body = (
+            f"    messages = ({lines}\n    )\n"
+            "    print(messages.count())\n"
+            "    for message in messages.limit(10):\n"
+            "        print(message.log_time_ns, message.topic)\n"
+        )
+        return program(self.store, body)
+
+    def file_name(self) -> str:
+        """The name of its file: recording and range."""
+        begin, end = self._extent() if self.span is None else self.span
+        times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
+        return f"{_NO_NAME.sub('_', self.recording.label)}_{times}.mcap"
+
+    def _extent(self) -> Span:
+        from hybridlog.losses import extent_of
+
+        return extent_of(self.recording)
+
+    def _topics(self) -> Sequence[str]:
+        return self.topics or sorted({channel.topic for channel in self.recording.channels})
+
+    def _name(self) -> str:
+        """The recording's label; its id, if that means several recordings."""
+        label, own = self.recording.label, self.recording.id
+        found = [one.id for one in self.store.choose(Choice.of([label])).summaries]
+        return label if found == [own] else own
+
+
+def question_of(context: Context, asked: Asked) -> PageQuestion:
+    """The question of a request about one topic.
+
+    Args:
+        context: The context.
+        asked: Has `recording`, `topic`, `where` and `within`.
+
+    Raises:
+        TopicError: There is no such recording or topic.
+        UsageError: A parameter is missing or too long.
+    """
+    recording = context.recording(asked)
+    topic = asked.text("topic")
+    context.query(recording, topic)
+    where = asked.text("where", "", longest=MAX_TEXT).strip()
+    return PageQuestion(
+        context.store, recording, (topic,), where, asked.text("within", "", longest=64), None
+    )
+
+
+def program(store: Store, body: str) -> str:
+    """A program that opens a store; `body` is indented."""
+    path = str(store.directory.path)
+    return f"import hybridlog as hl\n\nwith hl.open({path!r}) as store:\n{body}"

@@ -1,0 +1,111 @@
+"""Parts of a recording as files, and the command lines that write the same."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
+
+from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.view.context import Context, route, start_of
+from hybridlog.view.question import PageQuestion
+from hybridlog.view.stopping import Pieces, file_response
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from starlette.responses import Response
+
+    from hybridlog.query.query import Query
+    from hybridlog.view.asked import Asked
+    from hybridlog_storage.messages import Buffer
+
+MAX_TOPICS: Final = 200
+"""Greatest number of topics that are named; without any, all are meant."""
+PIECE: Final = 256 << 10
+"""Least size of a piece that is sent, bytes."""
+
+
+def command(context: Context, asked: Asked) -> dict[str, Any]:
+    """The command line that writes a part of a recording, and how many messages it has."""
+    question = _question(context, asked)
+    query = question.query()
+    count = query.count()
+    lost = query.lost()
+    return {
+        "command": question.command(),
+        "python": question.python(),
+        "name": question.file_name(),
+        "told": lost.describe(count) if lost else str(count),
+    }
+
+
+def file(context: Context, asked: Asked) -> Response:
+    """A part of a recording as an MCAP file."""
+    question = _question(context, asked)
+    pieces = pieces_of(question.query())
+    # Most errors come before the first piece, and can still be told.
+    return file_response(_with(next(pieces), pieces), question.file_name())
+
+
+def _with(first: bytes, rest: Pieces) -> Pieces:
+    try:
+        yield first
+        yield from rest
+    finally:
+        rest.close()
+
+
+def _question(context: Context, asked: Asked) -> PageQuestion:
+    recording = context.recording(asked)
+    topics = tuple(dict.fromkeys(asked.texts("topic", most=MAX_TOPICS)))
+    context.query(recording, *topics)
+    span = None
+    if asked.has("begin") or asked.has("end"):
+        start = start_of(recording)
+        begin, end = asked.offset("begin"), asked.offset("end")
+        if end <= begin:
+            raise UsageError("end is greater than begin.")
+        span = max(start + begin, 0), max(start + end, 1)
+    where = asked.text("where", "", longest=MAX_TEXT).strip()
+    within = asked.text("within", "", longest=64)
+    question = PageQuestion(context.store, recording, topics, where, within, span)
+    return question.around(asked.text("around", longest=64)) if asked.has("around") else question
+
+
+class _Pieces:
+    """Bytes that were written and not taken yet."""
+
+    def __init__(self) -> None:
+        self._held: list[bytes] = []
+        self.size = 0
+
+    def write(self, data: Buffer) -> int:
+        """Hold a copy of bytes."""
+        self._held.append(bytes(data))
+        self.size += len(self._held[-1])
+        return len(self._held[-1])
+
+    def flush(self) -> None:
+        """Do nothing."""
+
+    def take(self) -> bytes:
+        """The bytes, which are no longer held."""
+        taken = b"".join(self._held)
+        self._held.clear()
+        self.size = 0
+        return taken
+
+
+def pieces_of(query: Query) -> Pieces:
+    """An MCAP file in pieces; a piece is made when it is asked for."""
+    from hybridlog.export.mcap import McapWriter
+    from hybridlog.export.slices import IN_FORCE, batches_of, profile_of
+
+    written = _Pieces()
+    with McapWriter(cast("BinaryIO", written), profile=profile_of(query)) as writer:
+        for batch, channels in batches_of(query, IN_FORCE):
+            writer.write(batch, channels)
+            if written.size >= PIECE:
+                yield written.take()
+    yield written.take()
+
+
+routes = [route("/export-command", command), route("/export", file)]

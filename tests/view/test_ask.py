@@ -1,0 +1,294 @@
+"""Questions over HTTP: predicates, SQL, completion, files."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlencode
+
+import pytest
+from click.testing import CliRunner
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog.cli import fetch
+from hybridlog.view.app import make_app
+from hybridlog.view.routes import ask, export
+
+from .conftest import PORT, TOKEN
+
+if TYPE_CHECKING:
+    from starlette.testclient import TestClient
+
+NEAR = {"recording": "robot", "topic": "/base/scan", "where": "ranges.min < 0.8"}
+BOTH = {**NEAR, "where": "ranges.min < 0.8 and /odom: twist.twist.linear.x > 0.3", "within": "50ms"}
+ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
+S = 10**9
+
+
+def start_of(store: hl.Store) -> int:
+    (entry,) = store.recordings()
+    assert entry.span is not None
+    return entry.span[0]
+
+
+def times(query: hl.Query) -> list[int]:
+    return [message.log_time_ns for message in query]
+
+
+def near(store: hl.Store) -> hl.Query:
+    return store.topic("/base/scan").where(NEAR["where"])
+
+
+def run_program(text: str) -> list[str]:
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        exec(compile(text, "copied", "exec"), {"__name__": "copied"})
+    return said.getvalue().splitlines()
+
+
+def test_a_predicate_is_counted(client: TestClient, demo_store: hl.Store) -> None:
+    answer = client.get("ask", params=NEAR).json()
+    want = near(demo_store).count()
+    assert want > 20
+    assert (answer["count"], answer["told"], answer["remarks"]) == (want, str(want), [])
+    assert run_program(answer["python"])[0] == str(want)
+    both = client.get("ask", params=BOTH).json()
+    want = demo_store.topic("scan").where(BOTH["where"], within="50ms").count()
+    assert both["count"] == want > 0
+    assert run_program(both["python"])[0] == str(want)
+
+
+def test_matches_by_pixel(client: TestClient, demo_store: hl.Store) -> None:
+    start = start_of(demo_store)
+    asked = {**NEAR, "begin": 2 * S, "end": 19 * S, "pixels": 400}
+    answer = client.get("matches", params=asked).json()
+    seen = [t - start for t in times(near(demo_store)) if 2 * S <= t - start < 19 * S]
+    assert (sum(answer["counts"]), answer["first"][0]) == (len(seen), seen[0])
+    assert answer["pixels"] == sorted({(t - 2 * S) // answer["width"] for t in seen})
+    held = near(demo_store).between(start + 2 * S, start + 19 * S).intervals()
+    assert answer["bands"] == [[i.begin_ns - start, i.end_ns - start] for i in held]
+    none = client.get("matches", params={**asked, "begin": 100 * S, "end": 101 * S}).json()
+    assert none["counts"] == none["bands"] == []
+
+
+def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store) -> None:
+    start = start_of(demo_store)
+    want = [t - start for t in times(near(demo_store))]
+    page = client.get("match-list", params={**NEAR, "at": 0, "count": 5}).json()
+    assert ([at for at, _ in page["rows"]], page["before"]) == (want[:5], 0)
+    at, seq = page["rows"][-1]
+    page = client.get("match-list", params={**NEAR, "at": at, "seq": seq, "count": 3}).json()
+    assert ([at for at, _ in page["rows"]], page["before"]) == (want[5:8], 5)
+    asked = {**NEAR, "at": want[5], "count": 2, "direction": "earlier"}
+    page = client.get("match-list", params=asked).json()
+    assert ([at for at, _ in page["rows"]], page["before"]) == (want[3:5], 3)
+    page = client.get("match-list", params={**NEAR, "at": 100 * S}).json()
+    assert page == {"rows": [], "before": None}
+
+
+@pytest.mark.parametrize(
+    ("path", "changes", "problem"),
+    [
+        (
+            "ask",
+            {"where": "ranges.min <"},
+            "expected a value here\n  ranges.min <\n              ^",
+        ),
+        ("ask", {"where": "ranges.minn < 1"}, "ranges.min"),
+        ("ask", {"where": "(" * 60 + "range_max > 1" + ")" * 60}, "nested deeper than 50"),
+        ("ask", {"where": "x" * 20_000}, "too long"),
+        ("ask", {"where": f'header.frame_id ~ "{"a" * 2000}"'}, "1000"),
+        ("ask", {"where": 'header.frame_id ~ "((a{99}){99}){99}"'}, "pattern"),
+        ("ask", {"where": "/odom: twist.twist.linear.x > 1"}, "0.1s"),
+        ("ask", {"topic": "scan"}, "no topic 'scan'"),
+        ("ask", {"topic": "/<img>"}, "no topic"),
+        ("matches", {"begin": 0, "end": 9, "pixels": 10**6}, "pixels"),
+        ("matches", {"begin": 9, "end": 9, "pixels": 10}, "greater"),
+        ("match-list", {"at": 0, "count": 201}, "count"),
+        ("match-list", {"at": 0, "direction": "up"}, "direction"),
+        ("complete", {"text": "x" * 10_001, "place": 1}, "too long"),
+        ("sql", {"text": "select 1; drop table x"}, "Only queries"),
+        ("sql", {"text": "selec 1"}, "LINE 1"),
+        ("sql", {"text": "select * from '/etc/passwd'"}, "no view"),
+        ("sql", {"text": "select * from read_text('/etc/passwd')"}, "files"),
+        ("sql", {"text": "copy (select 1) to '/tmp/x'"}, "Only queries"),
+        ("sql", {"text": "set memory_limit='9GB'"}, "Only queries"),
+        ("sql", {"text": "select " + "(" * 3000 + "1" + ")" * 3000}, ""),
+        ("export", {"begin": 5, "end": 5}, "greater"),
+        ("export", {"begin": 100 * S, "end": 101 * S}, "Nothing was recorded"),
+        ("export", {"topic": ["/odom"] * 201}, "201"),
+        ("export-command", {"around": "2s", **BOTH}, "without other topics"),
+        ("export-command", {"around": "much"}, "duration"),
+    ],
+)
+def test_what_is_refused(
+    client: TestClient, path: str, changes: dict[str, Any], problem: str
+) -> None:
+    answer = client.get(path, params={**NEAR, **changes})
+    assert answer.status_code in {400, 404}
+    assert problem in answer.json()["error"]
+
+
+def test_completion(client: TestClient) -> None:
+    def offered(text: str, **others: str) -> list[str]:
+        asked = {**NEAR, "text": text, "place": len(text), **others}
+        answer = client.get("complete", params=asked).json()
+        return [text[: answer["begin"]] + one for one, _, _ in answer["candidates"]]
+
+    assert offered("ranges.mi") == ["ranges.min"]
+    assert offered("ranges.min < 1 and /od") == ["ranges.min < 1 and /odom: "]
+    assert offered("/odom: twist.twist.linear.x") == ["/odom: twist.twist.linear.x"]
+    assert offered("odom: twist.twist.linear.x") == ["odom: twist.twist.linear.x"]
+    assert offered("/nothing: x") == []
+    assert offered("select nearest from sca", language="sql") == ["select nearest from scan"]
+
+
+def test_sql_gives_rows_that_lead_to_their_time(client: TestClient, demo_store: hl.Store) -> None:
+    text = "select t, recording, ranges_summary.min as near from scan where near < 0.8 order by t"
+    answer = client.get("sql", params={"text": text}).json()
+    want = times(near(demo_store))
+    assert [int(time) for time in answer["times"]] == want
+    assert set(answer["recordings"]) == {"robot"}
+    assert answer["columns"] == [["t", True], ["recording", False], ["near", True]]
+    assert [row[0] for row in answer["rows"]] == [str(time) for time in want]
+    assert (answer["more"], answer["remarks"], answer["columns_left_out"]) == (False, [], 0)
+    assert str(len(want)) in run_program(answer["python"])[-1]
+    by_log_time = text.replace("select t,", "select log_time,")
+    answer = client.get("sql", params={"text": by_log_time}).json()
+    assert [int(time) // 1000 for time in answer["times"]] == [time // 1000 for time in want]
+
+
+def test_sql_is_bounded(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = client.get("sql", params={"text": "select range from range(100000)"}).json()
+    assert (len(answer["rows"]), answer["more"], answer["times"]) == (ask.SQL_ROWS, True, [])
+    wide = "select " + ", ".join(f"{n} as c{n}" for n in range(300))
+    answer = client.get("sql", params={"text": wide}).json()
+    assert (len(answer["columns"]), answer["columns_left_out"]) == (200, 100)
+    monkeypatch.setattr(ask, "SQL_SECONDS", 0.2)
+    answer = client.get("sql", params={"text": ENDLESS})
+    assert "stopped after 0.2 s" in answer.json()["error"]
+
+
+async def asked_for(
+    app: Any, path: str, params: dict[str, Any], *, leaves_after: float
+) -> list[dict[str, Any]]:
+    """What the application says to a client that leaves, after seconds or a number of parts."""
+    scope = {
+        "type": "http",
+        "method": "GET",
+        "path": f"/{TOKEN}/{path}",
+        "query_string": urlencode(params).encode(),
+        "headers": [(b"host", f"127.0.0.1:{PORT}".encode())],
+    }
+    said: list[dict[str, Any]] = []
+    heard = asyncio.Event()
+
+    async def receive() -> dict[str, Any]:
+        if isinstance(leaves_after, float):
+            await asyncio.sleep(leaves_after)
+        else:
+            await heard.wait()
+        return {"type": "http.disconnect"}
+
+    async def send(message: Any) -> None:
+        said.append(message)
+        if len(said) == leaves_after:
+            heard.set()
+
+    await asyncio.wait_for(app(scope, receive, send), 30)
+    return said
+
+
+def test_sql_stops_when_the_client_goes(demo_store: hl.Store) -> None:
+    """The server's answer ends although the query would not, and the next one is answered."""
+    app = make_app(demo_store, TOKEN, PORT)
+    for _ in range(3):  # more than are answered at once
+        said = asyncio.run(asked_for(app, "sql", {"text": ENDLESS}, leaves_after=0.1))
+        assert b"The query was stopped" in said[1]["body"]
+    said = asyncio.run(asked_for(app, "sql", {"text": "select 1 as one"}, leaves_after=9.0))
+    assert json.loads(said[1]["body"])["rows"] == [["1"]]
+
+
+@pytest.fixture
+def chunked(tmp_path: Path) -> Iterator[hl.Store]:
+    """A store with a recording of many chunks."""
+    with (tmp_path / "large.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/large", "raw", 0)
+        for n in range(60):
+            writer.add_message(channel, n * S, bytes(500_000), n * S)
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(tmp_path / "large.mcap")
+        yield store
+
+
+def test_a_file_is_made_while_it_is_sent(
+    chunked: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "PIECE", 1)
+    made: list[int] = []
+    ended: list[bool] = []
+    pieces_of = export.pieces_of
+
+    def counted(query: hl.Query) -> Iterator[bytes]:
+        try:
+            for piece in pieces_of(query):
+                made.append(len(piece))
+                yield piece
+        finally:
+            ended.append(True)
+
+    monkeypatch.setattr(export, "pieces_of", counted)
+    app = make_app(chunked, TOKEN, PORT)
+    asked = {"recording": "large"}
+    said = asyncio.run(asked_for(app, "export", asked, leaves_after=9.0))
+    whole = len(made)
+    assert sum(made) == sum(len(message.get("body", b"")) for message in said)
+    made.clear()
+    asyncio.run(asked_for(app, "export", asked, leaves_after=2))
+    assert 1 <= len(made) <= 4 < whole
+    assert ended == [True, True]
+
+
+EXPORTS: list[dict[str, Any]] = [
+    {"begin": 5 * S, "end": 6 * S + 1},
+    {"topic": ["/odom", "/base/scan"], "begin": 5 * S, "end": 6 * S},
+    {"topic": "/base/scan", "where": NEAR["where"]},
+    {"topic": "/base/scan", "where": BOTH["where"], "within": "50ms", "begin": 0, "end": 18 * S},
+    {
+        "topic": "/base/scan",
+        "where": f"{NEAR['where']} and header.frame_id != 'a\"b'",
+        "around": "50ms",
+    },
+]
+
+
+@pytest.mark.parametrize("asked", EXPORTS)
+def test_the_command_line_writes_the_same_file(
+    client: TestClient,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    asked: dict[str, Any],
+) -> None:
+    params = {"recording": "robot", **asked}
+    told = client.get("export-command", params=params).json()
+    sent = client.get("export", params=params)
+    assert sent.headers["content-disposition"] == f'attachment; filename="{told["name"]}"'
+    assert told["name"].startswith("robot_")
+    words = shlex.split(told["command"])
+    assert words[:2] == ["hybridlog", "fetch"]
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(fetch.command, words[2:], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / told["name"]).read_bytes() == sent.content
+    assert int(told["told"]) > 0
+    assert run_program(told["python"])[0] == told["told"]
