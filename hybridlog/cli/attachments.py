@@ -63,7 +63,7 @@ def command(
         elif name is None or len(found) > 1 or target.is_dir():
             _write_all(found, target, force=force, quiet=quiet)
         else:
-            check_room(target, form="", force=force)
+            check_room(target, force=force)
             _write(found[0], target, quiet=quiet)
 
 
@@ -135,7 +135,7 @@ def _write_all(found: list[StoredAttachment], directory: Path, *, force: bool, q
 
     paths = [directory / name for name in file_names(found)]
     for path in paths:
-        check_room(path, form="", force=force)
+        check_room(path, force=force)
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:

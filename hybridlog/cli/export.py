@@ -79,7 +79,7 @@ def command(
     if tags is not None and form in _EXACT:
         raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
     if form in _EXACT:
-        check_room(target, form=form, force=force)
+        check_room(target, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = query_of(opened, topic, choice)
         if not query.topics:
@@ -123,7 +123,7 @@ def _write_file(
 ) -> None:
     with (
         if_stopped(partial(not_written, target)),
-        replacing(target, form=form, force=force),
+        replacing(target, force=force),
     ):
         write_answer(query, form, target, front=front, extras=extras, quiet=quiet)
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
@@ -155,7 +155,7 @@ def _remove_empty(directory: Path) -> None:
 def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
     for path in paths.values():
-        check_room(path, form=form, force=force)
+        check_room(path, force=force)
     left_out: list[HybridlogError] = []
     for topic, path in paths.items():
         one = query.with_topic(topic)

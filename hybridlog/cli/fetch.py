@@ -25,6 +25,7 @@ from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import write_answer
+from hybridlog.export import PICTURES
 from hybridlog.export.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
-_FORMATS = ("table", "jsonl", "csv", "parquet", "arrow", "npz", "mcap", "bag", "raw")
+_FORMATS = ("table", "jsonl", "csv", "parquet", "arrow", "npz", "mcap", "bag", "raw", "png", "jpg")
 _SUFFIXES = {
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
@@ -44,9 +45,12 @@ _SUFFIXES = {
     ".npz": "npz",
     ".mcap": "mcap",
     ".bag": "bag",
+    ".png": "png",
+    ".jpg": "jpg",
+    ".jpeg": "jpg",
 }
 _TEXT = {"jsonl", "csv"}
-_EXACT = {"mcap", "bag", "raw"}
+_WITHOUT_COLUMNS = {"mcap", "bag", "raw", *PICTURES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +133,8 @@ class _Choices:
     "-o",
     type=options.PATH,
     metavar="FILE",
-    help="Write to this file (raw: a directory); - is standard output.",
+    help="Write to this file (raw: a directory; png and jpg: a directory, or one picture); - is "
+    "standard output.",
 )
 @options.no_latched
 @options.original_times
@@ -193,7 +198,7 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
     else:
         with (
             if_stopped(partial(not_written, path)),
-            replacing(path, form=form, force=choices.force),
+            replacing(path, force=choices.force, is_directory=_is_directory(path, form)),
         ):
             missing = write_answer(query, form, path, front=front, quiet=choices.quiet)
     print_unreadable(missing)
@@ -244,7 +249,7 @@ def _form(choices: _Choices) -> str:
     options.check_latched(
         no_latched=choices.no_latched, original_times=choices.original_times, form=form
     )
-    if choices.tags is not None and form in _EXACT:
+    if choices.tags is not None and form in _WITHOUT_COLUMNS:
         raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
     if form == "table" and choices.output is not None:
         raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
@@ -303,7 +308,18 @@ def _path(choices: _Choices, form: str) -> Path | None:
         return None
     if choices.output is None or str(choices.output) == "-":
         if form not in {*_TEXT, "table"} and sys.stdout.isatty():
-            raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
+            what = "a directory" if form in PICTURES else "a file"
+            raise UsageError(f"{form} is no text for a terminal: name {what} with -o.")
         return None
-    check_room(choices.output, form=form, force=choices.force)
+    is_directory = _is_directory(choices.output, form)
+    check_room(choices.output, force=choices.force, is_directory=is_directory)
     return choices.output
+
+
+def _is_directory(path: Path, form: str) -> bool:
+    """True if the output is a directory with a file a message."""
+    if form not in PICTURES:
+        return form == "raw"
+    from hybridlog.export.pictures import suffix_of
+
+    return suffix_of(path) is None

@@ -12,8 +12,13 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.unfinished import is_published, undone
 
 
-def check_room(path: Path, *, form: str, force: bool) -> None:
+def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
     """Refuse to overwrite without --force, and foreign directories even with it.
+
+    Args:
+        path: The output.
+        force: --force was given.
+        is_directory: It is to be a directory with a file a message.
 
     Raises:
         UsageError: The path cannot be written.
@@ -21,21 +26,21 @@ def check_room(path: Path, *, form: str, force: bool) -> None:
     if not os.path.lexists(path) or _is_device(path):
         return
     if path.is_dir():
-        if form != "raw":
+        if not is_directory:
             raise UsageError(f"{path} is a directory; name a file in it.")
         inside = next(path.iterdir(), None)
         if inside is None:
             return
-        if not _holds_payloads(path):
+        if not _holds_messages(path):
             raise UsageError(f"{path} is a directory that holds other things; name a new one.")
-    elif form == "raw":
-        raise UsageError(f"{path} is a file; payloads go into a directory.")
+    elif is_directory:
+        raise UsageError(f"{path} is a file; messages go into a directory.")
     if not force:
         raise UsageError(f"{path} exists; --force overwrites it.")
 
 
 @contextmanager
-def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
+def replacing(path: Path, *, force: bool, is_directory: bool = False) -> Iterator[None]:
     """Move a directory aside while a new one is written; it comes back when the block fails.
 
     Files are replaced by their writers in one step.
@@ -43,7 +48,7 @@ def replacing(path: Path, *, form: str, force: bool) -> Iterator[None]:
     Raises:
         UsageError: The path cannot be written.
     """
-    check_room(path, form=form, force=force)
+    check_room(path, force=force, is_directory=is_directory)
     if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
         yield
         return
@@ -71,11 +76,11 @@ def not_written(path: Path) -> str:
     return "" if is_published(path) else f"{path} is not written."
 
 
-def _holds_payloads(path: Path) -> bool:
-    from hybridlog.export.raw import holds_payloads
+def _holds_messages(path: Path) -> bool:
+    from hybridlog.export.raw import holds_messages
 
     try:
-        return holds_payloads(path)
+        return holds_messages(path)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
 

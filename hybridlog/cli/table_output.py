@@ -104,7 +104,7 @@ class TableChoices:
         elif form == "table":
             raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
         else:
-            check_room(path, form=form, force=self.force)
+            check_room(path, force=self.force)
         return TableChoices(form=form, output=path, force=self.force, limit=self.limit)
 
 
@@ -129,7 +129,7 @@ def write_tables(
         return _write(limited, schema, form, sys.stdout.buffer)
     with (
         if_stopped(partial(not_written, choices.output)),
-        replacing(choices.output, form=form, force=choices.force),
+        replacing(choices.output, force=choices.force),
     ):
         return _write(limited, schema, form, choices.output)
 

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 from hybridlog.cli import output
 from hybridlog.cli.progress import progress_bar
 from hybridlog.export.slices import IN_FORCE, Front, batches_of, profile_of
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import (
+    DefinitionError,
+    HybridlogError,
+    PayloadError,
+    SegmentError,
+    UsageError,
+)
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
@@ -31,7 +37,7 @@ def write_answer(
 
     Args:
         query: The query.
-        form: A format of `hybridlog.export.FORMATS`.
+        form: A format of `hybridlog.export.FORMATS` or `PICTURES`.
         target: Path or binary stream.
         front: The latched messages in front of the answer.
         extras: What an MCAP file or a bag has beside messages; None for nothing.
@@ -40,7 +46,7 @@ def write_answer(
     Returns:
         Messages that are missing, because they do not fit their definition.
     """
-    from hybridlog.export import FORMATS
+    from hybridlog.export import FORMATS, PICTURES
 
     total = 0 if quiet else query.size_hint()
     with progress_bar(form, total, quiet=quiet) as bar:
@@ -49,6 +55,9 @@ def write_answer(
         def progress() -> None:
             bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
+        if form in PICTURES:
+            _write_pictures(query, form, target, progress)
+            return 0
         if FORMATS[form].kind == "exact":
             _write_exact(query, form, target, progress, front=front, extras=extras)
             return 0
@@ -119,3 +128,43 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
     for name in json_columns(schema):
         output.note(f"{name} has values of several types: it is written as JSON text.")
     return written
+
+
+def _write_pictures(query: Query, form: str, target: Target, progress: Progress) -> None:
+    """Write the images; messages that are unreadable are left out and told.
+
+    Raises:
+        UsageError: a message is no image by its type.
+        PayloadError: no image is readable.
+        DefinitionError: the same.
+    """
+    from hybridlog.arrays import IMAGES
+    from hybridlog.drawing.images import picture
+    from hybridlog.export.pictures import open_pictures_writer
+
+    written = left_out = 0
+    refused: HybridlogError | None = None
+    with open_pictures_writer(target) as images:
+        for message in query:
+            if message.type.replace("/msg/", "/") not in IMAGES:
+                raise UsageError(
+                    f"{message.topic} has {message.type or 'no type'}, which is no image: {form} "
+                    "is for Image and CompressedImage, those of ROS and of Foxglove."
+                )
+            if message.is_reduced:
+                query.counters.reduced += 1
+                continue
+            try:
+                found = picture(message, form="jpg" if form == "jpg" else "png")
+            except (PayloadError, DefinitionError) as error:
+                refused = refused or error
+                left_out += 1
+                continue
+            images.write(message, found)
+            written += 1
+            progress()
+        if refused is not None and not written:
+            raise refused
+    if refused is not None:
+        are = "is" if left_out == 1 else "are"
+        output.note(f"{output.counted(left_out, 'message')} {are} left out; the first: {refused}.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from hybridlog.arrays import COMPRESSED_IMAGES, depth_picture, to_numpy
+from hybridlog.arrays import COMPRESSED_IMAGES, IMAGES, depth_picture, to_numpy
 from hybridlog.drawing.pixels import pixels, png
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 
@@ -72,14 +72,15 @@ def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] =
         DefinitionError: no usable definition exists.
         MissingDependencyError: Pillow is required and not installed.
     """
+    kind = message.type.replace("/msg/", "/")
+    if kind not in IMAGES:
+        raise PayloadError(f"{message.type} is no image; {', '.join(sorted(IMAGES))} are.")
     decoded = message.decode()
-    if message.type.replace("/msg/", "/") in COMPRESSED_IMAGES:
+    if kind in COMPRESSED_IMAGES:
         found = _as_it_came(decoded, raw=raw)
         if found is not None:
             return found
     image = to_numpy(message.type, decoded)
-    if image.dtype.names is not None:
-        raise PayloadError(f"{message.type} is no image")
     deep = raw and form == "png"
     shown = pixels(image, str(getattr(decoded, "encoding", "rgba8")), deep=deep)
     if not shown.size:

@@ -46,6 +46,8 @@ FORMATS: dict[str, Format] = {
     "raw": Format("exact", "", "a directory with one file a payload"),
 }
 """Every format by its name for `--format`."""
+PICTURES = ("png", "jpg")
+"""Formats for messages that are images: a directory with one file a message, or one file."""
 
 
 def open_batch_writer(name: str, target: Target, *, profile: str = "") -> BatchWriter:

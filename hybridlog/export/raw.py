@@ -1,4 +1,4 @@
-"""Writes unchanged payloads, one file each.
+"""Writes one file a message: unchanged payloads here, pictures in `pictures`.
 
 The directory holds `index.jsonl`, with a line for each message (file, topic, type, times,
 sequence, length). Each topic has a directory with files `<log time in ns>.bin`. A second
@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,17 +23,17 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.unfinished import beside
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.messages import Batch, Buffer, Channel
 
 INDEX = "index.jsonl"
-"""The file that describes each payload. No topic's directory has a dot."""
-
+"""The file that describes each file. No topic's directory has a dot."""
+PICTURE_SUFFIXES = (".jpg", ".png", ".webp", ".gif", ".avif", ".bmp", ".tif", ".jp2", ".jxl")
 
 _LONGEST_LINE = 1 << 20
-_PAYLOAD = re.compile(r"[0-9]+(-[0-9]+)?\.bin")
+_FILE = re.compile(rf"[0-9]+(-[0-9]+)?({'|'.join(map(re.escape, ('.bin', *PICTURE_SUFFIXES)))})")
 
 
-def holds_payloads(directory: Path) -> bool:
+def holds_messages(directory: Path) -> bool:
     """True if this module wrote a directory, and no file was added since.
 
     Raises:
@@ -47,7 +47,7 @@ def holds_payloads(directory: Path) -> bool:
             continue
         if entry.is_symlink() or not entry.is_dir():
             return False
-        if not all(_PAYLOAD.fullmatch(file.name) for file in entry.iterdir()):
+        if not all(_FILE.fullmatch(file.name) for file in entry.iterdir()):
             return False
     return True
 
@@ -69,8 +69,8 @@ def open_raw_writer(target: Target) -> BatchWriter:
     return RawStreamWriter(target)
 
 
-class RawWriter(FileWriter):
-    """Writes a directory of payload files.
+class DirectoryWriter(FileWriter):
+    """Writes a directory with a file a message.
 
     Args:
         target: The directory; it must be missing or empty.
@@ -85,7 +85,7 @@ class RawWriter(FileWriter):
         with failures(self._name):
             self._final = Path(os.path.realpath(target))
             if self._final.exists() and not self._final.is_dir():
-                raise UsageError(f"{target} is a file; payloads go into a directory")
+                raise UsageError(f"{target} is a file; messages go into a directory")
             if self._final.is_dir() and next(self._final.iterdir(), None) is not None:
                 raise UsageError(f"{target} is not empty; name a directory that does not exist")
             self._unfinished = beside(self._final)
@@ -94,44 +94,36 @@ class RawWriter(FileWriter):
             self._index = (self._temporary / INDEX).open("x", encoding="ascii")
         self._last: dict[str, tuple[int, int]] = {}
 
-    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append messages.
+    def add(self, data: Buffer, suffix: str, about: Mapping[str, object]) -> None:
+        """Write a file.
+
+        Args:
+            data: Its content.
+            suffix: Its suffix, with the dot.
+            about: The line of the index; its `topic` and `log_time_ns` give the name.
 
         Raises:
             DiskFullError: No space left.
         """
         with failures(self._name):
-            for row in range(len(batch)):
-                channel = channels[int(batch.channel[row])]
-                log_time = int(batch.log_time[row])
-                name = self._write_payload(channel.topic, log_time, batch.payload(row))
-                line = {
-                    "file": name,
-                    "topic": channel.topic,
-                    "type": channel.schema.name if channel.schema else "",
-                    "encoding": channel.message_encoding,
-                    "log_time_ns": log_time,
-                    "publish_time_ns": int(batch.publish_time[row]),
-                    "sequence": int(batch.sequence[row]),
-                    "length": int(batch.length[row]),
-                }
-                self._index.write(json.dumps(line) + "\n")
+            name = self._write(str(about["topic"]), int(str(about["log_time_ns"])), suffix, data)
+            self._index.write(json.dumps({"file": name, **about}) + "\n")
 
-    def _write_payload(self, topic: str, log_time: int, payload: memoryview) -> str:
+    def _write(self, topic: str, log_time: int, suffix: str, data: Buffer) -> str:
         folder = collection_of(topic)
         last, number = self._last.get(folder, (-1, 0))
         if folder not in self._last:
             (self._temporary / folder).mkdir()
         number = number + 1 if last == log_time else 0
         while True:
-            name = f"{folder}/{log_time}{f'-{number}' if number else ''}.bin"
+            name = f"{folder}/{log_time}{f'-{number}' if number else ''}{suffix}"
             try:
                 file = (self._temporary / name).open("xb")
             except FileExistsError:  # the same time again, after other times
                 number += 1
                 continue
             with file:
-                file.write(payload)
+                file.write(data)
             self._last[folder] = (log_time, number)
             return name
 
@@ -146,6 +138,29 @@ class RawWriter(FileWriter):
         with suppress(OSError):
             self._index.close()
         self._unfinished.remove()
+
+
+class RawWriter(DirectoryWriter):
+    """Writes a directory of payload files."""
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        for row in range(len(batch)):
+            channel = channels[int(batch.channel[row])]
+            about = {
+                "topic": channel.topic,
+                "type": channel.schema.name if channel.schema else "",
+                "encoding": channel.message_encoding,
+                "log_time_ns": int(batch.log_time[row]),
+                "publish_time_ns": int(batch.publish_time[row]),
+                "sequence": int(batch.sequence[row]),
+                "length": int(batch.length[row]),
+            }
+            self.add(batch.payload(row), ".bin", about)
 
 
 class RawStreamWriter(FileWriter):

@@ -222,7 +222,7 @@ def stop_at(moment: str, *command: str, store: Path) -> subprocess.CompletedProc
         ("mcap", "call Unfinished.publish"),
         ("bag", "return BagWriter.__init__"),
         ("bag", "call FileWriter.__exit__"),
-        ("raw", "return RawWriter.__init__"),
+        ("raw", "return DirectoryWriter.__init__"),
         ("raw", "call FileWriter.__exit__"),
     ],
 )
@@ -244,7 +244,7 @@ def test_a_directory_that_was_to_be_replaced_comes_back(store: Path, tmp_path: P
     command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target), "-r", "robot"]
     run(*command, store=store)
     before = sorted(path.name for path in target.iterdir())
-    ended = stop_at("return RawWriter.__init__", *command, "--force", store=store)
+    ended = stop_at("return DirectoryWriter.__init__", *command, "--force", store=store)
     assert ended.returncode == 130, ended.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
     assert sorted(path.name for path in target.iterdir()) == before

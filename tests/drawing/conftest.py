@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.writer import Writer
 from numpy.typing import NDArray
+from PIL import Image
 
 import hybridlog as hl
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -35,11 +38,23 @@ float64 z
 """
 
 
+IMAGE = b"""\
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+"""
+COMPRESSED = b"string format\nuint8[] data\n"
+
+
 @dataclass
 class Drive:
     """What was written: one entry a message."""
 
     store: hl.Store
+    directory: Path
     times: NDArray[np.int64]
     x: NDArray[np.float64]
     z: NDArray[np.float64]
@@ -61,6 +76,49 @@ def payload(drive: Drive, n: int) -> bytes:
     )
 
 
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def image(pixels: NDArray[np.uint8], encoding: str = "rgb8") -> bytes:
+    height, width = pixels.shape[:2]
+    head = struct.pack("<II", height, width) + text(encoding)
+    return head + struct.pack("<BII", 0, pixels.strides[0], pixels.nbytes) + pixels.tobytes()
+
+
+def compressed(data: bytes, form: str = "png") -> bytes:
+    return text(form) + struct.pack("<I", len(data)) + data
+
+
+def encoded(pixels: NDArray[np.uint8], form: str) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, form)
+    return file.getvalue()
+
+
+SEEN = np.random.default_rng(5).integers(0, 256, (4, 4, 6, 3), np.uint8)
+FILES = [encoded(SEEN[0], "JPEG"), encoded(SEEN[1], "WEBP"), encoded(SEEN[2], "JPEG")]
+
+
+def write_looks(path: Path) -> None:
+    """Raw images, the second of which is too short; compressed ones, two at the same time."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros1")
+        raw = writer.register_schema("sensor_msgs/Image", "ros1msg", IMAGE)
+        packed = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", COMPRESSED)
+        front = writer.register_channel("/front", "ros1", raw)
+        rear = writer.register_channel("/rear/compressed", "ros1", packed)
+        broken = writer.register_channel("/broken", "ros1", packed)
+        for n, pixels in enumerate(SEEN):
+            payload = image(pixels, "rgb8" if n != 1 else "rgb16")
+            writer.add_message(front, BASE + n * MS, payload, BASE + n)
+        for n, data in enumerate(FILES):
+            writer.add_message(rear, BASE + n // 2, compressed(data), 0)
+            writer.add_message(broken, BASE + n, compressed(b"no picture", "h265"), 0)
+        writer.finish()
+
+
 @pytest.fixture(scope="session")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
     """5,000 messages, 10 ms apart but for two pauses of 20 s and one of 30 ms."""
@@ -77,6 +135,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
     with hl.open(path / "store", create=True) as store:
         made = Drive(
             store,
+            path / "store",
             BASE + np.cumsum(steps) - steps[0],
             x,
             np.sin(np.arange(count) / 100),
@@ -99,6 +158,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
                     writer.add_message(loose, time, json.dumps(said).encode(), time)
             writer.finish()
         store.record(path / "drive.mcap", settings=SegmentSettings(chunk_size=1 << 16))
+        write_looks(path / "looks.mcap")
+        store.record(path / "looks.mcap")
         yield made
 
 

@@ -348,7 +348,7 @@ SCAN = Sent(
         (raw("hsv99", GREY), "unknown encoding"),
         (raw("mono8", GREY, height=50), "needs"),
         (SCAN, "is no image"),
-        (Sent("std_msgs/String", data="x"), "no array form"),
+        (Sent("std_msgs/String", data="x"), "is no image"),
     ],
 )
 def test_no_pictures(message: Any, problem: str) -> None:
