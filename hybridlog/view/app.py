@@ -17,7 +17,15 @@ from hybridlog.view.guard import Guard
 if TYPE_CHECKING:
     from hybridlog.store import Store
 
-ROUTES: Final = ("ask", "export", "recordings")
+ROUTES: Final = (
+    "ask",
+    "export",
+    "images",
+    "log",
+    "messages",
+    "recordings",
+    "series",
+)
 """The modules of `routes/`."""
 
 _STATIC: Final = Path(__file__).parent / "static"

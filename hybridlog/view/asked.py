@@ -24,10 +24,15 @@ class Asked:
 
     Args:
         parameters: As in the URL.
+        tag: Entity tag of the answer that the browser has already; None for none.
+
+    Attributes:
+        tag: That tag.
     """
 
-    def __init__(self, parameters: QueryParams) -> None:
+    def __init__(self, parameters: QueryParams, tag: str | None = None) -> None:
         self._parameters = parameters
+        self.tag = tag
 
     def has(self, name: str) -> bool:
         """Whether a parameter is given."""

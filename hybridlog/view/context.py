@@ -105,7 +105,8 @@ def route(path: str, answer: Answer) -> Route:
         context: Context = request.app.state.context
         try:
             with context.turn():
-                found = answer(context, Asked(request.query_params))
+                tag = request.headers.get("if-none-match")
+                found = answer(context, Asked(request.query_params, tag))
             return found if isinstance(found, Response) else json_response(found)
         except HybridlogError as error:
             return error_response(error)

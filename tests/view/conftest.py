@@ -18,6 +18,8 @@ from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
 from hybridlog.view.app import make_app
 from hybridlog.view.server import ViewServer
+from tests.every_image import write_images
+from tests.odd_messages import write_odd
 from tests.view.chromium import chromium
 
 if TYPE_CHECKING:
@@ -54,6 +56,21 @@ def asking() -> Asking:
 def client(demo_store: hl.Store, asking: Asking) -> TestClient:
     """A client of the view of `demo_store`."""
     return asking(demo_store)
+
+
+@pytest.fixture(scope="session")
+def odd_store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """An open store with the recordings `odd` and `images`. Tests only read it."""
+    with hl.open(tmp_path_factory.mktemp("odd") / "store", create=True) as store:
+        write_odd(store)
+        write_images(store)
+        yield store
+
+
+@pytest.fixture(scope="session")
+def odd(odd_store: hl.Store, asking: Asking) -> TestClient:
+    """A client of the view of `odd_store`."""
+    return asking(odd_store)
 
 
 @contextmanager

@@ -60,6 +60,7 @@ def recording(context: Context, asked: Asked) -> dict[str, Any]:
     return {
         "id": entry.id,
         "label": entry.label,
+        "store": str(context.store.directory.path),
         "name": entry.name,
         "status": entry.status,
         "start": str(start),

@@ -1,0 +1,81 @@
+"""The fields of a topic that can be drawn over time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from hybridlog.frames.names import is_summary
+from hybridlog.query.answers.infer_fields import infer_fields
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from hybridlog.query.query import Query
+
+MAX_FIELDS: Final = 5000
+"""Most fields of a topic that are listed."""
+MAX_ELEMENTS: Final = 36
+"""Most elements of an array that are listed one by one: those of a covariance."""
+
+_NUMBER: Final = re.compile(r"bool|byte|char|time|duration|float(32|64)|u?int(8|16|32|64)")
+_WIDTH: Final = re.compile(r"\[(\d{1,9})\]$")
+_SUMMARIES: Final = ("min", "max", "mean", "n")
+_IN_JSON: Final = ("bool", "integer", "number")
+
+
+class Field(NamedTuple):
+    """A field, as `series` takes it, and its type."""
+
+    path: str
+    type: str
+
+
+def fields_of(query: Query) -> list[Field]:
+    """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
+
+    Where no definition fixes the fields, those of the first messages.
+    """
+    known = query.field_types()
+    found = _observed(query) if known is None else _defined(known, query)
+    return list(islice(found, MAX_FIELDS))
+
+
+def _defined(known: dict[str, str], query: Query) -> Iterator[Field]:
+    first = query.first()
+    values = {} if first is None else first.fields
+    for path, kind in known.items():
+        if "[" in path:
+            continue  # within the elements of an array
+        if _NUMBER.fullmatch(kind):
+            yield Field(path, kind)
+            continue
+        summaries = (f"{path}.{name}" for name in _SUMMARIES)
+        yield from (Field(name, "summary") for name in summaries if is_summary(name, known))
+        element, bracket, _ = kind.partition("[")
+        if bracket and _NUMBER.fullmatch(element):
+            width = _width(kind, path, values)
+            yield from (Field(f"{path}[{n}]", element) for n in range(width))
+
+
+def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
+    """Number of elements that are listed: of a fixed array, or of the first message."""
+    fixed = _WIDTH.search(kind)
+    if fixed:
+        width = int(fixed[1])
+    else:
+        value: Any = values
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        width = len(value) if isinstance(value, list) else 0
+    return width if width <= MAX_ELEMENTS else 0
+
+
+def _observed(query: Query) -> Iterator[Field]:
+    for found in infer_fields(query):
+        path, kinds = str(found["path"]), str(found["type"]).split("|")
+        # A name within backquotes may have dots, which a path cannot tell from its own.
+        if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):
+            yield Field(path, "|".join(kinds))

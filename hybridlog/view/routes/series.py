@@ -1,0 +1,58 @@
+"""Fields over time, for plots."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.drawing.fields import fields_of
+from hybridlog.drawing.series import series as read_series
+from hybridlog.view.context import route, start_of
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog.view.asked import Asked
+    from hybridlog.view.context import Context
+
+MAX_FIELDS: Final = 16
+"""Most fields of one plot."""
+
+
+def fields(context: Context, asked: Asked) -> dict[str, Any]:
+    """The fields of a topic that can be drawn, and their types."""
+    query = context.query(context.recording(asked), asked.text("topic"))
+    return {"fields": [{"path": path, "type": kind} for path, kind in fields_of(query)]}
+
+
+def series(context: Context, asked: Asked) -> dict[str, Any]:
+    """Least and greatest values by pixel, or each value if there are few."""
+    entry = context.recording(asked)
+    query = context.query(entry, asked.text("topic"))
+    start = start_of(entry)
+    begin, end = asked.offset("begin"), asked.offset("end")
+    if end <= begin:
+        raise UsageError("end must be behind begin.")
+    wanted = asked.texts("field", most=MAX_FIELDS)
+    found = read_series(query, wanted, pixels=asked.pixels(), span=(start + begin, start + end))
+    if len(found) > MAX_FIELDS:
+        raise UsageError(f"These are {len(found)} fields, at most {MAX_FIELDS} fit in a plot.")
+    return {
+        "exact": all(one.exact for one in found),
+        "times": (found[0].times - start).tolist() if found else [],
+        "fields": [
+            {"field": one.field, "least": _values(one.least)}
+            | ({} if one.exact else {"greatest": _values(one.greatest)})
+            for one in found
+        ],
+    }
+
+
+def _values(numbers: NDArray[np.float64]) -> list[float | None]:
+    """Null for NaN and infinities, which JSON lacks."""
+    return [value if isfinite(value) else None for value in numbers.tolist()]
+
+
+routes = [route("/fields", fields), route("/series", series)]

@@ -1,0 +1,239 @@
+"""What panels ask the server for, against the store."""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from starlette.testclient import TestClient
+
+import hybridlog as hl
+from hybridlog.drawing.series import series
+from hybridlog.drawing.tree import MAX_SHOWN, tree
+from hybridlog_storage.errors import TopicError
+from tests.every_image import (
+    BROKEN,
+    COMPRESSED,
+    FORMS,
+    HEIGHT,
+    PIXELS,
+    RAW,
+    SAMPLES,
+    WIDTH,
+)
+from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time
+
+S = 10**9
+
+
+def got(client: TestClient, page: str, topic: str, recording: str = "odd", /, **asked: Any) -> Any:
+    answer = client.get(page, params={"recording": recording, "topic": topic, **asked})
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def test_the_message_is_the_one_that_the_store_has_at_a_time(
+    client: TestClient, demo_store: hl.Store
+) -> None:
+    (entry,) = demo_store.recordings()
+    assert entry.span is not None
+    start = entry.span[0]
+    for topic in ("/base/scan", "/tf_static", "/r_gripper_controller/command", "/rosout"):
+        query = demo_store.topic(topic)
+        times = query.to_arrow()["log_time"].cast("int64").to_numpy()
+        for at in (-S, 0, 51 * MS, 5 * S, int(times[2 % len(times)]) - start, 19 * S, 60 * S):
+            found = got(client, "message", topic, "robot", at=at)
+            later = times[times > start + at]
+            assert found["until"] == (int(later[0]) - start if len(later) else None)
+            try:
+                wanted = query.at(start + at)
+            except TopicError:
+                assert found["time"] is None
+                assert "tree" not in found
+                continue
+            assert found["time"] == wanted.log_time_ns - start
+            assert (found["seq"], found["type"]) == (wanted.seq, wanted.type)
+            assert found["bytes"] == len(wanted.payload)
+            assert found["tree"] == tree(wanted)
+
+
+def test_of_messages_at_one_time_the_last_is_shown(odd: TestClient) -> None:
+    found = got(odd, "message", "/own", at=5 * S)
+    assert found["tree"]["items"][3]["text"] == "name 7"
+    assert (found["time"], found["until"]) == (5 * S, 6 * S)
+
+
+def test_a_part_of_a_message(odd: TestClient) -> None:
+    asked = {"at": S, "path": "6", "begin": LONG - 50, "count": 100}
+    part = got(odd, "message", "/own", **asked)["tree"]
+    assert part["texts"] == [str(k * 7 % 256) for k in range(LONG - 50, LONG)]
+
+
+def test_a_damaged_message_is_told(odd: TestClient) -> None:
+    for topic in ("/own", "/loose"):
+        found = got(odd, "message", topic, at=6 * S)
+        assert found["problem"]
+        assert "tree" not in found
+        assert found["time"] == 6 * S
+
+
+def test_fields_that_can_be_drawn_can_be_drawn(client: TestClient, odd: TestClient) -> None:
+    for one, recording, topic in (
+        (client, "robot", "/base/scan"),
+        (client, "robot", "/joint_states"),
+        (client, "robot", "/odom"),
+        (odd, "odd", "/own"),
+        (odd, "odd", "/loose"),
+    ):
+        fields = got(one, "fields", topic, recording)["fields"]
+        names = [field["path"] for field in fields]
+        assert names
+        assert len(set(names)) == len(names)
+        for n in range(0, len(names), 16):
+            asked = {"field": names[n : n + 16], "begin": 0, "end": 4 * S, "pixels": 10}
+            drawn = got(one, "series", topic, recording, **asked)
+            assert [found["field"] for found in drawn["fields"]] == names[n : n + 16]
+    listed = {
+        f["path"]: f["type"] for f in got(client, "fields", "/joint_states", "robot")["fields"]
+    }
+    assert listed["position[2]"] == "float64"
+    assert listed["effort.max"] == "summary"
+    assert "position[3]" not in listed
+    loose = {f["path"]: f["type"] for f in got(odd, "fields", "/loose")["fields"]}
+    assert loose["n"] == "integer"
+    assert not any("`" in path for path in loose)
+
+
+@pytest.mark.parametrize(("begin", "end", "is_exact"), [(0, 20 * S, False), (S, 3 * S, True)])
+def test_series_are_those_of_the_store(
+    client: TestClient, demo_store: hl.Store, begin: int, end: int, *, is_exact: bool
+) -> None:
+    (entry,) = demo_store.recordings()
+    assert entry.span is not None
+    start = entry.span[0]
+    fields = ["pose.pose.position.x", "twist.twist.linear.x"]
+    asked = {"field": fields, "begin": begin, "end": end, "pixels": 120}
+    found = got(client, "series", "/odom", "robot", **asked)
+    span = start + begin, start + end
+    wanted = series(demo_store.topic("/odom"), fields, pixels=120, span=span)
+    assert found["exact"] is is_exact is wanted[0].exact
+    assert found["times"] == (wanted[0].times - start).tolist()
+    for one, want in zip(found["fields"], wanted, strict=True):
+        assert one["field"] == want.field
+        assert ("greatest" in one) is not is_exact
+        for side, values in (("least", want.least), ("greatest", want.greatest)):
+            numbers = [math.nan if v is None else v for v in one.get(side, one["least"])]
+            assert np.array_equal(numbers, values, equal_nan=True)
+
+
+def test_lines_of_a_log_around_the_cursor(odd: TestClient) -> None:
+    at = log_time(100) - START
+    found = got(odd, "log", "/rosout", at=at, before=10, after=10)
+    numbers = range(95, 115)
+    assert [line["text"] for line in found["lines"]] == [LOGS[n][2] for n in numbers]
+    assert [line["time"] for line in found["lines"]] == [log_time(n) - START for n in numbers]
+    assert (found["first"], found["last"]) == (False, False)
+    # From a line on: those of its own time that came after it, too.
+    line = found["lines"][2]
+    asked = {"at": line["time"], "seq": line["seq"], "before": 3, "after": 3}
+    beside = got(odd, "log", "/rosout", **asked)["lines"]
+    assert [one["text"] for one in beside] == [LOGS[n][2] for n in (94, 95, 96, 98, 99, 100)]
+    last = got(odd, "log", "/rosout", at=60 * S, before=2, after=2)
+    assert last["lines"][-1]["problem"]
+    assert last["last"]
+    none = got(odd, "log", HOSTILE, at=-S, before=2, after=2)
+    assert (len(none["lines"]), none["first"], none["last"]) == (2, True, False)
+
+
+def test_filters_of_a_log(odd: TestClient) -> None:
+    asked = {"level": "error", "text": "LINE 1"}
+    found = got(odd, "log", "/rosout2", at=60 * S, before=500, **asked)["lines"]
+    wanted = [text for level, _, text in LOGS if level >= 3 and "line 1" in text]
+    assert [line["text"] for line in found] == wanted
+    assert got(odd, "log/count", "/rosout2", **asked) == {"count": len(wanted)}
+    assert got(odd, "log/count", HOSTILE, text="é\n<b>") == {"count": len(LOGS)}
+
+
+@pytest.mark.parametrize("topic", [RAW, COMPRESSED])
+def test_an_image_of_every_encoding(odd: TestClient, odd_store: hl.Store, topic: str) -> None:
+    names = [*SAMPLES, *BROKEN[:3]] if topic == RAW else [*FORMS, BROKEN[3]]
+    messages = list(odd_store.topic(topic))
+    tags = set()
+    for n, (name, message) in enumerate(zip(names, messages, strict=True)):
+        asked: dict[str, Any] = {"recording": "images", "topic": topic, "at": n * 100 * MS + 1}
+        answer = odd.get("image", params=asked)
+        assert answer.status_code == 200, name
+        assert answer.headers["Hybridlog-Time"] == str(n * 100 * MS)
+        assert answer.headers.get("Hybridlog-Until") == (
+            str((n + 1) * 100 * MS) if n + 1 < len(names) else None
+        )
+        if name in BROKEN:
+            assert answer.headers["Content-Type"] == "application/json"
+            assert answer.json()["problem"]
+            continue
+        kind = answer.headers["Content-Type"]
+        assert kind == {"JPEG": "image/jpeg", "WEBP": "image/webp", "BMP": "image/bmp"}.get(
+            name, "image/png"
+        )
+        if name in {"PNG", "JPEG", "WEBP", "BMP"}:  # as it came
+            assert answer.content == bytes(message.decode().data)
+        with Image.open(io.BytesIO(answer.content)) as image:
+            assert image.size == (WIDTH, HEIGHT), name
+            if name in {"rgb8", "PNG", "BMP", "TIFF"}:
+                assert np.array_equal(np.asarray(image), PIXELS)
+        tag = answer.headers["ETag"]
+        asked["at"] += 1
+        again = odd.get("image", params=asked, headers={"If-None-Match": tag})
+        assert (again.status_code, again.content) == (304, b"")
+        assert again.headers["Hybridlog-Time"] == answer.headers["Hybridlog-Time"]
+        tags.add(tag)
+    assert len(tags) == len(names) - len(set(BROKEN) & set(names))
+    none = odd.get("image", params={"recording": "images", "topic": topic, "at": -1})
+    assert (none.json(), none.headers["Hybridlog-Until"]) == ({}, "0")
+
+
+@pytest.mark.parametrize(
+    ("path", "asked"),
+    [
+        ("message", {}),
+        ("message", {"at": "now"}),
+        ("message", {"at": "9" * 25}),
+        ("message", {"at": 0, "path": "a"}),
+        ("message", {"at": 0, "path": "1..2"}),
+        ("message", {"at": 0, "path": ".".join("1" * 101)}),
+        ("message", {"at": 0, "path": "1.99"}),
+        ("message", {"at": 0, "begin": -1}),
+        ("message", {"at": 0, "count": 0}),
+        ("message", {"at": 0, "count": MAX_SHOWN + 1}),
+        ("series", {"begin": 0, "end": 1, "pixels": 10}),
+        ("series", {"begin": 1, "end": 1, "pixels": 10, "field": "id"}),
+        ("series", {"begin": 0, "end": 1, "pixels": 0, "field": "id"}),
+        ("series", {"begin": 0, "end": 1, "pixels": 8193, "field": "id"}),
+        ("series", {"begin": 0, "end": 1, "pixels": 10, "field": ["id"] * 17}),
+        ("series", {"begin": 0, "end": 1, "pixels": 10, "field": "name"}),
+        ("series", {"begin": 0, "end": 1, "pixels": 10, "field": "x" * 2000}),
+        ("image", {"at": "soon"}),
+        ("image", {"at": [0, 1]}),
+        ("log", {"at": 0, "before": 501}),
+        ("log", {"at": 0, "after": -1}),
+        ("log", {"at": 0, "before": 1}),
+        ("log/count", {"level": "loud"}),
+        ("log/count", {"text": "x" * 201}),
+    ],
+)
+def test_absurd_parameters_are_refused(odd: TestClient, path: str, asked: dict[str, Any]) -> None:
+    answer = odd.get(path, params={"recording": "odd", "topic": "/own", **asked})
+    assert answer.status_code == 400
+    assert answer.json()["error"]
+
+
+@pytest.mark.parametrize("path", ["message", "fields", "series", "image", "log", "log/count"])
+def test_what_is_not_there_is_not_found(odd: TestClient, path: str) -> None:
+    asked = {"at": 0, "begin": 0, "end": 1, "pixels": 1, "field": "id"}
+    for recording, topic in (("odd", "/scan"), ("odd", "own"), ("even", "/own"), ("", HOSTILE)):
+        answer = odd.get(path, params={"recording": recording, "topic": topic, **asked})
+        assert answer.status_code == 404
