@@ -2,6 +2,10 @@
 
 import { element, fill, notice } from "./dom.js";
 import * as state from "./state.js";
+import image from "./panels/image.js";
+import log from "./panels/log.js";
+import message from "./panels/message.js";
+import plot from "./panels/plot.js";
 
 /**
  * The kinds of panels, in the order of the menu.
@@ -23,7 +27,7 @@ import * as state from "./state.js";
  * @property {function(): {begin: number, end: number}} range the visible one
  * @property {function(number)} seek moves the cursor
  */
-const KINDS = [];
+const KINDS = [image, plot, log, message];
 
 /** The panels that a recording is first shown with: one of each kind that says so. */
 function firstPanels(topics) {
@@ -65,7 +69,11 @@ export function mountPanels(main, recording) {
       else shown.push(made(panel));
     }
     kept.forEach(({ running }) => running?.destroy());
-    fill(grid, ...shown.map(({ frame }) => frame));
+    const frames = shown.map(({ frame }) => frame);
+    // An element that is put in its place anew loses the keyboard, and where it was scrolled to.
+    if (frames.some((frame, n) => frame !== grid.children[n]) || frames.length < grid.childElementCount)
+      fill(grid, ...frames);
+    shown.forEach(({ running }) => running?.update());
   }
 
   function made(panel) {

@@ -1,0 +1,126 @@
+/** Keeps what a panel shows current at the cursor, without a queue of requests. */
+
+import { ApiError } from "../api.js";
+
+const MOST_KEPT = 64;
+const MOST_BYTES = 64 << 20;
+const STILL_PLAYING = 250; // ms between two steps of a cursor that plays
+
+/**
+ * An answer about one message.
+ *
+ * @typedef {Object} Answer
+ * @property {?number} time log time of the message, ns since the start; null without one
+ * @property {?number} until log time of the next message; null if no later one is known
+ * @property {number} [size] bytes
+ */
+
+/**
+ * Asks for one message at a time. While an answer is under way only the newest cursor is
+ * remembered, so messages are left out rather than shown late. While the cursor plays, it asks
+ * for the time at which the answer will have come.
+ *
+ * @param {Object} parts
+ * @param {function(number): Promise<Answer>} parts.load asks for the message at a time
+ * @param {function(Answer)} parts.show shows one
+ * @param {function(Error)} parts.fail shows why there is none
+ * @param {boolean} [parts.grows] whether later messages may still come
+ */
+export function follow({ load, show, fail, grows = false }) {
+  let kept = [];
+  let shown = null;
+  let wanted = null;
+  let last = { at: 0, when: -Infinity };
+  let speed = 0; // ns of the recording for each ms; 0 when it does not play
+  let latency = 30; // ms
+  let isRunning = false;
+  let isGone = false;
+  let stopping = 0;
+
+  const covers = ({ time, until }, at) => (time ?? -Infinity) <= at && at < (until ?? Infinity);
+
+  function take(answer) {
+    if (answer === shown) return;
+    shown = answer;
+    show(answer);
+  }
+
+  /** Shows what is current at the wanted time, as far as it is there already. */
+  function choose() {
+    const exact = kept.find((answer) => covers(answer, wanted));
+    if (exact) return take(exact);
+    if (!speed) return undefined;
+    const passed = kept.filter(({ time }) => time !== null && time <= wanted);
+    const newest = passed.reduce((a, b) => (a && a.time >= b.time ? a : b), null);
+    if (newest && newest.time > (shown?.time ?? -Infinity)) take(newest);
+    return undefined;
+  }
+
+  function keep(answer) {
+    kept = [answer, ...kept].slice(0, MOST_KEPT);
+    let bytes = 0;
+    kept = kept.filter(({ size }, place) => (bytes += size ?? 0) <= MOST_BYTES || !place);
+  }
+
+  async function ask() {
+    if (isRunning || isGone) return;
+    const at = Math.round(wanted + speed * latency);
+    if (kept.some((answer) => covers(answer, at))) return;
+    isRunning = true;
+    const begun = performance.now();
+    try {
+      const answer = await load(at);
+      if (isGone) return;
+      if (grows && answer.until === null) answer.until = at + 1;
+      keep(answer);
+      latency += (performance.now() - begun - latency) / 4;
+      const isEarly = speed && answer.time > wanted;
+      if (covers(answer, wanted) || !isEarly) take(answer);
+    } catch (error) {
+      if (!(error instanceof ApiError)) throw error;
+      if (isGone) return;
+      shown = null;
+      fail(error);
+      if (wanted === at) return; // not again before the cursor moves
+    } finally {
+      isRunning = false;
+    }
+    ask();
+  }
+
+  /** The cursor stays where it is: what is shown must be exact now. */
+  function stop() {
+    speed = 0;
+    choose();
+    ask();
+  }
+
+  return {
+    /** Shows the message that is current at a time. */
+    want(at) {
+      const when = performance.now();
+      const step = at - last.at;
+      const isPlaying = step > 0 && when - last.when < STILL_PLAYING;
+      if (at !== last.at) {
+        speed = isPlaying ? step / Math.max(when - last.when, 1) : 0;
+        last = { at, when };
+      }
+      wanted = at;
+      choose();
+      ask();
+      clearTimeout(stopping);
+      if (speed) stopping = setTimeout(stop, STILL_PLAYING);
+    },
+    /** Forgets all answers, and asks again. */
+    renew() {
+      kept = [];
+      shown = null;
+      if (wanted !== null) ask();
+    },
+    destroy() {
+      isGone = true;
+      clearTimeout(stopping);
+      kept = [];
+    },
+  };
+}

@@ -1,0 +1,267 @@
+/** Lines of a text log around the cursor; only those that can be seen are elements. */
+
+import { ApiError, get, isAborted } from "../api.js";
+import { element, fill } from "../dom.js";
+import { count, offset } from "../words.js";
+import { literal, moment, opening } from "./python.js";
+
+const TYPES = new Set([
+  "rosgraph_msgs/Log",
+  "rcl_interfaces/Log",
+  "foxglove_msgs/Log",
+  "foxglove.Log",
+  "std_msgs/String",
+]);
+const LEVELS = ["debug", "info", "warning", "error", "fatal"];
+const ROW = 22; // pixels; the style sheet says the same
+const PAGE = 200; // lines of a request
+const MOST_LINES = 2000;
+const BEYOND = 10; // lines above and below what is seen
+const TYPING = 250; // ms
+
+let mounted = 0;
+
+export default {
+  kind: "log",
+  title: "Log",
+  isFirst: true,
+  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  mount,
+  python: (panel) => {
+    const { level, text } = filtersOf(panel.options);
+    const { begin, end } = panel.range();
+    const { recording } = panel;
+    return [
+      opening(panel),
+      "from hybridlog.drawing.log import filtered, kind_of, lines_after",
+      "",
+      `kind = kind_of(${literal(panel.topic.type)})`,
+      `query = query.between(${moment(recording, begin)}, ${moment(recording, end)})`,
+      `query = filtered(query, kind, ${literal(level)}, ${literal(text)})`,
+      "for message in query.limit(1000):",
+      "    print(message.log_time_ns, message.fields)",
+    ].join("\n");
+  },
+};
+
+function filtersOf({ level, text }) {
+  return {
+    level: LEVELS.includes(level) ? level : "",
+    text: typeof text === "string" ? text.slice(0, 200) : "",
+  };
+}
+
+function mount(body, panel) {
+  const slot = `log ${(mounted += 1)}`;
+  const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
+  const hasLevels = !/String$/.test(panel.topic.type);
+  let lines = [];
+  let isFirst = true; // no line is before these
+  let isLast = true;
+  let isLoading = false;
+  let current = -1; // place of the line at the cursor
+  let at = null;
+  let isGone = false;
+  let typing = 0;
+
+  const level = element(
+    "select",
+    { "aria-label": "Least level", onchange: () => panel.setOptions({ level: level.value }) },
+    element("option", { value: "" }, "all levels"),
+    ...LEVELS.map((name) => element("option", { value: name }, name)),
+  );
+  const text = element("input", {
+    type: "search",
+    placeholder: "Text",
+    "aria-label": "Text",
+    maxlength: 200,
+    oninput: () => {
+      clearTimeout(typing);
+      typing = setTimeout(() => panel.setOptions({ text: text.value }), TYPING);
+    },
+  });
+  const number = element("small", { role: "status" });
+  const inside = element("div", { class: "inside", role: "list" });
+  const view = element(
+    "div",
+    { class: "lines", tabindex: "0", "aria-label": "Lines", onscroll: scrolled, onkeydown: moved },
+    inside,
+  );
+  const whole = element("div", { class: "whole" });
+  body.append(
+    element("div", { class: "filters-line" }, hasLevels ? level : null, text, number),
+    view,
+    whole,
+  );
+  let filters = filtersOf(panel.options);
+  showFilters();
+  const watching = new ResizeObserver(() => draw());
+  watching.observe(view);
+  load();
+
+  function showFilters() {
+    level.value = filters.level;
+    if (text.value !== filters.text) text.value = filters.text;
+  }
+
+  /** Lines around the cursor, in the place of all others. */
+  async function load() {
+    at = panel.cursor();
+    isLoading = true;
+    const parameters = { ...asked, ...chosen(), at, before: PAGE / 2, after: PAGE / 2 };
+    await answered(get("log", parameters, { slot }), (found) => {
+      [lines, isFirst, isLast] = [found.lines, found.first, found.last];
+      isLoading = false;
+      point(true);
+      if (panel.cursor() !== at) update();
+    });
+    if (!isGone) tally();
+  }
+
+  let tallied = "";
+
+  /** How many lines pass the filters. */
+  async function tally() {
+    const now = JSON.stringify(filters);
+    if (now === tallied) return;
+    tallied = now;
+    number.textContent = "…";
+    await answered(get("log/count", { ...asked, ...chosen() }, { slot: `${slot} count` }), (found) => {
+      number.textContent = `${count(found.count)} lines`;
+    });
+  }
+
+  function chosen() {
+    return { level: filters.level || null, text: filters.text || null };
+  }
+
+  /** More lines at one end; the others stay where they are seen. */
+  async function more(isBefore) {
+    const edge = isBefore ? lines[0] : lines.at(-1);
+    if (isLoading || !edge) return;
+    isLoading = true;
+    const parameters = { ...asked, ...chosen(), at: edge.time, seq: edge.seq };
+    parameters[isBefore ? "before" : "after"] = PAGE;
+    await answered(get("log", parameters, { slot }), (found) => {
+      isLoading = false;
+      if (isBefore) {
+        lines = [...found.lines, ...lines];
+        isFirst = found.first;
+        view.scrollTop += found.lines.length * ROW;
+        if (lines.length > MOST_LINES) isLast = false;
+        lines = lines.slice(0, MOST_LINES);
+      } else {
+        lines = [...lines, ...found.lines];
+        isLast = found.last;
+        const surplus = Math.max(lines.length - MOST_LINES, 0);
+        if (surplus) isFirst = false;
+        lines = lines.slice(surplus);
+        view.scrollTop -= surplus * ROW;
+      }
+      point(false);
+    });
+  }
+
+  async function answered(request, use) {
+    try {
+      const found = await request;
+      if (!isGone) use(found);
+    } catch (error) {
+      if (isGone || isAborted(error)) return;
+      if (!(error instanceof ApiError)) throw error;
+      isLoading = false;
+      lines = [];
+      number.textContent = "";
+      fill(inside, element("pre", { class: "problem", role: "alert" }, error.message));
+    }
+  }
+
+  function update() {
+    const wanted = filtersOf(panel.options);
+    if (JSON.stringify(wanted) !== JSON.stringify(filters)) {
+      filters = wanted;
+      showFilters();
+      load();
+      return;
+    }
+    if (panel.cursor() === at) return;
+    at = panel.cursor();
+    const isThere =
+      lines.length && (isFirst || lines[0].time <= at) && (isLast || at < lines.at(-1).time);
+    if (isThere) point(true);
+    else if (!isLoading) load();
+  }
+
+  /** Finds the line at the cursor, and with `isMoved` brings it into view. */
+  function point(isMoved) {
+    let place = lines.length - 1;
+    while (place >= 0 && lines[place].time > at) place -= 1;
+    current = place;
+    inside.style.height = `${lines.length * ROW}px`;
+    if (isMoved) {
+      const top = Math.max(current, 0) * ROW;
+      const isSeen = top >= view.scrollTop && top + ROW <= view.scrollTop + view.clientHeight;
+      if (!isSeen) view.scrollTop = top - view.clientHeight / 2;
+    }
+    draw();
+  }
+
+  function draw() {
+    if (isGone) return;
+    const first = Math.max(Math.floor(view.scrollTop / ROW) - BEYOND, 0);
+    const seen = Math.ceil(view.clientHeight / ROW) + 2 * BEYOND;
+    const rows = lines.slice(first, first + seen).map((line, n) => rowOf(line, first + n));
+    if (!lines.length && !isLoading) rows.push(element("p", {}, "No such lines."));
+    fill(inside, ...rows);
+    const line = lines[current];
+    whole.textContent = line ? line.text : "";
+  }
+
+  function rowOf(line, place) {
+    const row = element(
+      "div",
+      {
+        class: `line ${line.level ?? ""}${line.problem ? " unreadable" : ""}`,
+        role: "listitem",
+        "aria-current": place === current ? "true" : null,
+        title: line.text,
+        onclick: () => panel.seek(line.time),
+      },
+      element("span", { class: "time" }, offset(line.time)),
+      hasLevels ? element("span", { class: "level" }, line.level ?? "") : null,
+      line.name ? element("span", { class: "name" }, line.name) : null,
+      element("span", { class: "text" }, line.text + (line.cut ? "…" : "")),
+    );
+    row.style.top = `${place * ROW}px`;
+    return row;
+  }
+
+  function scrolled() {
+    draw();
+    const near = PAGE / 4 * ROW;
+    if (!isFirst && view.scrollTop < near) more(true);
+    else if (!isLast && view.scrollTop + view.clientHeight > lines.length * ROW - near) more(false);
+  }
+
+  /** The arrows step from one time to the next that has lines. */
+  function moved(event) {
+    if (event.key !== "ArrowUp" && event.key !== "ArrowDown") return;
+    event.preventDefault();
+    event.stopPropagation();
+    let place = current + 1;
+    if (event.key === "ArrowUp") {
+      place = current - 1;
+      while (place >= 0 && lines[place].time === lines[current].time) place -= 1;
+    }
+    if (lines[place]) panel.seek(lines[place].time);
+  }
+
+  return {
+    update,
+    destroy() {
+      isGone = true;
+      clearTimeout(typing);
+      watching.disconnect();
+    },
+  };
+}

@@ -1,0 +1,340 @@
+/** Fields over time: each value where there are few, else least and greatest by pixel. */
+
+import { ApiError, get, isAborted } from "../api.js";
+import { element, fill } from "../dom.js";
+import * as state from "../state.js";
+import { offset } from "../words.js";
+import uPlot from "../vendor/uPlot.esm.js";
+import { fieldPicker } from "./fields.js";
+import { literal, moment, opening } from "./python.js";
+
+const USUAL_FIELDS = 3;
+const FIRST = "ranges.min"; // how near something is
+const MOST_FIELDS = 16;
+const COLOURS = 8; // classes `series-0` and so on of the style sheet
+const MOST_PIXELS = 4096;
+const SHARED_CURSOR = "time";
+const LEAST_DRAG = 5; // pixels; less is a click
+
+export default {
+  kind: "plot",
+  title: "Plot",
+  isFirst: false,
+  accepts: () => true,
+  mount,
+  python: (panel) => {
+    const { begin, end } = panel.range();
+    const [from, to] = [moment(panel.recording, begin), moment(panel.recording, end)];
+    const names = fieldsOf(panel.options) ?? [];
+    return [
+      opening(panel),
+      "from hybridlog.drawing.series import series",
+      "",
+      `fields = [${names.map(literal).join(", ")}]`,
+      `for one in series(query, fields, pixels=1000, span=(${from}, ${to})):`,
+      "    print(one.field, one.times, one.least, one.greatest)",
+    ].join("\n");
+  },
+};
+
+/** The fields that the options of a panel name; null if they name none. */
+function fieldsOf({ fields }) {
+  if (!Array.isArray(fields)) return null;
+  return fields.filter((one) => typeof one === "string").slice(0, MOST_FIELDS);
+}
+
+let mounted = 0;
+
+function mount(body, panel) {
+  const slot = `plot ${(mounted += 1)}`;
+  const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
+  const legend = element("div", { class: "legend" });
+  const place = element("div", { class: "chart" });
+  const problem = element("pre", { class: "problem", role: "alert", hidden: true });
+  let chart = null;
+  let drawn = null; // the answer that is drawn
+  let wanted = ""; // what was asked for last
+  let known = [];
+  let isGone = false;
+
+  const picker = fieldPicker({
+    most: MOST_FIELDS,
+    choose: (fields) => panel.setOptions({ fields }),
+  });
+  body.append(element("div", { class: "legend-line" }, legend, picker.dom), problem, place);
+  const line = element("div", { class: "cursor-line" });
+  const watching = new ResizeObserver(resized);
+  watching.observe(place);
+  const scheme = matchMedia("(prefers-color-scheme: dark)");
+  scheme.addEventListener("change", redraw);
+  load();
+
+  async function load() {
+    try {
+      const found = await get("fields", asked);
+      if (isGone) return;
+      known = found.fields;
+      if (!fieldsOf(panel.options)) panel.setOptions({ fields: usual(known) });
+      showLegend();
+      update();
+    } catch (error) {
+      refuse(error);
+    }
+  }
+
+  function fields() {
+    return fieldsOf(panel.options) ?? [];
+  }
+
+  function update() {
+    if (!isGone && place.clientWidth) ask();
+    showCursor();
+  }
+
+  /** Asks for the visible range, if it is not what was asked for last. */
+  async function ask() {
+    const { begin, end } = panel.range();
+    const names = fields();
+    const pixels = Math.min(Math.max(Math.round(place.clientWidth), 1), MOST_PIXELS);
+    const now = JSON.stringify([begin, end, names, pixels]);
+    if (now === wanted) return;
+    wanted = now;
+    chart?.setScale("x", { min: begin, max: end }); // at once, with the values that are there
+    showLegend();
+    if (!names.length) return drawAnswer({ times: [], fields: [], exact: true });
+    try {
+      const parameters = { ...asked, field: names, begin, end, pixels };
+      const answer = await get("series", parameters, { slot });
+      if (isGone) return;
+      problem.hidden = true;
+      drawAnswer(answer);
+    } catch (error) {
+      refuse(error);
+    }
+  }
+
+  function refuse(error) {
+    if (isGone || isAborted(error)) return;
+    if (!(error instanceof ApiError)) throw error;
+    problem.textContent = error.message;
+    problem.hidden = false;
+    drawAnswer({ times: [], fields: [], exact: true });
+  }
+
+  function drawAnswer(answer) {
+    const isAlike = drawn && namesOf(drawn) === namesOf(answer);
+    drawn = answer;
+    if (isAlike && chart) chart.setData(dataOf(answer), false);
+    else redraw();
+    const { begin, end } = panel.range();
+    chart.batch(() => {
+      chart.setScale("x", { min: begin, max: end });
+      chart.setScale("y", heightOf(answer));
+    });
+    showCursor();
+    place.dataset.exact = answer.exact; // for tests and for style
+  }
+
+  function redraw() {
+    if (!drawn) return;
+    chart?.destroy();
+    const { begin, end } = panel.range();
+    chart = new uPlot(optionsOf(), dataOf(drawn), place);
+    chart.setScale("x", { min: begin, max: end });
+    chart.setScale("y", heightOf(drawn));
+    chart.over.append(line);
+    chart.over.addEventListener("click", clicked);
+    showCursor();
+  }
+
+  function optionsOf() {
+    const colours = colourReader(place);
+    const axis = { stroke: colours.text, grid: { stroke: colours.line, width: 1 } };
+    const ticks = { stroke: colours.line, width: 1, size: 4 };
+    return {
+      width: Math.max(place.clientWidth, 50),
+      height: Math.max(place.clientHeight, 50),
+      legend: { show: false },
+      scales: { x: { time: false, auto: false }, y: { auto: false } },
+      axes: [
+        { ...axis, ticks, size: 28, values: (_, splits) => splits.map((ns) => timeText(ns)) },
+        { ...axis, ticks, size: 56 },
+      ],
+      cursor: {
+        y: false,
+        drag: { x: true, y: false, setScale: false, dist: LEAST_DRAG },
+        sync: { key: SHARED_CURSOR, scales: ["x", null], setSeries: false },
+        bind: { dblclick: () => () => state.set({ begin: null, end: null }, { isStep: true }) },
+        points: { show: drawn.exact },
+      },
+      hooks: { setSelect: [selected], setCursor: [showValues] },
+      series: [
+        {},
+        ...drawn.fields.flatMap((_, place) => {
+          const stroke = colours.series(place);
+          const shared = { stroke, width: 1.5, spanGaps: false };
+          // Values that have no neighbours are points, and many are too close to be told apart.
+          return [shared, { ...shared, points: { show: false } }];
+        }),
+      ],
+      bands: drawn.fields.map((_, place) => ({
+        series: [2 * place + 2, 2 * place + 1],
+        fill: colours.band(place),
+      })),
+    };
+  }
+
+  function selected() {
+    const { left, width } = chart.select;
+    if (width < LEAST_DRAG) return;
+    const [begin, end] = [left, left + width].map((at) => Math.round(chart.posToVal(at, "x")));
+    chart.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+    if (end > begin) state.set({ begin, end }, { isStep: true });
+  }
+
+  function clicked(event) {
+    const [from] = pressedAt ?? [];
+    if (from !== undefined && Math.abs(event.clientX - from) >= LEAST_DRAG) return;
+    const { left } = chart.over.getBoundingClientRect();
+    panel.seek(chart.posToVal(event.clientX - left, "x"));
+  }
+
+  let pressedAt = null;
+  place.addEventListener("mousedown", (event) => (pressedAt = [event.clientX]));
+
+  function resized() {
+    if (isGone || !place.clientWidth) return;
+    chart?.setSize({ width: place.clientWidth, height: Math.max(place.clientHeight, 50) });
+    update();
+  }
+
+  /** A line where the cursor is, and the values there. */
+  function showCursor() {
+    if (!chart) return;
+    const at = panel.cursor();
+    const { begin, end } = panel.range();
+    line.hidden = at < begin || at > end;
+    line.style.transform = `translateX(${chart.valToPos(at, "x")}px)`;
+    if (chart.cursor.left === undefined || chart.cursor.left < 0) showValues();
+  }
+
+  function showLegend() {
+    const names = fields();
+    const chips = names.map((name, place) =>
+      element(
+        "span",
+        { class: `chip series-${place % COLOURS}` },
+        element("span", { class: "name", title: name }, name),
+        element("output", { "data-field": name, "aria-live": "off" }, ""),
+        element(
+          "button",
+          {
+            type: "button",
+            class: "plain",
+            "aria-label": `Remove ${name}`,
+            onclick: () => panel.setOptions({ fields: fields().filter((one) => one !== name) }),
+          },
+          "×",
+        ),
+      ),
+    );
+    fill(legend, ...chips);
+    picker.set(known, names);
+  }
+
+  /** The values below the mouse, or else at the cursor. */
+  function showValues() {
+    if (!drawn || !chart) return;
+    const { left, idx } = chart.cursor;
+    const isHovered = left !== undefined && left >= 0 && idx !== null && idx !== undefined;
+    const place = isHovered ? idx : placeAt(drawn.times, panel.cursor());
+    drawn.fields.forEach((one) => {
+      const output = legend.querySelector(`output[data-field="${CSS.escape(one.field)}"]`);
+      if (output) output.textContent = place < 0 ? "" : valueText(one, place);
+    });
+  }
+
+  return {
+    update,
+    destroy() {
+      isGone = true;
+      watching.disconnect();
+      scheme.removeEventListener("change", redraw);
+      chart?.destroy();
+    },
+  };
+}
+
+function namesOf({ fields, exact }) {
+  return JSON.stringify([exact, ...fields.map(({ field }) => field)]);
+}
+
+function dataOf({ times, fields }) {
+  return [times, ...fields.flatMap(({ least, greatest }) => [least, greatest ?? least])];
+}
+
+/** The range of all values, with a little room. */
+function heightOf({ fields }) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const { least, greatest } of fields) {
+    for (const value of least) if (value !== null && value < low) low = value;
+    for (const value of greatest ?? least) if (value !== null && value > high) high = value;
+  }
+  if (low > high) return { min: 0, max: 1 };
+  const room = high > low ? (high - low) * 0.05 : Math.abs(high) * 0.05 || 1;
+  return { min: low - room, max: high + room };
+}
+
+/** The last entry not after a time; -1 if there is none. */
+function placeAt(times, at) {
+  let [low, high] = [0, times.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= at) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}
+
+function valueText({ least, greatest }, place) {
+  const [low, high] = [least[place], (greatest ?? least)[place]];
+  if (low === null) return "–";
+  return low === high ? numberText(low) : `${numberText(low)} … ${numberText(high)}`;
+}
+
+function numberText(value) {
+  return Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(6)));
+}
+
+function timeText(ns) {
+  return `${Number((ns / 1e9).toPrecision(12))} s`;
+}
+
+/** Fields to begin with: those that a robotics engineer would look at first. */
+function usual(known) {
+  if (known.some(({ path }) => path === FIRST)) return [FIRST];
+  const isPlain = ({ path, type }) => type !== "summary" && !/\[|^header\./.test(path);
+  const isNumber = ({ type }) => !/time|duration/.test(type);
+  const lists = [known.filter((one) => isPlain(one) && isNumber(one)), known.filter(isPlain), known];
+  const found = lists.find((list) => list.length) ?? [];
+  return found.slice(0, USUAL_FIELDS).map(({ path }) => path);
+}
+
+/** Colours of the style sheet, as a canvas needs them. */
+function colourReader(place) {
+  const probe = element("span", { hidden: true });
+  place.append(probe);
+  const colour = (name, property) => {
+    probe.className = name;
+    return getComputedStyle(probe)[property];
+  };
+  const series = Array.from({ length: COLOURS }, (_, n) => colour(`series-${n}`, "color"));
+  const found = {
+    text: colour("axis", "color"),
+    line: colour("axis", "borderTopColor"),
+    series: (n) => series[n % COLOURS],
+    band: (n) => series[n % COLOURS].replace(/^rgb\((.*)\)$/, "rgba($1, 0.35)"),
+  };
+  probe.remove();
+  return found;
+}
