@@ -23,8 +23,10 @@ ROUTES: Final = (
     "images",
     "log",
     "messages",
+    "points",
     "recordings",
     "series",
+    "track",
 )
 """The modules of `routes/`."""
 

@@ -4,8 +4,10 @@ import { element, fill, notice } from "./dom.js";
 import * as state from "./state.js";
 import image from "./panels/image.js";
 import log from "./panels/log.js";
+import map from "./panels/map.js";
 import message from "./panels/message.js";
 import plot from "./panels/plot.js";
+import points from "./panels/points.js";
 
 /**
  * The kinds of panels, in the order of the menu.
@@ -27,7 +29,7 @@ import plot from "./panels/plot.js";
  * @property {function(): {begin: number, end: number}} range the visible one
  * @property {function(number)} seek moves the cursor
  */
-const KINDS = [image, plot, log, message];
+const KINDS = [image, points, map, plot, log, message];
 
 /** The panels that a recording is first shown with: one of each kind that says so. */
 function firstPanels(topics) {

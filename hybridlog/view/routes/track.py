@@ -1,0 +1,65 @@
+"""The positions of a satellite receiver: its track, and the one at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.drawing.track import fix_of, position_of, track
+from hybridlog.view.context import route, start_of
+from hybridlog.view.current import current
+from hybridlog.view.packed import packed_response
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from starlette.responses import Response
+
+    from hybridlog.view.asked import Asked
+    from hybridlog.view.context import Context
+
+
+def track_of(context: Context, asked: Asked) -> Response:
+    """The track of a topic in metres from its first fix, and the times.
+
+    Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time.
+    """
+    recording = context.recording(asked)
+    start = start_of(recording)
+    span = None
+    if asked.has("begin") or asked.has("end"):
+        span = start + asked.offset("begin"), start + asked.offset("end")
+    query = context.query(recording, asked.text("topic"))
+    found = track(query, pixels=asked.pixels(), span=span)
+    header = {
+        "grid": None if found.grid is None else asdict(found.grid),
+        "messages": found.messages,
+        "fixes": found.fixes,
+        "exact": found.exact,
+    }
+    arrays: dict[str, NDArray[np.floating[Any]]] = {
+        "times": (found.times - start).astype(np.float64),
+        "xy": found.xy.astype(np.float32),
+    }
+    return packed_response(header, arrays)
+
+
+def fix_at(context: Context, asked: Asked) -> dict[str, Any]:
+    """The position of the message that is current at a time.
+
+    Parameters: `recording`, `topic`, `at`.
+    """
+    shown = current(context, asked)
+    answer: dict[str, Any] = {"time": shown.time, "until": shown.until}
+    if shown.message is None:
+        return answer
+    query = context.query(context.recording(asked), shown.message.topic)
+    found = asdict(fix_of(shown.message, position_of(query) or ""))
+    for name in ("latitude", "longitude"):
+        found[name] = found[name] if math.isfinite(found[name]) else None
+    return {**found, **answer}
+
+
+routes = [route("/track", track_of), route("/fix", fix_at)]

@@ -1,0 +1,263 @@
+/** The track of a satellite receiver on a grid in metres: no tiles, no network. */
+
+import { ApiError, bytes, get } from "../api.js";
+import { element } from "../dom.js";
+import { unpack } from "../spatial/packed.js";
+import { metres, plane } from "../spatial/plane.js";
+import { count, offset } from "../words.js";
+import { follow } from "./follow.js";
+import { opening } from "./python.js";
+
+const PIXELS = 2000; // steps of time of a track
+const NEAR = 12; // pixels within which a click means the track
+const TYPES = new Set([
+  "sensor_msgs/NavSatFix",
+  "gps_common/GPSFix",
+  "gps_msgs/GPSFix",
+  "geographic_msgs/GeoPointStamped",
+  "geographic_msgs/GeoPoseStamped",
+  "foxglove.LocationFix",
+  "foxglove_msgs/LocationFix",
+]);
+
+export default {
+  kind: "map",
+  title: "Map",
+  isFirst: true,
+  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  mount,
+  python: (panel) =>
+    [
+      opening(panel),
+      "from hybridlog.drawing.track import track",
+      "",
+      `found = track(query, pixels=${PIXELS})`,
+      "print(found.grid, found.xy)",
+    ].join("\n"),
+};
+
+function mount(body, panel) {
+  const fit = element("button", { type: "button", title: "Show the whole track (0)" }, "Fit");
+  const facts = element("p", { class: "facts", role: "status" }, "…");
+  const problem = element("pre", { class: "problem", role: "alert", hidden: true });
+  const place = element("div", { class: "space" });
+  const sum = element("span", { class: "sum" });
+  body.append(element("div", { class: "tools" }, sum, fit), place, problem, facts);
+  body.classList.add("spatial");
+  const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
+
+  let track = null; // of the whole recording
+  let detail = null; // of the visible range, if that shows more
+  let wanted = ""; // the range that was asked for last
+  let fix = null;
+  let messages = -1;
+  let isGone = false;
+
+  const drawn = plane(place, { label: `Track of ${panel.topic.topic}`, paint, pick });
+  fit.addEventListener("click", drawn.reset);
+  const following = follow({
+    load: (at) => get("fix", { ...asked, at }),
+    show(found) {
+      fix = found;
+      describe();
+      drawn.redraw();
+    },
+    fail: refuse,
+    grows: panel.recording.info.status === "open",
+  });
+  update();
+  return {
+    update,
+    destroy() {
+      isGone = true;
+      following.destroy();
+      drawn.destroy();
+    },
+  };
+
+  function update() {
+    following.want(panel.cursor());
+    if (messages !== panel.topic.messages) {
+      messages = panel.topic.messages;
+      load();
+    } else {
+      look();
+    }
+    drawn.redraw();
+  }
+
+  async function load() {
+    try {
+      const found = unpack(await bytes("track", { ...asked, pixels: PIXELS }));
+      if (isGone) return;
+      track = found;
+      problem.hidden = true;
+      place.hidden = false;
+      drawn.fit(boxOf(track.arrays.xy));
+      describe();
+      look();
+    } catch (error) {
+      refuse(error);
+    }
+  }
+
+  /** Asks for more of the visible range than the whole track shows. */
+  async function look() {
+    const { begin, end } = panel.range();
+    const key = `${begin} ${end}`;
+    if (!track || track.exact || key === wanted) return;
+    wanted = key;
+    try {
+      const parameters = { ...asked, begin, end, pixels: PIXELS };
+      const found = unpack(await bytes("track", parameters));
+      if (isGone || key !== wanted) return;
+      detail = found.grid ? { ...found, shift: shiftOf(found.grid) } : null;
+      drawn.redraw();
+    } catch (error) {
+      refuse(error);
+    }
+  }
+
+  /** Metres from the origin of the whole track. */
+  function shiftOf({ latitude, longitude }) {
+    const { grid } = track;
+    const turn = ((((longitude - grid.longitude + 180) % 360) + 360) % 360) - 180;
+    return [turn * grid.east, (latitude - grid.latitude) * grid.north];
+  }
+
+  function paint(context, view) {
+    if (!track) return;
+    const { begin, end } = panel.range();
+    line(context, view, track, { colour: view.theme.faint, width: 1 });
+    const part = detail ?? track;
+    line(context, view, part, { colour: view.theme.accent, width: 2, begin, end });
+    if (!fix?.has_fix || !track.grid) return;
+    const [x, y] = shiftOf(fix);
+    const [right, down] = [view.x(x), view.y(y)];
+    context.fillStyle = view.theme.mark;
+    context.strokeStyle = view.theme.mark;
+    if (fix.ellipse) {
+      const [long, across, angle] = fix.ellipse;
+      context.lineWidth = 1;
+      context.beginPath();
+      context.ellipse(right, down, long * view.scale, across * view.scale, -angle, 0, 2 * Math.PI);
+      context.stroke();
+      context.globalAlpha = 0.15;
+      context.fill();
+      context.globalAlpha = 1;
+    }
+    context.beginPath();
+    context.arc(right, down, 4, 0, 2 * Math.PI);
+    context.fill();
+  }
+
+  function pick(x, y, pixel) {
+    if (!track) return;
+    const { times, xy } = track.arrays;
+    let nearest = NEAR * pixel;
+    let time = null;
+    for (let at = 0; at < times.length; at += 1) {
+      const distance = Math.hypot(xy[2 * at] - x, xy[2 * at + 1] - y);
+      if (distance <= nearest) [nearest, time] = [distance, times[at]];
+    }
+    if (time !== null) panel.seek(time);
+  }
+
+  function describe() {
+    if (track) {
+      const without = track.messages - track.fixes;
+      sum.textContent = [
+        `${count(track.fixes)} fixes`,
+        without ? `${count(without)} messages without a fix` : null,
+        track.grid ? `grid from ${degrees(track.grid)}` : null,
+      ]
+        .filter(Boolean)
+        .join(" · ");
+      Object.assign(place.dataset, {
+        points: track.arrays.times.length,
+        fixes: track.fixes,
+        messages: track.messages,
+        exact: track.exact,
+        box: JSON.stringify(boxOf(track.arrays.xy)),
+      });
+    }
+    if (!fix) return;
+    facts.textContent = fix.time === null ? "No fix at or before the cursor." : describeFix(fix);
+    facts.title = facts.textContent;
+    place.dataset.fix = JSON.stringify(fix);
+  }
+
+  function refuse(error) {
+    if (!(error instanceof ApiError)) throw error;
+    if (isGone) return;
+    problem.textContent = error.message;
+    problem.hidden = false;
+    place.hidden = true;
+  }
+}
+
+/** Draws a track, or the part of it in a range; NaN is a gap. */
+function line(context, view, { arrays, shift = [0, 0] }, { colour, width, begin, end }) {
+  const { times, xy } = arrays;
+  context.strokeStyle = colour;
+  context.fillStyle = colour;
+  context.lineWidth = width;
+  context.lineJoin = "round";
+  context.beginPath();
+  let isDown = false;
+  for (let at = 0; at < times.length; at += 1) {
+    const x = xy[2 * at];
+    if (Number.isNaN(x) || times[at] < begin || times[at] > end) {
+      isDown = false;
+      continue;
+    }
+    const right = view.x(x + shift[0]);
+    const down = view.y(xy[2 * at + 1] + shift[1]);
+    if (isDown) context.lineTo(right, down);
+    else context.moveTo(right, down);
+    // A single fix between gaps is a dot.
+    if (!isDown) context.lineTo(right + 0.1, down);
+    isDown = true;
+  }
+  context.lineCap = "round";
+  context.stroke();
+}
+
+function boxOf(xy) {
+  let [left, bottom, right, top] = [Infinity, Infinity, -Infinity, -Infinity];
+  for (let at = 0; at < xy.length; at += 2) {
+    if (Number.isNaN(xy[at])) continue;
+    left = Math.min(left, xy[at]);
+    right = Math.max(right, xy[at]);
+    bottom = Math.min(bottom, xy[at + 1]);
+    top = Math.max(top, xy[at + 1]);
+  }
+  if (left > right) return { left: -5, right: 5, bottom: -5, top: 5 };
+  // A receiver that stands still is not shown in a picture of millimetres.
+  const [x, y] = [(left + right) / 2, (bottom + top) / 2];
+  return {
+    left: Math.min(left, x - 2),
+    right: Math.max(right, x + 2),
+    bottom: Math.min(bottom, y - 2),
+    top: Math.max(top, y + 2),
+  };
+}
+
+function degrees({ latitude, longitude }) {
+  const north = `${Math.abs(latitude).toFixed(7)}° ${latitude < 0 ? "S" : "N"}`;
+  return `${north}, ${Math.abs(longitude).toFixed(7)}° ${longitude < 0 ? "W" : "E"}`;
+}
+
+function describeFix({ time, has_fix: hasFix, latitude, longitude, altitude, status, ellipse }) {
+  const isPosition = latitude !== null && longitude !== null;
+  return [
+    offset(time),
+    hasFix ? degrees({ latitude, longitude }) : "no fix",
+    !hasFix && isPosition ? `(${degrees({ latitude, longitude })})` : null,
+    altitude === null ? null : `${Number(altitude.toFixed(3))} m high`,
+    status === null ? null : `status ${status}`,
+    ellipse ? `95 % within ${metres(Number(ellipse[0].toPrecision(3)))}` : null,
+  ]
+    .filter((part) => part !== null)
+    .join(" · ");
+}

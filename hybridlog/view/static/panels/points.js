@@ -1,0 +1,339 @@
+/** The points of a laser scan or point cloud: scans from above, clouds in space. */
+
+import { bytes } from "../api.js";
+import { element, fill } from "../dom.js";
+import { coloursOf, packedColours, paintScale, sameColour, themeOf } from "../spatial/colours.js";
+import { unpack } from "../spatial/packed.js";
+import { metres, plane } from "../spatial/plane.js";
+import { count, offset } from "../words.js";
+import { follow } from "./follow.js";
+import { moment, opening } from "./python.js";
+
+const TYPES = new Set([
+  "sensor_msgs/LaserScan",
+  "sensor_msgs/MultiEchoLaserScan",
+  "sensor_msgs/PointCloud2",
+  "sensor_msgs/PointCloud",
+  "foxglove.LaserScan",
+  "foxglove.PointCloud",
+  "foxglove_msgs/LaserScan",
+  "foxglove_msgs/PointCloud",
+]);
+const AXES = ["x", "y", "z"];
+const COLOUR = "rgb";
+const PLAIN = "one colour";
+const POINT = 2; // pixels
+
+export default {
+  kind: "points",
+  title: "Points",
+  isFirst: true,
+  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  mount,
+  python: (panel) =>
+    [
+      opening(panel),
+      `message = query.at(${moment(panel.recording, panel.cursor())})`,
+      "points = message.to_numpy()",
+      "print(points.shape, points.dtype.names)",
+    ].join("\n"),
+};
+
+function mount(body, panel) {
+  const colour = element("select", {
+    "aria-label": "Colour by",
+    onchange: () => panel.setOptions({ colour: colour.value }),
+  });
+  const turn = element("button", {
+    type: "button",
+    onclick: () => panel.setOptions({ above: !isAbove() }),
+  });
+  const fit = element("button", { type: "button", onclick: refit, title: "Show all points (0)" }, "Fit");
+  const gradient = element("canvas", { "aria-hidden": "true" });
+  const [low, high] = [element("span"), element("span")];
+  const legend = element("span", { class: "scale" }, low, gradient, high);
+  const facts = element("p", { class: "facts", role: "status" }, "…");
+  const problem = element("pre", { class: "problem", role: "alert", hidden: true });
+  const place = element("div", { class: "space" });
+  body.append(element("div", { class: "tools" }, colour, legend, turn, fit), place, problem, facts);
+  body.classList.add("spatial");
+  paintScale(gradient);
+
+  let found = null; // the answer that is shown
+  let usual = "intensity"; // what colours show as long as the user has not chosen
+  let drawn = null; // where it is drawn: {isFlat, show, fit, reset, destroy}
+  let scales = {}; // by name of the values, the least and greatest seen so far
+  let box = null; // where points were seen so far, in metres of the frame
+  let module = null; // draws in space; null until it is needed
+  let without = ""; // why there is no space to draw in
+  let isGone = false;
+  let asked = chosen();
+
+  const following = follow({
+    load,
+    show: (answer) => show(answer),
+    fail: (error) => refuse(error.message),
+    grows: panel.recording.info.status === "open",
+  });
+  following.want(panel.cursor());
+  return {
+    update() {
+      if (chosen() !== asked) {
+        asked = chosen();
+        following.renew();
+      }
+      if (found && drawn && drawn.isFlat !== isFlat()) show(found);
+      following.want(panel.cursor());
+    },
+    destroy() {
+      isGone = true;
+      following.destroy();
+      drawn?.destroy();
+    },
+  };
+
+  /** What colours show: the user's choice, else what the first message suggests. */
+  function chosen() {
+    return typeof panel.options.colour === "string" ? panel.options.colour : null;
+  }
+
+  async function load(at) {
+    const parameters = { recording: panel.recording.info.id, topic: panel.topic.topic, at };
+    const value = chosen() ?? usual;
+    const isAxis = AXES.includes(value) || value === PLAIN;
+    const buffer = await bytes("points", { ...parameters, value: isAxis ? null : value });
+    const answer = { ...unpack(buffer), size: buffer.byteLength, value };
+    if (answer.names) usual = suggested(answer);
+    // The first answer tells which values there are.
+    return (chosen() ?? usual) === value ? answer : load(at);
+  }
+
+  async function show(answer) {
+    if (answer.time === null) return refuse("No scan or cloud at or before the cursor.", false);
+    if (answer.problem) return refuse(answer.problem);
+    found = answer;
+    remember();
+    if (!isFlat() && !module) {
+      await load3d();
+      if (isGone || found !== answer) return undefined;
+    }
+    problem.hidden = true;
+    place.hidden = false;
+    if (drawn?.isFlat !== isFlat()) {
+      drawn?.destroy();
+      drawn = null;
+      drawn = made();
+    }
+    drawn.fit(shifted(box));
+    drawn.show(found.arrays.xyz, colours());
+    describe();
+    return undefined;
+  }
+
+  async function load3d() {
+    try {
+      module = await import("../spatial/scene.js");
+    } catch (error) {
+      without = `${error.message}: points are shown from above.`;
+    }
+  }
+
+  function made() {
+    try {
+      if (!isFlat()) return deep(module, place, panel);
+    } catch (error) {
+      without = `${error.message}: points are shown from above.`;
+    }
+    return flat(place, panel);
+  }
+
+  function isAbove() {
+    return Boolean(panel.options.above);
+  }
+
+  function isFlat() {
+    return found.flat || isAbove() || Boolean(without);
+  }
+
+  /** Widens what was seen, so that neither view nor colours jump from message to message. */
+  function remember() {
+    const [x, y, z] = AXES.map((axis, at) => core(axis, found.origin[at]));
+    if (x) {
+      const own = { left: x[0], right: x[1], bottom: y[0], top: y[1], low: z[0], high: z[1] };
+      // A scan is seen from its scanner.
+      if (found.flat) Object.assign(own, around(own));
+      box = box ? joined(box, own) : own;
+    }
+    const { value } = found;
+    const seen = AXES.includes(value)
+      ? core(value, found.origin[AXES.indexOf(value)])
+      : core("value", found.base);
+    if (seen) {
+      const scale = (scales[value] ??= { low: seen[0], high: seen[1] });
+      scale.low = Math.min(scale.low, seen[0]);
+      scale.high = Math.max(scale.high, seen[1]);
+    }
+  }
+
+  function core(name, base) {
+    const bounds = found.bounds[name];
+    return bounds && [bounds[2] + base, bounds[3] + base];
+  }
+
+  /** A box of the frame in metres from the origin of this message's points. */
+  function shifted(whole) {
+    const [x, y, z] = found.origin;
+    if (!whole) return { left: -5, right: 5, bottom: -5, top: 5, low: 0, high: 0 };
+    return {
+      left: whole.left - x,
+      right: whole.right - x,
+      bottom: whole.bottom - y,
+      top: whole.top - y,
+      low: whole.low - z,
+      high: whole.high - z,
+    };
+  }
+
+  function colours() {
+    const { value, arrays, origin, base } = found;
+    const scale = scales[value];
+    if (value === COLOUR && arrays.value) return packedColours(arrays.value);
+    if (AXES.includes(value) && scale) {
+      const at = AXES.indexOf(value);
+      const own = { low: scale.low - origin[at], high: scale.high - origin[at] };
+      return coloursOf(arrays.xyz, own, 3, at);
+    }
+    if (arrays.value && scale) {
+      return coloursOf(arrays.value, { low: scale.low - base, high: scale.high - base });
+    }
+    return sameColour(arrays.xyz.length / 3, themeOf(place).accent);
+  }
+
+  function describe() {
+    const { shown, total, dropped, every, frame, time, origin, remarks, value } = found;
+    const left = Object.entries(dropped).map(([why, number]) => `${count(number)} ${why}`);
+    const parts = [
+      shown === total ? `${count(total)} points` : `${count(shown)} of ${count(total)} points`,
+      without && !found.flat ? without : null,
+      ...left,
+      every > 1 ? `every ${every}th is drawn` : null,
+      frame ? `frame ${frame}` : null,
+      origin.some(Boolean) ? `from ${origin.join(", ")} m` : null,
+      offset(time),
+      drawn.step ? `grid ${metres(drawn.step)}` : null,
+      ...remarks,
+    ];
+    facts.textContent = parts.filter(Boolean).join(" · ");
+    facts.title = facts.textContent;
+    const options = [...names, ...AXES.slice(0, found.flat ? 2 : 3), PLAIN];
+    if (options.join("\n") !== colour.dataset.options) {
+      colour.dataset.options = options.join("\n");
+      fill(colour, ...options.map((name) => element("option", { value: name }, name)));
+    }
+    colour.value = value;
+    const scale = value === COLOUR || value === PLAIN ? null : scales[value];
+    legend.classList.toggle("unused", !scale);
+    [low.textContent, high.textContent] = scale ? [short(scale.low), short(scale.high)] : ["", ""];
+    turn.textContent = isAbove() ? "In space" : "From above";
+    turn.hidden = found.flat || Boolean(without);
+    Object.assign(place.dataset, {
+      points: shown,
+      total,
+      time,
+      frame,
+      value,
+      bounds: JSON.stringify(found.bounds),
+      drawing: drawn.isFlat ? "flat" : "space",
+    });
+  }
+
+  function refit() {
+    box = null;
+    scales = {};
+    if (!found?.arrays?.xyz) return;
+    show(found);
+    drawn.reset();
+  }
+
+  function refuse(text, isProblem = true) {
+    problem.textContent = text;
+    problem.hidden = false;
+    problem.classList.toggle("problem", isProblem);
+    place.hidden = true;
+    facts.textContent = "\u00a0";
+    delete place.dataset.points;
+  }
+}
+
+/** What colours show at first: the colours themselves, intensity, or else distance or height. */
+function suggested({ names, flat: isFlat }) {
+  const known = [COLOUR, "intensity", "range"].find((name) => names.includes(name));
+  return known ?? (isFlat ? PLAIN : "z");
+}
+
+/** Points from above, on a plane. */
+function flat(place, panel) {
+  let xyz = new Float32Array();
+  let colours = new Uint8Array();
+  const made = plane(place, { label: `Points of ${panel.topic.topic}`, paint });
+
+  function paint(context, view) {
+    const radius = POINT / 2;
+    let style = -1;
+    for (let at = 0; at < xyz.length; at += 3) {
+      const x = view.x(xyz[at]);
+      const y = view.y(xyz[at + 1]);
+      if (x < 0 || y < 0 || x > view.width || y > view.height) continue;
+      const own = (colours[at] << 16) | (colours[at + 1] << 8) | colours[at + 2];
+      if (own !== style) {
+        style = own;
+        context.fillStyle = `rgb(${colours[at]},${colours[at + 1]},${colours[at + 2]})`;
+      }
+      context.fillRect(x - radius, y - radius, POINT, POINT);
+    }
+  }
+
+  return {
+    isFlat: true,
+    fit: made.fit,
+    reset: made.reset,
+    destroy: made.destroy,
+    show(places, own) {
+      xyz = places;
+      colours = own;
+      made.redraw();
+    },
+  };
+}
+
+/** Points in space. */
+function deep(module, place, panel) {
+  const made = module.scene(place, { label: `Points of ${panel.topic.topic}`, point: POINT });
+  return { ...made, isFlat: false, get step() { return made.step; } };
+}
+
+function around({ left, right, bottom, top }) {
+  return {
+    left: Math.min(left, 0),
+    right: Math.max(right, 0),
+    bottom: Math.min(bottom, 0),
+    top: Math.max(top, 0),
+  };
+}
+
+function joined(a, b) {
+  const least = (name) => Math.min(a[name], b[name]);
+  const greatest = (name) => Math.max(a[name], b[name]);
+  return {
+    left: least("left"),
+    right: greatest("right"),
+    bottom: least("bottom"),
+    top: greatest("top"),
+    low: least("low"),
+    high: greatest("high"),
+  };
+}
+
+function short(number) {
+  return String(Number(number.toPrecision(4)));
+}

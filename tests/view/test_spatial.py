@@ -1,0 +1,386 @@
+"""Points and tracks, asked by themselves and seen in a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlencode
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import hybridlog as hl
+from hybridlog.drawing.points import points
+from hybridlog.drawing.track import track
+from hybridlog_storage.messages import Channel, Schema
+from tests.ros_values import ROS1
+from tests.view.conftest import Asking, served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+    from starlette.testclient import TestClient
+
+S = 10**9
+BASE = 1_700_000_000 * S
+RED, BLUE = 0xFF0000, 0x0000FF
+
+
+def header(frame: str) -> Any:
+    stamp = ROS1.types["builtin_interfaces/msg/Time"](1, 2)
+    return ROS1.types["std_msgs/msg/Header"](0, stamp, frame)
+
+
+def sent(topic: str, name: str, values: list[Any]) -> tuple[Channel, bytes]:
+    full = f"sensor_msgs/msg/{name}"
+    text = ROS1.generate_msgdef(full, ros_version=1)[0].encode()
+    channel = Channel(topic, "ros1", Schema(f"sensor_msgs/{name}", "ros1msg", text))
+    return channel, bytes(ROS1.serialize_ros1(ROS1.types[full](*values), full))
+
+
+def scan(at: int) -> tuple[Channel, bytes]:
+    ranges = np.array([1 + at, 2, np.inf, 50, np.nan, 4], np.float32)
+    intensities = np.arange(6, dtype=np.float32) * 10
+    values = [header("laser"), 0.0, math.pi, math.pi / 6, 0.0, 0.1, 0.1, 10.0, ranges, intensities]
+    return sent("/scan", "LaserScan", values)
+
+
+def cloud(topic: str, colour: int, *, cut: int = 0) -> tuple[Channel, bytes]:
+    """A block of 20 x 20 x 2 points."""
+    fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("rgb", 12, 6), ("ring", 16, 4)]
+    grid = [(x / 10, y / 10, z) for x in range(20) for y in range(20) for z in (0.0, 1.0)]
+    data = b"".join(struct.pack("<3fIH", *p, colour, n % 7) for n, p in enumerate(grid))
+    described = [
+        ROS1.types["sensor_msgs/msg/PointField"](name, at, kind, 1) for name, at, kind in fields
+    ]
+    raw = np.frombuffer(data[: len(data) - cut], np.uint8)
+    values = [header("lidar"), 1, len(grid), described, False, 18, 18 * len(grid), raw, True]
+    return sent(topic, "PointCloud2", values)
+
+
+def fix(at: int) -> tuple[Channel, bytes]:
+    """East by 7.5 m a second, then north; no fix from 10 to 12 s."""
+    status = ROS1.types["sensor_msgs/msg/NavSatStatus"](-1 if 10 <= at < 13 else 0, 1)
+    east, north = min(at, 15), max(at - 15, 0)
+    covariance = np.array([4, 0, 0, 0, 1, 0, 0, 0, 9], np.float64)
+    place = [48.0 + north * 1e-4, 11.0 + east * 1e-4, 500.0]
+    return sent("/fix", "NavSatFix", [header("gps"), status, *place, covariance, 2])
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with hl.open(tmp_path_factory.mktemp("spatial") / "store", create=True) as opened:
+        with opened.start("yard") as recorder:
+            for at in range(31):
+                for channel, payload in (
+                    fix(at),
+                    *([scan(at)] if at < 3 else []),
+                    *([cloud("/cloud", BLUE if at else RED)] if at < 2 else []),
+                    *([cloud("/broken", RED, cut=3)] if not at else []),
+                ):
+                    recorder.write(channel, payload, log_time=BASE + at * S)
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def asked(store: hl.Store, asking: Asking) -> TestClient:
+    return asking(store)
+
+
+def unpacked(body: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Header and arrays of an answer."""
+    (size,) = struct.unpack_from("<I", body)
+    found = json.loads(body[4 : 4 + size])
+    arrays, place = {}, 4 + size
+    for one in found["arrays"]:
+        kind = np.dtype({"float32": "<f4", "float64": "<f8"}[one["type"]])
+        assert place % kind.itemsize == 0
+        arrays[one["name"]] = np.frombuffer(body, kind, one["count"], place)
+        place += kind.itemsize * one["count"]
+    assert place == len(body)
+    return found, arrays
+
+
+def points_at(client: TestClient, **parameters: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    response = client.get("points", params={"recording": "yard", **parameters})
+    assert response.status_code == 200, response.text
+    return unpacked(response.content)
+
+
+# Routes
+
+
+def test_points_of_a_scan(asked: TestClient) -> None:
+    found, arrays = points_at(asked, topic="/scan", at=int(1.5 * S), value="intensity")
+    assert (found["time"], found["until"]) == (S, 2 * S)
+    kept = [(0, 2.0), (1, 2.0), (5, 4.0)]
+    wanted = [(r * math.cos(n * math.pi / 6), r * math.sin(n * math.pi / 6), 0) for n, r in kept]
+    assert np.allclose(arrays["xyz"].reshape(-1, 3), wanted, atol=1e-6)
+    assert arrays["value"].tolist() == [0, 10, 50]
+    assert (found["shown"], found["total"]) == (3, 6)
+    assert found["dropped"] == {"not finite": 2, "out of range": 1}
+    assert (found["frame"], found["flat"], found["every"]) == ("laser", True, 1)
+    assert found["names"] == ["range", "intensity", "angle"]
+    assert found["bounds"]["value"][:2] == [0, 50]
+    assert found["bounds"]["x"][:2] == pytest.approx([4 * math.cos(5 * math.pi / 6), 2])
+
+
+def test_points_of_a_cloud(asked: TestClient, store: hl.Store) -> None:
+    found, arrays = points_at(asked, topic="/cloud", at=S, value="rgb")
+    wanted = points(store.topic("cloud").at("+1s"))
+    assert np.array_equal(arrays["xyz"].reshape(-1, 3), wanted.xyz)
+    assert set(arrays["value"].tolist()) == {BLUE}
+    assert (found["names"], found["flat"], found["until"]) == (["rgb", "ring"], False, None)
+    found, arrays = points_at(asked, topic="/cloud", at=S, value="ring", limit=100)
+    assert (found["shown"], found["total"], found["every"]) == (100, 800, 8)
+    assert arrays["value"].tolist() == [n % 7 for n in range(0, 800, 8)]
+    found, arrays = points_at(asked, topic="/cloud", at=S, value="nothing")
+    assert list(arrays) == ["xyz"]
+
+
+def test_points_that_are_not_there(asked: TestClient) -> None:
+    found, arrays = points_at(asked, topic="/scan", at=-1)
+    assert (found["time"], found["until"], arrays) == (None, 0, {})
+    found, arrays = points_at(asked, topic="/broken", at=0)
+    assert "needs 14400 bytes and has 14397" in found["problem"]
+    assert (found["time"], arrays) == (0, {})
+    found, _ = points_at(asked, topic="/fix", at=0)
+    assert "NavSatFix has no points" in found["problem"]
+
+
+def test_a_track(asked: TestClient, store: hl.Store) -> None:
+    parameters = {"recording": "yard", "topic": "/fix", "pixels": 100}
+    found, arrays = unpacked(asked.get("track", params=parameters).content)
+    wanted = track(store.topic("fix"), pixels=100)
+    assert arrays["times"].tolist() == (wanted.times - BASE).tolist() == [n * S for n in range(31)]
+    there = arrays["xy"].reshape(-1, 2)
+    assert np.array_equal(there, wanted.xy.astype(np.float32), equal_nan=True)
+    assert np.flatnonzero(np.isnan(there[:, 0])).tolist() == [10, 11, 12]
+    assert (found["messages"], found["fixes"], found["exact"]) == (31, 28, True)
+    assert (found["grid"]["latitude"], found["grid"]["longitude"]) == (48.0, 11.0)
+    parameters |= {"begin": 3 * S, "end": 8 * S, "pixels": 1}
+    found, arrays = unpacked(asked.get("track", params=parameters).content)
+    assert arrays["times"].tolist() == [n * S for n in range(3, 8)]
+    found, arrays = unpacked(asked.get("track", params={**parameters, "begin": 50 * S}).content)
+    assert (found["grid"], len(arrays["xy"])) == (None, 0)
+
+
+def test_a_fix(asked: TestClient) -> None:
+    parameters = {"recording": "yard", "topic": "/fix"}
+    found = asked.get("fix", params={**parameters, "at": 2 * S}).json()
+    assert (found["latitude"], found["longitude"], found["altitude"]) == (48.0, 11.0002, 500.0)
+    assert (found["time"], found["until"], found["has_fix"]) == (2 * S, 3 * S, True)
+    assert found["ellipse"] == pytest.approx([4.895, 2.4477, 0], abs=1e-3)
+    found = asked.get("fix", params={**parameters, "at": 11 * S}).json()
+    assert (found["has_fix"], found["status"]) == (False, -1)
+    assert asked.get("fix", params={**parameters, "at": -5}).json() == {"time": None, "until": 0}
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "status"),
+    [
+        ("points", {"limit": 0}, 400),
+        ("points", {"limit": 500_001}, 400),
+        ("points", {"at": "NaN"}, 400),
+        ("points", {"at": 10**30}, 400),
+        ("points", {"at": None}, 400),
+        ("points", {"topic": "/none"}, 404),
+        ("points", {"value": "x" * 1025}, 400),
+        ("track", {"pixels": 0}, 400),
+        ("track", {"pixels": 10**9}, 400),
+        ("track", {"begin": 0}, 400),
+        ("track", {"topic": "/scan"}, 400),
+        ("fix", {"topic": "/scan"}, 400),
+        ("fix", {"recording": "none"}, 404),
+    ],
+)
+def test_what_cannot_be_asked(
+    asked: TestClient, path: str, change: dict[str, Any], status: int
+) -> None:
+    parameters = {"recording": "yard", "topic": "/fix", "at": 0, "pixels": 10, **change}
+    response = asked.get(path, params={k: v for k, v in parameters.items() if v is not None})
+    assert response.status_code == status
+    assert response.json()["error"]
+
+
+# The page
+
+
+@pytest.fixture(scope="module")
+def url(store: hl.Store) -> Iterator[str]:
+    with served(store) as address:
+        yield address
+
+
+def opened(page: Page, url: str, at: int, *panels: tuple[str, str, dict[str, Any]]) -> None:
+    shown = [{"kind": kind, "topic": topic, "options": options} for kind, topic, options in panels]
+    state = {"recording": "yard", "at": at, "panels": json.dumps(shown)}
+    page.goto(f"{url}#{urlencode(state)}")
+
+
+def data(page: Page, topic: str) -> dict[str, Any]:
+    """What a panel says that it draws."""
+    place = page.locator(f'article[aria-label$="{topic}"] .space')
+    found: dict[str, Any] = place.evaluate("one => ({...one.dataset})")
+    return found
+
+
+def view(page: Page, kind: str) -> list[float]:
+    text = page.locator(f"canvas.{kind}").get_attribute("data-view")
+    return [float(part) for part in (text or "").split()]
+
+
+@pytest.mark.peer("browser")
+def test_a_scan_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str], Path]) -> None:
+    opened(page, url, S, ("points", "/scan", {}))
+    page.wait_for_selector(".space[data-points='3']")
+    shown = data(page, "/scan")
+    assert (shown["drawing"], shown["total"], shown["value"]) == ("flat", "6", "intensity")
+    assert json.loads(shown["bounds"])["value"][:2] == [0, 50]
+    words = page.locator(".facts").inner_text()
+    assert words.startswith(
+        "3 of 6 points · 2 not finite · 1 out of range · frame laser · +1.000 s"
+    )
+    # The point straight ahead, 2 m away, has the colour of the least intensity.
+    before = view(page, "plane")
+    assert colour_at(page, before, (2, 0))[2] > 150 > colour_at(page, before, (2, 0))[0]
+    assert colour_at(page, before, (4 * math.cos(5 * math.pi / 6), 2))[0] > 150
+    picture_of(page, "scan")
+    canvas = page.locator("canvas.plane")
+    canvas.focus()
+    canvas.press("+")
+    canvas.press("ArrowRight")
+    page.wait_for_function(
+        "old => document.querySelector('canvas.plane').dataset.view !== old",
+        arg=canvas.get_attribute("data-view"),
+    )
+    canvas.press("0")
+    page.wait_for_timeout(50)
+    assert view(page, "plane") == before
+    page.get_by_label("Colour by").select_option("one colour")
+    page.wait_for_selector(".space[data-value='one colour']")
+    page.wait_for_function("decodeURIComponent(location.hash).includes('one+colour')")
+
+
+def colour_at(page: Page, seen: list[float], place: tuple[float, float]) -> list[int]:
+    """Red, green and blue of a place on the plane, metres."""
+    script = """([right, up, scale, x, y]) => {
+        const canvas = document.querySelector("canvas.plane");
+        const { width, height } = canvas.getBoundingClientRect();
+        const ratio = canvas.width / width;
+        const at = [width / 2 + (x - right) * scale, height / 2 - (y - up) * scale];
+        const [left, top] = at.map((pixel) => Math.round(pixel * ratio));
+        return [...canvas.getContext("2d").getImageData(left, top, 1, 1).data].slice(0, 3);
+    }"""
+    found: list[int] = page.evaluate(script, [*seen, *place])
+    return found
+
+
+@pytest.mark.peer("browser")
+def test_a_cloud_is_drawn_in_space(page: Page, url: str) -> None:
+    opened(page, url, 0, ("points", "/cloud", {}))
+    page.wait_for_selector(".space[data-drawing='space']")
+    shown = data(page, "/cloud")
+    assert (shown["points"], shown["value"], shown["frame"]) == ("800", "rgb", "lidar")
+    canvas = page.locator("canvas.scene")
+    page.wait_for_timeout(100)
+    assert pixels(canvas.screenshot(), (255, 0, 0)) > 1000
+    before = view(page, "scene")
+    canvas.focus()
+    canvas.press("ArrowLeft")
+    canvas.press("t")
+    page.wait_for_timeout(50)
+    assert view(page, "scene")[1] > 1.5
+    canvas.press("0")
+    page.wait_for_timeout(50)
+    assert view(page, "scene") == before
+    # The next cloud takes its place in the same picture.
+    page.evaluate("import('./state.js').then((state) => state.set({ at: 1e9 }))")
+    page.wait_for_selector(f".space[data-time='{S}']")
+    page.wait_for_timeout(100)
+    assert pixels(canvas.screenshot(), (0, 0, 255)) > 1000
+    assert pixels(canvas.screenshot(), (255, 0, 0)) == 0
+    assert view(page, "scene") == before
+    page.get_by_role("button", name="From above").click()
+    page.wait_for_selector(".space[data-drawing='flat']")
+
+
+def pixels(png: bytes, colour: tuple[int, int, int]) -> int:
+    """Number of pixels that have about a colour."""
+    array = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+    return int((np.abs(array - colour).max(axis=2) < 40).sum())
+
+
+@pytest.mark.peer("browser")
+def test_without_webgl_clouds_are_seen_from_above(page: Page, url: str) -> None:
+    page.add_init_script(
+        "const real = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
+        "  return kind.startsWith('webgl') ? null : real.call(this, kind, ...more); };"
+    )
+    opened(page, url, 0, ("points", "/cloud", {"colour": "ring"}), ("points", "/broken", {}))
+    page.wait_for_selector(".space[data-drawing='flat']")
+    assert data(page, "/cloud")["points"] == "800"
+    words = page.locator("article[aria-label$='/cloud'] .facts").inner_text()
+    assert "This browser has no WebGL: points are shown from above" in words
+    broken = page.locator("article[aria-label$='/broken']")
+    broken.get_by_role("alert").wait_for()
+    assert "needs 14400 bytes and has 14397" in broken.get_by_role("alert").inner_text()
+
+
+@pytest.mark.peer("browser")
+def test_a_track_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str], Path]) -> None:
+    opened(page, url, 2 * S, ("map", "/fix", {}))
+    page.wait_for_selector(".space[data-fixes='28'][data-fix]")
+    shown = data(page, "/fix")
+    assert (shown["points"], shown["messages"], shown["exact"]) == ("31", "31", "true")
+    box = json.loads(shown["box"])
+    assert (box["left"], box["bottom"]) == (0, 0)
+    assert box["right"] == pytest.approx(111.92, abs=0.3)  # 15e-4 degrees at 48 degrees north
+    assert json.loads(shown["fix"])["longitude"] == 11.0002
+    words = page.locator("article .sum").inner_text()
+    assert "28 fixes · 3 messages without a fix" in words
+    assert "95 % within 4.9 m" in page.locator(".facts").inner_text()
+    page.wait_for_timeout(100)
+    seen = view(page, "plane")
+    line, gap, ground = (colour_at(page, seen, (x, y)) for x, y in ((37, 0), (82, 0), (20, 33)))
+    assert line != gap
+    assert gap != ground  # the line of the grid
+    picture_of(page, "track")
+    # A click on the track moves the cursor there.
+    canvas = page.locator("canvas.plane")
+    box_of = canvas.bounding_box()
+    assert box_of is not None
+    x = box_of["width"] / 2 + (15 * 7.46 - seen[0]) * seen[2]
+    y = box_of["height"] / 2 - (5 * 11.12 - seen[1]) * seen[2]
+    canvas.click(position={"x": x, "y": y})
+    page.wait_for_function("document.querySelector('.space').dataset.fix.includes('48.0005')")
+
+
+@pytest.mark.peer("browser")
+def test_python_that_gets_the_same(browser: Browser, url: str) -> None:
+    context = browser.new_context(permissions=["clipboard-read", "clipboard-write"])
+    page = context.new_page()
+    try:
+        opened(page, url, S, ("points", "/scan", {}), ("map", "/fix", {}))
+        said = []
+        for topic in ("/scan", "/fix"):
+            panel = page.locator(f"article[aria-label$='{topic}']")
+            panel.get_by_role("button", name="Copy as Python").click()
+            page.wait_for_selector("text=Copied as Python")
+            text = page.evaluate("navigator.clipboard.readText()")
+            with contextlib.redirect_stdout(io.StringIO()) as output:
+                names: dict[str, Any] = {}
+                exec(text, names)
+                names["store"].close()
+            said.append(output.getvalue())
+        assert said[0] == "(6,) ('range', 'intensity', 'angle')\n"
+        assert said[1].startswith("Grid(latitude=48.0, longitude=11.0")
+    finally:
+        context.close()
