@@ -18,8 +18,8 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
 
     Returns:
         `columns`, pairs of the name and whether it is a number; `columns_left_out`, their
-        number; `rows`, texts; `times`, log time of each row as text, ns since 1970, and
-        `recordings`, its recording: both empty without such columns.
+        number; `rows`, texts; `times`, log time of each row, ns since 1970, and `recordings`,
+        the label of its recording: both empty without such columns.
     """
     first = table.select(range(min(table.num_columns, most)))
     return {
@@ -36,14 +36,14 @@ def _is_number(kind: pa.DataType) -> bool:
     return bool(types.is_integer(kind) or types.is_floating(kind) or types.is_decimal(kind))
 
 
-def _times(table: pa.Table) -> list[str | None]:
+def _times(table: pa.Table) -> list[int | None]:
     for name, is_time in (("t", pa.types.is_int64), ("log_time", pa.types.is_timestamp)):
         place = table.schema.get_field_index(name)
         if place >= 0 and is_time(table.schema.field(place).type):
             column = table.column(place)
             if name == "log_time":
                 column = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
-            return list(column.cast(pa.string()).to_pylist())
+            return list(column.to_pylist())
     return []
 
 

@@ -24,6 +24,8 @@ from hybridlog.view.routes import ask, export
 from .conftest import PORT, TOKEN
 
 if TYPE_CHECKING:
+    from httpx import Response
+    from playwright.sync_api import Page
     from starlette.testclient import TestClient
 
 NEAR = {"recording": "robot", "topic": "/base/scan", "where": "ranges.min < 0.8"}
@@ -44,6 +46,10 @@ def times(query: hl.Query) -> list[int]:
 
 def near(store: hl.Store) -> hl.Query:
     return store.topic("/base/scan").where(NEAR["where"])
+
+
+def sql(client: TestClient, text: str) -> Response:
+    return client.get("sql", params={"recording": "robot", "text": text})
 
 
 def run_program(text: str) -> list[str]:
@@ -152,27 +158,32 @@ def test_completion(client: TestClient) -> None:
 
 def test_sql_gives_rows_that_lead_to_their_time(client: TestClient, demo_store: hl.Store) -> None:
     text = "select t, recording, ranges_summary.min as near from scan where near < 0.8 order by t"
-    answer = client.get("sql", params={"text": text}).json()
+    answer = sql(client, text).json()
     want = times(near(demo_store))
-    assert [int(time) for time in answer["times"]] == want
+    start = start_of(demo_store)
+    assert answer["at"] == [time - start for time in want]
     assert set(answer["recordings"]) == {"robot"}
     assert answer["columns"] == [["t", True], ["recording", False], ["near", True]]
     assert [row[0] for row in answer["rows"]] == [str(time) for time in want]
     assert (answer["more"], answer["remarks"], answer["columns_left_out"]) == (False, [], 0)
     assert str(len(want)) in run_program(answer["python"])[-1]
     by_log_time = text.replace("select t,", "select log_time,")
-    answer = client.get("sql", params={"text": by_log_time}).json()
-    assert [int(time) // 1000 for time in answer["times"]] == [time // 1000 for time in want]
+    answer = sql(client, by_log_time).json()
+    assert answer["at"] == [time // 1000 * 1000 - start for time in want]
+    renamed = text.replace("t, recording,", "t, 'other' as recording,")
+    assert set(sql(client, renamed).json()["at"]) == {None}
+    alone = text.replace("t, recording,", "t,")
+    assert sql(client, alone).json()["at"] == [time - start for time in want]
 
 
 def test_sql_is_bounded(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer = client.get("sql", params={"text": "select range from range(100000)"}).json()
-    assert (len(answer["rows"]), answer["more"], answer["times"]) == (ask.SQL_ROWS, True, [])
+    answer = sql(client, "select range from range(100000)").json()
+    assert (len(answer["rows"]), answer["more"], answer["at"]) == (ask.SQL_ROWS, True, [])
     wide = "select " + ", ".join(f"{n} as c{n}" for n in range(300))
-    answer = client.get("sql", params={"text": wide}).json()
+    answer = sql(client, wide).json()
     assert (len(answer["columns"]), answer["columns_left_out"]) == (200, 100)
     monkeypatch.setattr(ask, "SQL_SECONDS", 0.2)
-    answer = client.get("sql", params={"text": ENDLESS})
+    answer = sql(client, ENDLESS)
     assert "stopped after 0.2 s" in answer.json()["error"]
 
 
@@ -210,9 +221,13 @@ def test_sql_stops_when_the_client_goes(demo_store: hl.Store) -> None:
     """The server's answer ends although the query would not, and the next one is answered."""
     app = make_app(demo_store, TOKEN, PORT)
     for _ in range(3):  # more than are answered at once
-        said = asyncio.run(asked_for(app, "sql", {"text": ENDLESS}, leaves_after=0.1))
+        said = asyncio.run(
+            asked_for(app, "sql", {"recording": "robot", "text": ENDLESS}, leaves_after=0.1)
+        )
         assert b"The query was stopped" in said[1]["body"]
-    said = asyncio.run(asked_for(app, "sql", {"text": "select 1 as one"}, leaves_after=9.0))
+    said = asyncio.run(
+        asked_for(app, "sql", {"recording": "robot", "text": "select 1 as one"}, leaves_after=9.0)
+    )
     assert json.loads(said[1]["body"])["rows"] == [["1"]]
 
 
@@ -292,3 +307,58 @@ def test_the_command_line_writes_the_same_file(
     assert (tmp_path / told["name"]).read_bytes() == sent.content
     assert int(told["told"]) > 0
     assert run_program(told["python"])[0] == told["told"]
+
+
+@pytest.mark.peer("browser")
+def test_a_question_is_asked_and_its_matches_become_a_file(
+    page: Page, demo_url: str, demo_store: hl.Store, client: TestClient, tmp_path: Path
+) -> None:
+    start = start_of(demo_store)
+    want = [time - start for time in times(demo_store.topic("scan").where("ranges.min < 0.8"))]
+    page.goto(f"{demo_url}#recording=robot")
+    page.get_by_label("Topic of the question").select_option("/base/scan")
+    page.locator("body").press("/")
+    page.keyboard.type("ranges.mi")
+    page.get_by_role("option", name="ranges.min").wait_for()
+    page.keyboard.press("Tab")
+    page.keyboard.type(" <")
+    page.keyboard.press("Enter")
+    assert (
+        page.locator(".ask .body .problem").inner_text().endswith("ranges.min <\n              ^")
+    )
+    page.keyboard.type(" 0.8")
+    page.keyboard.press("Enter")
+    page.get_by_text(f"{len(want)} matches").wait_for()
+    page.keyboard.press("Escape")
+    page.keyboard.press("n")
+    page.locator("li[aria-current]", has_text="#1 ").wait_for()
+    page.keyboard.press("n")
+    page.locator("li[aria-current]", has_text="#2 ").wait_for()
+    page.keyboard.press("p")
+    page.locator("li[aria-current]", has_text="#1 ").wait_for()
+    page.get_by_role("complementary").get_by_role("button", name="#5 ").first.click()
+    page.wait_for_url(lambda url: f"&at={want[4]}&" in url)
+    page.get_by_role("button", name="Export").click()
+    page.get_by_label("Part to export").select_option("matches")
+    page.get_by_text(f"{len(want)} messages").wait_for()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download").click()
+    asked = {**NEAR, "recording": "robot"}
+    told = client.get("export-command", params=asked).json()
+    assert page.get_by_label("Command line").inner_text() == told["command"]
+    assert download.value.suggested_filename == told["name"]
+    download.value.save_as(tmp_path / "sent.mcap")
+    assert (tmp_path / "sent.mcap").read_bytes() == client.get("export", params=asked).content
+    page.get_by_label("Language").select_option("sql")
+    question = page.get_by_label("Question", exact=True)
+    question.fill("select log_time, '<b>x</b>' as bold from scan order by t desc limit 2")
+    question.press("Enter")
+    page.locator("td", has_text="<b>x</b>").nth(1).wait_for()
+    page.locator("td button").first.click()
+    last = demo_store.topic("scan").reverse().first()
+    assert last is not None
+    at = last.log_time_ns // 1000 * 1000 - start
+    page.wait_for_url(lambda url: f"&at={at}&" in url)
+    question.press("ArrowUp")
+    question.press("ArrowUp")
+    assert question.input_value() == "ranges.min < 0.8"

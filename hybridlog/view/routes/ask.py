@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from hybridlog.drawing.matches import (
     Match,
@@ -137,6 +137,7 @@ def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, A
     """The first rows of a query in SQL."""
     from hybridlog.sql.shown import shown
 
+    recording = context.recording(asked)
     text = asked.text("text", longest=MAX_TEXT)
     with _sql_turn(stopped):
         connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
@@ -145,13 +146,33 @@ def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, A
             answer = connection.query(text, timeout=SQL_SECONDS)
             table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
             body = f"    print(store.sql({text!r}).to_pandas())\n"
-            return shown(table, SQL_COLUMNS) | {
+            found = shown(table, SQL_COLUMNS)
+            times, labels = found.pop("times"), found["recordings"]
+            return found | {
+                "at": _offsets(context, times, labels or [recording.label] * len(times)),
                 "more": is_cut,
                 "remarks": _remarks(context, answer),
                 "python": program(context.store, body),
             }
         finally:
             connection.close()
+
+
+def _offsets(
+    context: Context, times: Sequence[int | None], labels: Sequence[str | None]
+) -> list[int | None]:
+    """Times since the start of the recording of each row, ns; None where that is not known."""
+    starts: dict[str | None, int | None] = {None: None}
+    for label in labels:
+        if label is not None and label not in starts:
+            try:
+                starts[label] = start_of(context.store.entry(label))
+            except TopicError:
+                starts[label] = None
+    return [
+        None if time is None or starts[label] is None else time - cast("int", starts[label])
+        for time, label in zip(times, labels, strict=False)
+    ]
 
 
 @contextmanager

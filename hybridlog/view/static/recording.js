@@ -1,6 +1,7 @@
 /** One recording: its head, and below it the parts of the page that show it. */
 
 import { ApiError, get } from "./api.js";
+import { mountAsk } from "./ask.js";
 import { element, fill } from "./dom.js";
 import { mountPanels } from "./panels.js";
 import { count, duration, moment, size } from "./words.js";
@@ -33,6 +34,7 @@ export function mountRecording(main, label) {
       const toTime = (offset) => start + BigInt(Math.round(offset));
       const recording = { label: info.label, info, start, toTime };
       fill(head, summaryOf(recording));
+      ends.push(mountAsk(main, recording));
       ends.push(mountPanels(main, recording));
     } catch (error) {
       if (!(error instanceof ApiError)) throw error;

@@ -1,0 +1,213 @@
+/** The bar that takes questions, and below it their answers. */
+
+import { ApiError, get, isAborted } from "./api.js";
+import { completed, questionHistory } from "./completion.js";
+import { element, fill, notice } from "./dom.js";
+import { exportForm } from "./export.js";
+import { matchList } from "./match_list.js";
+import { predicate } from "./matches.js";
+import { sqlTable } from "./sql_table.js";
+import * as state from "./state.js";
+
+/** Shows the bar. Returns a function that takes it away. */
+export function mountAsk(main, recording) {
+  const topics = recording.info.topics.filter(({ messages }) => messages);
+  const kind = element(
+    "select",
+    { "aria-label": "Language", onchange: adapt },
+    element("option", { value: "predicate" }, "Where"),
+    element("option", { value: "sql" }, "SQL"),
+  );
+  const topic = element(
+    "select",
+    { "aria-label": "Topic of the question" },
+    ...topics.map((one) => element("option", { value: one.topic }, one.topic)),
+  );
+  const text = element("input", {
+    class: "question",
+    type: "text",
+    role: "combobox",
+    "aria-label": "Question",
+    "aria-autocomplete": "list",
+    autocomplete: "off",
+    autocapitalize: "off",
+    spellcheck: "false",
+    maxlength: 10000,
+    oninput: adapt,
+    onkeydown: pressed,
+  });
+  const within = element("input", {
+    "aria-label": "Time within which messages of other topics are",
+    placeholder: "within 0.1s",
+    title: "How near in time messages of other topics are: 0.1s",
+    size: 10,
+    maxlength: 64,
+  });
+  const candidates = completed(text, () => ({
+    recording: recording.info.id,
+    topic: topic.value,
+    language: kind.value,
+  }));
+  const history = questionHistory();
+  const list = matchList(recording);
+  const files = exportForm(recording);
+  const told = element("span", { class: "told", role: "status" });
+  const steps = element(
+    "span",
+    { class: "steps", hidden: true },
+    button("‹ Previous", "Previous match (p)", () => list.step("earlier")),
+    button("Next ›", "Next match (n)", () => list.step("later")),
+  );
+  const copy = button("Copy as Python", "Copy the question as Python", copyPython);
+  const clear = button("Clear", "Clear the question", () => state.set({ ask: null }, { isStep: true }));
+  const body = element("div", { class: "body" });
+  const bar = element(
+    "form",
+    { class: "bar", role: "search", "aria-label": "Ask", onsubmit: submit },
+    kind,
+    topic,
+    element("div", { class: "input" }, text, candidates.list),
+    within,
+    element("button", {}, "Ask"),
+    button("Export", "Export this range or the matches", files.toggle),
+  );
+  let python = "";
+  let asking = new AbortController();
+  const place = element(
+    "section",
+    { class: "ask", "aria-label": "Questions" },
+    bar,
+    element("p", { class: "row" }, told, steps, copy, clear),
+    files.form,
+    body,
+  );
+  main.append(place, list.side);
+  document.addEventListener("keydown", key);
+  const end = state.on(["ask"], answer);
+  answer();
+  return () => {
+    end();
+    asking.abort();
+    list.destroy();
+    files.destroy();
+    document.removeEventListener("keydown", key);
+  };
+
+  function adapt() {
+    const isSql = kind.value === "sql";
+    topic.hidden = isSql;
+    within.hidden = isSql || !/:(\s|$)/.test(text.value);
+    text.placeholder = isSql ? "select … from …" : "ranges.min < 0.5";
+  }
+
+  function written() {
+    return { kind: kind.value, topic: topic.value, text: text.value.trim(), within: within.value.trim() };
+  }
+
+  function write(question) {
+    kind.value = question.kind === "sql" ? "sql" : "predicate";
+    if (topics.some((one) => one.topic === question.topic)) topic.value = question.topic;
+    text.value = question.text;
+    within.value = typeof question.within === "string" ? question.within : "";
+    adapt();
+  }
+
+  function submit(event) {
+    event.preventDefault();
+    candidates.close();
+    const question = written();
+    if (!question.text) {
+      state.set({ ask: null }, { isStep: true });
+      return;
+    }
+    if (within.hidden) question.within = "";
+    history.add(question);
+    if (JSON.stringify(state.get("ask")) === JSON.stringify(question)) answer();
+    else state.set({ ask: question }, { isStep: true });
+  }
+
+  /** Asks the question of the state. */
+  async function answer() {
+    asking.abort();
+    asking = new AbortController();
+    const { signal } = asking;
+    const question = state.get("ask");
+    list.show(null);
+    steps.hidden = true;
+    copy.hidden = clear.hidden = !question;
+    fill(body);
+    told.textContent = question ? "…" : "";
+    if (!question) {
+      if (!place.contains(document.activeElement)) write({ kind: "predicate", topic: firstTopic(), text: "" });
+      return;
+    }
+    write(question);
+    try {
+      if (question.kind === "sql") await answerSql(question, signal);
+      else await answerPredicate(signal);
+    } catch (error) {
+      if (isAborted(error)) return;
+      if (!(error instanceof ApiError)) throw error;
+      told.textContent = "";
+      copy.hidden = true;
+      fill(body, element("pre", { class: "problem", role: "alert" }, error.message));
+    }
+  }
+
+  async function answerPredicate(signal) {
+    const asked = predicate(recording);
+    if (!asked) throw new ApiError("Choose a topic for the question.");
+    const found = await get("ask", asked, { slot: "ask", signal });
+    python = found.python;
+    const is = found.count === 1 ? "match" : "matches";
+    told.textContent = `${found.told} ${found.told === String(found.count) ? is : ""}`.trim();
+    told.title = `Messages of ${asked.topic} that satisfy the predicate`;
+    fill(body, ...found.remarks.map((line) => element("p", { class: "summary" }, line)));
+    list.show(found.count);
+    steps.hidden = !found.count;
+  }
+
+  async function answerSql(question, signal) {
+    const found = await get("sql", { recording: recording.info.id, text: question.text }, { slot: "ask", signal });
+    python = found.python;
+    told.textContent = "";
+    fill(body, sqlTable(recording, found));
+  }
+
+  function firstTopic() {
+    return state.get("panels")?.[0]?.topic ?? topics[0]?.topic;
+  }
+
+  async function copyPython() {
+    await navigator.clipboard.writeText(python);
+    notice("Copied as Python.");
+  }
+
+  function pressed(event) {
+    if (event.key === "Escape") {
+      event.stopPropagation();
+      if (!candidates.close()) text.blur();
+    } else if (event.key === "ArrowUp" || event.key === "ArrowDown") {
+      event.preventDefault();
+      candidates.close();
+      const found = history.step(event.key === "ArrowUp" ? -1 : 1, written());
+      if (found) write(found);
+    }
+  }
+
+  function key(event) {
+    const isTyping = event.target.closest?.("input, select, textarea, [contenteditable]");
+    if (isTyping || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key === "/") {
+      event.preventDefault();
+      text.focus();
+      text.select();
+    } else if (event.key === "n" || event.key === "p") {
+      if (predicate(recording)) list.step(event.key === "n" ? "later" : "earlier");
+    }
+  }
+}
+
+function button(text, label, onclick) {
+  return element("button", { type: "button", title: label, "aria-label": label, onclick }, text);
+}

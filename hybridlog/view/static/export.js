@@ -1,0 +1,109 @@
+/** Parts of the recording as a file: the command line that writes it, and the file itself. */
+
+import { ApiError, address, get, isAborted } from "./api.js";
+import { element, fill, notice } from "./dom.js";
+import { predicate } from "./matches.js";
+import * as state from "./state.js";
+
+/** What can be exported, and what the server has to know for it. */
+const PARTS = {
+  range: { title: "This range, all topics", ask: (asked, range) => range },
+  topic: {
+    title: "This range, the topic of the question",
+    ask: ({ topic }, range) => ({ topic, ...range }),
+  },
+  matches: { title: "Matches in this range", ask: (asked, range) => ({ ...asked, ...range }) },
+  around: {
+    title: "All topics around these matches",
+    ask: (asked, range, around) => ({ ...asked, ...range, around }),
+  },
+};
+
+/**
+ * A form to export a part of the recording.
+ *
+ * @param {Object} recording
+ * @returns {{form: HTMLElement, toggle: function(), destroy: function()}}
+ */
+export function exportForm(recording) {
+  const part = element("select", { "aria-label": "Part to export", onchange: load });
+  const around = element("input", {
+    "aria-label": "Time around each match",
+    size: 6,
+    value: "2s",
+    onchange: load,
+  });
+  const distance = element("label", {}, "± ", around);
+  const told = element("span", { role: "status" });
+  const command = element("pre", { class: "command", tabindex: "0", "aria-label": "Command line" });
+  const download = element("a", { class: "button", download: true }, "Download");
+  const problem = element("pre", { class: "problem", role: "alert", hidden: true });
+  let python = "";
+  const copies = element(
+    "span",
+    { class: "copies" },
+    download,
+    copy("Copy command", () => command.textContent),
+    copy("Copy as Python", () => python),
+  );
+  const form = element(
+    "section",
+    { class: "export", "aria-label": "Export", hidden: true },
+    element("p", { class: "row" }, part, distance, told),
+    command,
+    copies,
+    problem,
+  );
+  const end = state.on(["ask", "begin", "end"], () => form.hidden || draw());
+  return { form, toggle, destroy: end };
+
+  function toggle() {
+    form.hidden = !form.hidden;
+    if (form.hidden) return;
+    draw();
+    part.focus();
+  }
+
+  function draw() {
+    const chosen = part.value;
+    const offered = predicate(recording) ? Object.keys(PARTS) : ["range"];
+    fill(part, ...offered.map((name) => element("option", { value: name }, PARTS[name].title)));
+    if (offered.includes(chosen)) part.value = chosen;
+    load();
+  }
+
+  async function load() {
+    distance.hidden = part.value !== "around";
+    const { begin, end } = { begin: state.get("begin"), end: state.get("end") };
+    const range = begin === null ? {} : { begin: Math.round(begin), end: Math.round(end) };
+    const asked = {
+      recording: recording.info.id,
+      ...PARTS[part.value].ask(predicate(recording) ?? {}, range, around.value),
+    };
+    try {
+      const found = await get("export-command", asked, { slot: "export" });
+      told.textContent = `${found.told} messages`;
+      command.textContent = found.command;
+      python = found.python;
+      download.href = address("export", asked);
+      download.download = found.name;
+      problem.hidden = true;
+      copies.hidden = false;
+    } catch (error) {
+      if (isAborted(error)) return;
+      if (!(error instanceof ApiError)) throw error;
+      told.textContent = command.textContent = "";
+      problem.textContent = error.message;
+      problem.hidden = false;
+      copies.hidden = true;
+    }
+  }
+}
+
+function copy(title, text) {
+  const onclick = async () => {
+    await navigator.clipboard.writeText(text());
+    notice("Copied.");
+  };
+  return element("button", { type: "button", onclick }, title);
+}

@@ -1,0 +1,146 @@
+/** The list of matches, a page at a time, and the steps from one to the next. */
+
+import { ApiError, get, isAborted } from "./api.js";
+import { element, fill, notice } from "./dom.js";
+import { predicate } from "./matches.js";
+import * as state from "./state.js";
+import { count, offset } from "./words.js";
+
+const PAGE = 100;
+
+/**
+ * A list of the matches of the question.
+ *
+ * @param {Object} recording
+ * @returns {{side: HTMLElement, show: function(number|null), step: function(string),
+ *     destroy: function()}} `show` lists so many matches, null hides the list; `step` moves the
+ *     cursor to the `later` or `earlier` match
+ */
+export function matchList(recording) {
+  const rows = element("ol", { class: "rows" });
+  const title = element("span", {});
+  const side = element(
+    "aside",
+    { class: "matches", "aria-label": "Matches", hidden: true },
+    element(
+      "header",
+      {},
+      title,
+      button("‹", "Previous page of matches", () => page("earlier")),
+      button("›", "Next page of matches", () => page("later")),
+    ),
+    rows,
+  );
+  let total = 0;
+  let shown = { rows: [], before: 0 };
+  const end = state.on(["at"], mark);
+  return { side, show, step, destroy: end };
+
+  function show(number) {
+    total = number ?? 0;
+    side.hidden = number === null;
+    shown = { rows: [], before: 0 };
+    draw();
+    if (number) load({ at: recording.info.begin, seq: -1, direction: "later" });
+  }
+
+  async function load(place) {
+    const found = await list({ ...place, count: PAGE }, "match-page");
+    if (!found?.rows.length) return;
+    shown = found;
+    draw();
+  }
+
+  /** Some matches at a place; null if there is no question, or a newer one. */
+  async function list(place, slot) {
+    const asked = predicate(recording);
+    if (!asked) return null;
+    try {
+      return await get("match-list", { ...asked, ...place }, { slot });
+    } catch (error) {
+      if (isAborted(error)) return null;
+      if (!(error instanceof ApiError)) throw error;
+      notice(error.message.split("\n")[0]);
+      return null;
+    }
+  }
+
+  function page(direction) {
+    const edge = direction === "later" ? shown.rows.at(-1) : shown.rows[0];
+    if (edge) load({ at: edge[0], seq: edge[1], direction });
+  }
+
+  async function step(direction) {
+    const at = Math.round(state.get("at")) + (direction === "later" ? 1 : 0);
+    const found = await list({ at, seq: -1, direction, count: 1 }, "match-step");
+    if (!found) return;
+    if (!found.rows.length) {
+      notice(direction === "later" ? "No later match." : "No earlier match.");
+      return;
+    }
+    const [[time, seq]] = found.rows;
+    seek(time);
+    if (!shown.rows.some(([known]) => known === time)) {
+      await load({ at: time, seq: seq - 1, direction: "later" });
+      mark();
+    }
+  }
+
+  function seek(time) {
+    const changes = { at: time };
+    const [begin, end] = [state.get("begin"), state.get("end")];
+    if (begin !== null && (time < begin || time >= end)) {
+      // What is zoomed into moves along.
+      changes.begin = Math.round(time - (end - begin) / 2);
+      changes.end = changes.begin + (end - begin);
+    }
+    state.set(changes);
+  }
+
+  function draw() {
+    const last = shown.before + shown.rows.length;
+    title.textContent = shown.rows.length
+      ? `${count(shown.before + 1)}–${count(last)} of ${count(total)}`
+      : total
+        ? "…"
+        : "No match";
+    fill(
+      rows,
+      ...shown.rows.map(([time], number) =>
+        element(
+          "li",
+          {},
+          element(
+            "button",
+            { type: "button", class: "plain", onclick: () => seek(time) },
+            element("small", {}, `#${count(shown.before + number + 1)} `),
+            offset(time),
+          ),
+        ),
+      ),
+    );
+    mark();
+  }
+
+  /** Marks the match at the cursor. */
+  function mark() {
+    const at = Math.round(state.get("at"));
+    [...rows.children].forEach((row, number) => {
+      const isCurrent = shown.rows[number]?.[0] === at;
+      row.toggleAttribute("aria-current", isCurrent);
+      if (isCurrent) keepVisible(row);
+    });
+  }
+
+  /** Scrolls the list, and nothing around it. */
+  function keepVisible(row) {
+    const low = row.offsetTop - rows.offsetTop; // the head stays in sight
+    const high = row.offsetTop + row.offsetHeight;
+    if (low < side.scrollTop) side.scrollTop = low;
+    else if (high > side.scrollTop + side.clientHeight) side.scrollTop = high - side.clientHeight;
+  }
+}
+
+function button(text, label, onclick) {
+  return element("button", { type: "button", "aria-label": label, title: label, onclick }, text);
+}

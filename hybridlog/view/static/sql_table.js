@@ -1,0 +1,62 @@
+/** The answer of a question in SQL: a table whose times lead to the moment. */
+
+import { element } from "./dom.js";
+import * as state from "./state.js";
+import { count } from "./words.js";
+
+const TIMES = ["t", "log_time"];
+
+/** A table of an answer of the server. */
+export function sqlTable(recording, answer) {
+  const { columns, rows, at, recordings } = answer;
+  const cell = (text, [name, isNumber], row) => {
+    const shown =
+      TIMES.includes(name) && typeof at[row] === "number"
+        ? element("button", { type: "button", class: "plain link", onclick: () => go(row) }, text)
+        : text;
+    return element("td", { class: isNumber ? "number" : null }, shown);
+  };
+  return element(
+    "div",
+    { class: "answer" },
+    element(
+      "div",
+      { class: "scrolls table", tabindex: "0", "aria-label": "Answer" },
+      element(
+        "table",
+        {},
+        element("thead", {}, element("tr", {}, ...columns.map(heading))),
+        element(
+          "tbody",
+          {},
+          ...rows.map((cells, row) =>
+            element("tr", {}, ...cells.map((text, column) => cell(text, columns[column], row))),
+          ),
+        ),
+      ),
+    ),
+    element("p", { class: "summary" }, summaryOf(answer)),
+  );
+
+  /** Shows the moment of a row, in its recording. */
+  function go(row) {
+    const label = recordings[row] ?? recording.label;
+    if (label === recording.label) state.set({ at: at[row] });
+    else state.show(label, { at: at[row], ask: state.get("ask") });
+  }
+}
+
+function heading([name, isNumber]) {
+  return element("th", { class: isNumber ? "number" : null, scope: "col" }, name);
+}
+
+function summaryOf({ rows, more, columns_left_out: leftOut, remarks }) {
+  const words = rows.length === 1 ? "1 row" : `${count(rows.length)} rows`;
+  return [
+    more ? `The first ${words}; the answer has more. \`hybridlog sql\` gives all` : words,
+    leftOut ? `${count(leftOut)} further columns are left out` : null,
+    ...remarks,
+  ]
+    .filter(Boolean)
+    .join(". ");
+}
