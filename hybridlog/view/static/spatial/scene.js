@@ -32,10 +32,10 @@ const START = { azimuth: -2.3, height: 0.55 }; // from behind, to the right and 
  * Puts a scene into an element.
  *
  * @param {HTMLElement} parent
- * @param {{label: string, point?: number}} parts `point` is the size of a point, pixels
+ * @param {{label: string}} parts
  * @throws {Error} this browser has no WebGL
  */
-export function scene(parent, { label, point = 2 }) {
+export function scene(parent, { label }) {
   const canvas = element("canvas", {
     class: "scene",
     tabindex: 0,
@@ -55,7 +55,7 @@ export function scene(parent, { label, point = 2 }) {
   camera.up.set(0, 0, 1);
   const cloud = new Points(
     new BufferGeometry(),
-    new PointsMaterial({ size: point * devicePixelRatio, sizeAttenuation: false, vertexColors: true }),
+    new PointsMaterial({ sizeAttenuation: false, vertexColors: true }),
   );
   cloud.frustumCulled = false;
   const grid = new LineSegments(new BufferGeometry(), new LineBasicMaterial());
@@ -151,7 +151,8 @@ export function scene(parent, { label, point = 2 }) {
   }
 
   function fitted() {
-    const distance = (whole.radius / Math.tan((ANGLE * Math.PI) / 360)) * 1.05;
+    const narrow = Math.min(camera.aspect, 1);
+    const distance = (whole.radius / Math.tan((ANGLE * Math.PI) / 360) / narrow) * 1.05;
     return { distance, target: [...whole.centre] };
   }
 
@@ -207,8 +208,9 @@ export function scene(parent, { label, point = 2 }) {
     get step() {
       return step;
     },
-    /** Draws these in the place of others: x, y and z of each, and red, green and blue. */
-    show(xyz, colours) {
+    /** Draws these in the place of others: x, y and z of each, red, green and blue, and size. */
+    show(xyz, colours, pixels) {
+      cloud.material.size = pixels * devicePixelRatio;
       setPlaces(cloud, xyz);
       cloud.geometry.setAttribute("color", new BufferAttribute(colours, 3, true));
       redraw();
