@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _BLOCK_ROWS = 65_536
 _BLOCK_BYTES = 32 << 20
 _SEQ_BITS = 44
-_FIXED = {"ros1", "cdr"}
+FIXED = {"ros1", "cdr"}
 """Encodings whose definition fixes the fields."""
 
 
@@ -157,7 +157,7 @@ def json_columns(schema: pa.Schema | None) -> list[str]:
 
 def _is_open(channel: RecordedChannel) -> bool:
     """True if the columns of a channel depend on the content of its messages."""
-    return channel.channel.message_encoding not in _FIXED
+    return channel.channel.message_encoding not in FIXED
 
 
 def _finished(builder: TableBuilder, question: Question) -> pa.Table:

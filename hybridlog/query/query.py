@@ -801,6 +801,9 @@ class Query:
             PayloadError: None of the messages can be an array.
             DefinitionError: The first of them has no definition.
         """
+        scans = self._scans()
+        if scans is not None:
+            return scans
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
         unreadable = 0
@@ -815,6 +818,17 @@ class Query:
         self.counters.unreadable += unreadable
         alike = {(a.shape, a.dtype) for a in arrays}
         return np.stack(arrays) if len(alike) == 1 else arrays
+
+    def _scans(self) -> NDArray[Any] | None:
+        """Laser scans of one length as an array, from columns; None for everything else."""
+        from hybridlog.frames.scans import FIELDS, are_scans, scans_in
+
+        if not are_scans(self.channels()):
+            return None
+        self.counters.reset()
+        question = replace(self.question, fields=FIELDS, tags=())
+        found = scans_in(Planner(self._session, question, self.counters))
+        return None if self.counters.unreadable or self.counters.reduced else found
 
     # Known without reading messages.
 

@@ -48,10 +48,16 @@ def _header(n: int, frame: str):
 
 
 def scan(
-    values: Sequence[float] | np.ndarray, *, frame: str = "laser", n: int = 2, big: bool = False
+    values: Sequence[float] | np.ndarray,
+    *,
+    frame: str = "laser",
+    n: int = 2,
+    big: bool = False,
+    measured: int | None = None,
 ) -> bytes:
+    """A scan; by default half as many intensities are measured as ranges."""
     numbers = np.asarray(values, np.float32)
-    half = numbers[: len(numbers) // 2]
+    half = numbers[: len(numbers) // 2 if measured is None else measured]
     angles = -1.5, 1.5, 0.01, 0.0, 0.1, 0.0, 30.0
     message = typestore().types[SCAN](_header(n, frame), *angles, numbers, half)
     return bytes(typestore().serialize_cdr(message, SCAN, little_endian=not big))

@@ -13,7 +13,8 @@ import pytest
 import hybridlog as hl
 from hybridlog.query.engines.base import Need
 from hybridlog.query.planner import Planner
-from tests.payloads.logs import BASE, COUNT, STEP
+from hybridlog_storage.errors import PayloadError
+from tests.payloads.logs import BASE, COUNT, SCAN, STEP, scan, write_log
 
 
 @pytest.fixture(scope="module")
@@ -134,3 +135,69 @@ def test_what_columns_cannot_tell_they_leave(stores: tuple[hl.Store, hl.Store]) 
 def test_types_are_those_of_the_messages(stores: tuple[hl.Store, hl.Store]) -> None:
     table = stores[1].topic("image").fields("data").to_arrow()
     assert table.schema.field("data").type == pa.list_(pa.uint8())
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """Topics of scans, one of them of one length."""
+    path = tmp_path_factory.mktemp("scans")
+    said = []
+    for n in range(30):
+        values = np.sin(np.arange(60) + n).astype(np.float32)
+        values[n] = (np.inf, np.nan, -np.inf)[n % 3]
+        for topic, size, measured in (
+            ("/even", 60, 60),
+            ("/without", 60, 0),
+            ("/some", 60, 60 * (n % 2)),
+            ("/fewer", 60, 59),
+            ("/longer", 60 - n % 2, 60 - n % 2),
+            ("/none", 0, 0),
+        ):
+            payload = scan(values[:size], n=n, big=n % 4 == 0, measured=measured)
+            said.append((topic, SCAN, BASE + n * STEP, payload))
+    said.append(("/even", SCAN, BASE + 40 * STEP, b"odd"))
+    log = write_log(path / "log.mcap", said)
+    with hl.open(path / "store", create=True) as store:
+        store.record(log, name="log")
+        yield store
+
+
+@pytest.mark.parametrize("topic", ["/even", "/without", "/some", "/fewer", "/longer", "/none"])
+def test_scans_as_one_array(scans: hl.Store, topic: str) -> None:
+    """From columns where scans are alike, and as from the messages one by one."""
+    whole = scans.topic(topic).between(None, "+1s")
+    questions = [
+        whole,
+        whole.reverse(),
+        whole.every(3),
+        whole.limit(4),
+        whole.where("ranges > 0.9"),
+    ]
+    for query in questions:
+        expected = [message.to_numpy() for message in query]
+        found = query.to_numpy()
+        is_stack = len({(one.shape, one.dtype) for one in expected}) == 1
+        assert isinstance(found, np.ndarray) == is_stack
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            assert (one.dtype, one.shape) == (other.dtype, other.shape)
+            assert one.tobytes() == other.tobytes()
+
+
+def test_scans_of_compacted_recordings_come_from_columns(scans: hl.Store) -> None:
+    query = scans.topic("/without").between("+0.3s", "+1.2s")
+    expected = query.to_numpy()
+    assert query.counters.chunks_read > 0
+    scans.compact(topics=["without"])
+    assert query.to_numpy().tobytes() == expected.tobytes()  # type: ignore[union-attr]
+    assert query.counters.chunks_read == 0
+    assert query.counters.messages == len(expected) == 18
+
+
+def test_odd_scans_are_counted(scans: hl.Store) -> None:
+    query = scans.topic("/even")
+    assert len(query.to_numpy()) == 30
+    assert query.counters.unreadable == 1
+    assert scans.topic("/even").between("+1.9s", None).limit(0).to_numpy() == []
+    with pytest.raises(PayloadError, match="does not fit"):
+        scans.topic("/even").between("+1.9s", None).to_numpy()

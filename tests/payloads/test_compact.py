@@ -65,6 +65,7 @@ def test_the_columns_say_what_the_messages_say(compacted: hl.Store) -> None:
     assert found.column("pub").to_pylist() == [BASE + n * STEP - 5 for n in range(COUNT)]
     assert found.column("seq").to_pylist() == [m.seq for m in compacted.topic("/scan")]
     assert {row["frame_id"] for row in found.column("header").to_pylist()} == {"laser"}
+    assert not found.schema.field("ranges").type.value_field.nullable
     for n, ranges in enumerate(found.column("ranges").to_pylist()):
         np.testing.assert_array_equal(np.array(ranges, np.float32), ranges_of(n))
 
