@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.user_directories import user_directory
 from hybridlog_storage import durability, files
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import EMBEDDED, without_password
@@ -92,15 +93,7 @@ def state_directory() -> Path:
     Raises:
         StoreError: this user has no home directory.
     """
-    named = os.environ.get("XDG_STATE_HOME", "")
-    if os.path.isabs(named):  # noqa: PTH117 - a relative one does not count
-        return Path(named, "hybridlog")
-    try:
-        return Path.home() / ".local" / "state" / "hybridlog"
-    except RuntimeError as error:
-        raise StoreError(
-            "This user has no home directory to keep trusted servers in: set XDG_STATE_HOME."
-        ) from error
+    return user_directory("XDG_STATE_HOME", ".local/state", "trusted servers")
 
 
 def _trusted() -> dict[str, list[str]]:

@@ -83,6 +83,7 @@ SLOW = frozenset(
         "cli/test_info.py",
         "cli/test_intervals.py",
         "cli/test_maintain.py",
+        "cli/test_open.py",
         "cli/test_record.py",
         "cli/test_record_live.py",
         "cli/test_serve.py",

@@ -39,6 +39,7 @@ COMMANDS: Final = (
     "view",
     "export",
     "serve",
+    "open",
     "attachments",
     "index",
     "reindex",

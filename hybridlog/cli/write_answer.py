@@ -7,18 +7,17 @@ from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.progress import progress_bar
-from hybridlog.export.slices import IN_FORCE, Front, batches_of, profile_of
+from hybridlog.export.slices import IN_FORCE, Front, add_extras, batches_of, profile_of
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
     PayloadError,
-    SegmentError,
     UsageError,
 )
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
-    from hybridlog.export.base import LogWriter, Target
+    from hybridlog.export.base import Target
     from hybridlog.query.query import Query
 
 Progress = Callable[[], None]
@@ -83,26 +82,12 @@ def _write_exact(
         writer = log = open_log_writer(form, target, profile=profile)
     with writer as exact:
         if extras is not None:
-            _write_extras(log, extras)
+            for problem in add_extras(log, extras):
+                output.note(problem)
         given = front if form != "raw" else Front(latched=False)
         for batch, channels in batches_of(query, given):
             exact.write(batch, channels)
             progress()
-
-
-def _write_extras(log: LogWriter, extras: Extras) -> None:
-    log.declare(extras.channels)
-    for metadata in extras.metadata:
-        log.add_metadata(metadata.name, metadata.values)
-    for problem in extras.problems:
-        output.note(f"A metadata record is left out: {problem}")
-    for attachment in extras.attachments:
-        try:
-            checked = attachment.open()
-        except SegmentError as error:
-            output.note(f"The attachment {output.quoted(attachment.name)} is left out: {error}")
-            continue
-        log.add_attachment(checked)
 
 
 def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> int:

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from hybridlog_storage.errors import SegmentError
+
 if TYPE_CHECKING:
+    from hybridlog.attachments import Extras
+    from hybridlog.export.base import LogWriter
     from hybridlog.query.query import Query
     from hybridlog_storage.messages import Batch, Channel
 
@@ -48,3 +53,34 @@ def profile_of(query: Query) -> str:
     """The MCAP profile of a slice: `ros1` or `ros2`, empty for others and for a mixture."""
     encodings = query.encodings()
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
+
+
+def add_extras(log: LogWriter, extras: Extras) -> Iterator[str]:
+    """Write what a log has beside its messages.
+
+    Yields:
+        A sentence about each record or attachment that is left out because it is damaged.
+    """
+    log.declare(extras.channels)
+    for metadata in extras.metadata:
+        log.add_metadata(metadata.name, metadata.values)
+    for problem in extras.problems:
+        yield f"A metadata record is left out: {problem}"
+    for attachment in extras.attachments:
+        try:
+            checked = attachment.open()
+        except SegmentError as error:
+            yield f"The attachment {attachment.name!r} is left out: {error}"
+            continue
+        log.add_attachment(checked)
+
+
+def write_mcap(query: Query, path: Path) -> None:
+    """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
+    from hybridlog.export.mcap import McapWriter
+
+    with McapWriter(path, profile=profile_of(query)) as log:
+        for _ in add_extras(log, query.extras()):
+            pass  # the ledger has what is damaged
+        for batch, channels in batches_of(query, IN_FORCE):
+            log.write(batch, channels)

@@ -13,6 +13,8 @@ then has the cost of the answer.
 from __future__ import annotations
 
 import difflib
+import hashlib
+import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -924,6 +926,17 @@ class Query:
                 low, high = found.get(part.recording.id, extent)
                 found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
         return found
+
+    def fingerprint(self) -> str:
+        """A digest of the question and of the state of its recordings, in hexadecimal digits.
+
+        As long as it is the same, so is the answer.
+        """
+        snapshot = self._session.snapshot()
+        places = self._session.chosen(self.question).tolist()
+        chosen = [snapshot.summaries[place] for place in places]
+        states = [(one.id, one.look, one.status, one.messages, one.extent) for one in chosen]
+        return hashlib.sha256(pickle.dumps((self.question, states), protocol=5)).hexdigest()
 
     def check_range(self) -> None:
         """Check that the time range overlaps a recording.
