@@ -18,6 +18,8 @@ import numpy as np
 
 from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog.drawing.density import MOST_WORK, Density, count, reading_work
+from hybridlog.drawing.silence import usual_period
+from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,10 +81,27 @@ class DensityCache:
         Returns:
             Bins of equal length that cover the span: more than half as many as pixels, unless
             a bin is one nanosecond, and one more than pixels at most.
+
+        Raises:
+            TopicError: The recording has no such topic.
         """
         recorded = self._of(recording)
         with recorded.lock:
             return recorded.density(recording, span, pixels, topics)
+
+    def periods(
+        self, recording: RecordingEntry, span: tuple[int, int], topics: Sequence[str]
+    ) -> list[float]:
+        """Usual time from one message of each topic to the next, ns; 0 where it is unknown.
+
+        Args:
+            recording: The recording.
+            span: Log time of messages that tell it, if it is not known yet.
+            topics: Full names.
+        """
+        recorded = self._of(recording)
+        with recorded.lock:
+            return [recorded.period(recording, span, topic) for topic in topics]
 
     def running(self, recording: RecordingEntry) -> dict[str, RunningTopic]:
         """What is flushed and not in the recording's entry yet, by topic."""
@@ -108,14 +127,28 @@ class _Recorded:
         self._chunks: RecordedChunks | None = None
         self._blocks: OrderedDict[tuple[int, int, str], _Block] = OrderedDict()
         self._bytes = 0
+        self._periods: dict[str, tuple[float, int]] = {}  # and the messages that told it
 
     def follow(self, recording: RecordingEntry) -> RecordedChunks:
         """The chunks as they are now."""
         if self._chunks is None or not self._chunks.follow(recording):
             self._blocks.clear()
             self._bytes = 0
+            self._periods.clear()
             self._chunks = RecordedChunks(self._session, recording)
         return self._chunks
+
+    def period(self, recording: RecordingEntry, span: tuple[int, int], topic: str) -> float:
+        chunks = self.follow(recording)
+        known, told = self._periods.get(topic, (0.0, 0))
+        if known and recording.status != "open":
+            return known
+        parts = chunks.parts(span, [topic])
+        messages = int(parts.messages.sum())
+        if not known or messages > 2 * told:
+            known = usual_period(chunks, parts) or known
+            self._periods[topic] = known, messages
+        return known
 
     def density(
         self,
@@ -125,6 +158,9 @@ class _Recorded:
         topics: Sequence[str],
     ) -> Density:
         chunks = self.follow(recording)
+        unknown = set(topics).difference(chunks.topics())
+        if unknown:
+            raise TopicError(f"{recording.label} has no topic {min(unknown)!r}.")
         level = max(-(-(span[1] - span[0]) // pixels) - 1, 0).bit_length()
         begin, end = span[0] >> level, -(-span[1] >> level)
         fine = self._fine_level(chunks, topics, level, begin, end)

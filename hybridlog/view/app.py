@@ -26,6 +26,7 @@ ROUTES: Final = (
     "points",
     "recordings",
     "series",
+    "timeline",
     "track",
 )
 """The modules of `routes/`."""

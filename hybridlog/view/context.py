@@ -9,11 +9,13 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from starlette.responses import Response
 from starlette.routing import Route
 
+from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.view.asked import Asked
 from hybridlog_storage.errors import HybridlogError, TopicError
 
@@ -46,6 +48,11 @@ class Context:
         self._refreshing = threading.Lock()
         self._refreshed = time.monotonic()
         self._working = threading.BoundedSemaphore(MAX_WORKING)
+
+    @cached_property
+    def densities(self) -> DensityCache:
+        """Counts of messages by pixel."""
+        return DensityCache(self.store.session)
 
     @contextmanager
     def turn(self) -> Iterator[None]:

@@ -20,7 +20,7 @@ from hybridlog.drawing import density_cache
 from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog.drawing.density import count, density, reading_work
 from hybridlog.drawing.density_cache import DensityCache
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.open_segment import OpenSegment
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
@@ -255,6 +255,8 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         hl.open(tmp_path / "store") as store,
     ):
         cache = DensityCache(store.session)
+        with pytest.raises(TopicError, match="'/a'"):
+            cache.density(store.entry("live"), span, 10, ["/a"])
 
         def ask() -> NDArray[np.int64]:
             return cache.density(store.entry("live"), span, 2000, ["/a", "/b"]).counts
@@ -268,10 +270,13 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
                 recording.write(channel, b"[1, 2, 3]", log_time=BASE + written // 2)
                 written += 1
             until = time.monotonic() + 60
-            while ask().sum() != written:
+            while running() + store.entry("live").messages != written:
                 assert time.monotonic() < until
                 time.sleep(0.02)
+            if channel is B:
+                assert ask().sum() == 160
         found = ask()
+        assert found.sum() == written
         assert found[0][:50].tolist() == [2] * 50
         assert found[1][50:80].tolist() == [2] * 30
         assert running() == written

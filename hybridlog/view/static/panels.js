@@ -50,12 +50,17 @@ export function mountPanels(main, recording) {
   draw();
   const ends = [
     state.on(["panels"], draw),
-    state.on(["at", "begin", "end"], () => shown.forEach(({ running }) => running?.update())),
+    state.on(["at", "begin", "end"], update),
+    recording.on(update),
   ];
   return () => {
     ends.forEach((end) => end());
     shown.splice(0).forEach(({ running }) => running?.destroy());
   };
+
+  function update() {
+    shown.forEach(({ running }) => running?.update());
+  }
 
   function panels() {
     return state.get("panels") ?? firstPanels(topics);

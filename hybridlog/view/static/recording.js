@@ -3,7 +3,9 @@
 import { ApiError, get } from "./api.js";
 import { mountAsk } from "./ask.js";
 import { element, fill } from "./dom.js";
+import { followLive } from "./live.js";
 import { mountPanels } from "./panels.js";
+import { mountTimeline } from "./timeline.js";
 import { count, duration, moment, size } from "./words.js";
 
 /**
@@ -12,6 +14,9 @@ import { count, duration, moment, size } from "./words.js";
  * @property {Object} info the answer of the server: topics, marks, losses, begin, end
  * @property {BigInt} start the time that all other times count from, ns since 1970
  * @property {function(number): BigInt} toTime ns since 1970 of a time since the start
+ * @property {function(function()): function()} on calls back when `info` has changed, of a
+ *     recording that goes on; returns a function that ends this
+ * @property {function()} tell calls them back
  */
 
 /** Shows a recording in an element. Returns a function that takes it away. */
@@ -30,17 +35,37 @@ export function mountRecording(main, label) {
     try {
       const info = await get("recording", { recording: label });
       if (isGone) return;
-      const start = BigInt(info.start);
-      const toTime = (offset) => start + BigInt(Math.round(offset));
-      const recording = { label: info.label, info, start, toTime };
-      fill(head, summaryOf(recording));
-      ends.push(mountAsk(main, recording));
-      ends.push(mountPanels(main, recording));
+      const recording = made(info);
+      const drawHead = () => fill(head, summaryOf(recording));
+      drawHead();
+      ends.push(
+        recording.on(drawHead),
+        mountTimeline(main, recording),
+        mountAsk(main, recording),
+        mountPanels(main, recording),
+        followLive(recording),
+      );
     } catch (error) {
       if (!(error instanceof ApiError)) throw error;
       fill(main, element("pre", { class: "problem", role: "alert" }, error.message));
     }
   }
+}
+
+function made(info) {
+  const listeners = new Set();
+  const recording = {
+    label: info.label,
+    info,
+    start: BigInt(info.start),
+    toTime: (offset) => recording.start + BigInt(Math.round(offset)),
+    on: (callback) => {
+      listeners.add(callback);
+      return () => listeners.delete(callback);
+    },
+    tell: () => listeners.forEach((callback) => callback()),
+  };
+  return recording;
 }
 
 function summaryOf({ info, start }) {

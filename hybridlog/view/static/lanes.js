@@ -1,0 +1,146 @@
+/** Asks the server for messages by pixel, and keeps what is needed to draw them at any zoom. */
+
+import { ApiError, bytes } from "./api.js";
+import { notice } from "./dom.js";
+
+const MOST_LANES = 64;
+const MOST_PIXELS = 8192;
+const MOST_BINS = 1 << 17;
+
+/**
+ * Messages of one topic by bin.
+ *
+ * @typedef {Object} Lane
+ * @property {number} begin of the first bin, ns since the start
+ * @property {number} width of a bin, ns
+ * @property {ArrayLike<number>} counts
+ * @property {boolean} exact false if they are estimates
+ * @property {number} period the usual time from one message to the next, ns; 0 if unknown
+ * @property {ArrayLike<number>} gaps pairs: first bin, and the one behind the last
+ */
+
+/** Lanes and the start of the recording, from the answer of `timeline`. */
+export function decoded(buffer, topics) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  const arrays = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
+  let at = 4 + length;
+  const take = (Kind, count) => {
+    const found = new Kind(buffer, at, count);
+    at += Math.ceil(found.byteLength / 8) * 8;
+    return found;
+  };
+  const lanes = new Map();
+  head.lanes.forEach(({ size, gaps, exact, period }, place) => {
+    const counts = take(arrays[size], head.bins);
+    const { begin, width } = head;
+    const lane = { begin, width, counts, exact, period, gaps: take(Uint32Array, 2 * gaps) };
+    lanes.set(topics[place], lane);
+  });
+  return { start: BigInt(head.start), lanes };
+}
+
+/** The number of messages of a lane between two times. Bins that are cut count as a whole. */
+export function countBetween(lane, begin, end) {
+  const low = Math.max(Math.floor((begin - lane.begin) / lane.width), 0);
+  const high = Math.min(Math.ceil((end - lane.begin) / lane.width), lane.counts.length);
+  let sum = 0;
+  for (let bin = low; bin < high; bin++) sum += lane.counts[bin];
+  return sum;
+}
+
+/**
+ * The lanes of a recording.
+ *
+ * @param {import("./recording.js").Recording} recording
+ * @param {function()} onChange called when there is more to draw
+ */
+export class Lanes {
+  constructor(recording, onChange) {
+    this.recording = recording;
+    this.onChange = onChange;
+    this.near = new Map();
+    this.far = new Map(); // of the whole recording, for what is not there yet
+    this.wanted = null;
+    this.isAsking = false;
+    this.stop = new AbortController();
+  }
+
+  /** The lanes of a topic that are there, the one to prefer first. */
+  of(topic) {
+    return [this.near.get(topic), this.far.get(topic)].filter(Boolean);
+  }
+
+  /** Asks for what a picture needs and is not there; `isNew` asks for it in any case. */
+  want(begin, end, pixels, topics, isNew = false) {
+    const isThere = (topic) => {
+      const lane = this.near.get(topic);
+      if (!lane) return false;
+      const last = lane.begin + lane.width * lane.counts.length;
+      const isFine = lane.width <= Math.max(widthOf(end - begin, pixels), 1);
+      return isFine && lane.begin <= begin && last >= end;
+    };
+    const lacking = isNew ? topics : topics.filter((topic) => !isThere(topic));
+    this.wanted = lacking.length ? { begin, end, pixels, topics: lacking } : null;
+    if (this.wanted && !this.isAsking) this.ask();
+  }
+
+  async ask() {
+    this.isAsking = true;
+    try {
+      while (this.wanted && !this.stop.signal.aborted) {
+        const wanted = this.wanted;
+        this.wanted = null;
+        await this.fetch(wanted);
+      }
+    } catch (error) {
+      if (error instanceof ApiError) notice(error.message);
+      else if (error.name !== "AbortError") throw error;
+    } finally {
+      this.isAsking = false;
+    }
+  }
+
+  async fetch({ begin, end, pixels, topics }) {
+    const asked = topics.slice(0, MOST_LANES);
+    // As much again at both sides, so that moving the picture shows something at once.
+    const { info, label } = this.recording;
+    const margin = (end - begin) / 2;
+    const isWhole = begin <= info.begin && end >= info.end;
+    const [low, high] = isWhole ? [begin, end] : [begin - margin, end + margin];
+    const most = Math.min(MOST_PIXELS, Math.floor(MOST_BINS / asked.length));
+    const answer = await bytes(
+      "timeline",
+      {
+        recording: label,
+        begin: Math.floor(low),
+        end: Math.ceil(high),
+        pixels: Math.max(Math.min(isWhole ? pixels : 2 * pixels, most), 1),
+        topic: asked,
+      },
+      { signal: this.stop.signal },
+    );
+    const { start, lanes } = decoded(answer, asked);
+    if (start !== this.recording.start) return; // of before the recording was known to begin earlier
+    for (const [topic, lane] of lanes) {
+      this.near.set(topic, lane);
+      if (isWhole) this.far.set(topic, lane);
+    }
+    this.onChange();
+  }
+
+  /** Forgets all, when times count from another start. */
+  clear() {
+    this.near.clear();
+    this.far.clear();
+  }
+
+  destroy() {
+    this.stop.abort();
+  }
+}
+
+/** The width of bins that the server makes for a picture, ns. */
+function widthOf(span, pixels) {
+  return 2 ** Math.ceil(Math.log2(Math.max(span / pixels, 1)));
+}

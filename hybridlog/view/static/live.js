@@ -1,0 +1,71 @@
+/** Follows a recording that goes on: asks how far it is, once a second while the page is seen. */
+
+import { ApiError, get } from "./api.js";
+import { lastTime, show, visible } from "./range.js";
+import * as state from "./state.js";
+
+const EVERY_MS = 1000;
+
+/** Keeps `recording.info` up to date. Returns a function that ends this. */
+export function followLive(recording) {
+  let timer = 0;
+  const stop = new AbortController();
+  if (recording.info.status === "open") {
+    if (state.get("at") === 0) state.set({ at: lastTime(recording) });
+    timer = setTimeout(look, EVERY_MS);
+  }
+  return () => {
+    clearTimeout(timer);
+    stop.abort();
+  };
+
+  async function look() {
+    try {
+      if (!document.hidden) await update();
+    } catch (error) {
+      // A server that does not answer now may do so later.
+      if (!(error instanceof ApiError) && error.name !== "AbortError") throw error;
+    }
+    if (!stop.signal.aborted && recording.info.status === "open") timer = setTimeout(look, EVERY_MS);
+  }
+
+  async function update() {
+    const parameters = { recording: recording.label };
+    const found = await get("live", parameters, { signal: stop.signal });
+    const { info } = recording;
+    if (found.messages === info.messages && found.status === info.status) return;
+    const isAtEnd = state.get("at") >= lastTime(recording);
+    const before = info.end;
+    const isMoved = moveStart(BigInt(found.start));
+    if (isMoved || found.status !== "open") {
+      Object.assign(info, await get("recording", parameters, { signal: stop.signal }));
+    }
+    if (found.status === "open") Object.assign(info, { ...found, topics: merged(info, found) });
+    if (isAtEnd) {
+      const { begin, end } = visible(recording);
+      if (state.get("begin") !== null) show(recording, begin + info.end - before, end + info.end - before);
+      state.set({ at: lastTime(recording) });
+    }
+    recording.tell();
+  }
+
+  /** Times count from the first message, which is known for sure once a segment is sealed. */
+  function moveStart(start) {
+    const by = Number(recording.start - start);
+    if (!by) return false;
+    recording.start = start;
+    const moved = (time) => (time === null ? null : time + by);
+    const { begin, end, at } = state.get();
+    recording.info.end += by;
+    recording.info.begin += by;
+    state.set({ begin: moved(begin), end: moved(end), at: at + by });
+    return true;
+  }
+}
+
+/** The topics as they are now, with what is known of them besides. */
+function merged(info, found) {
+  const known = new Map(info.topics.map((one) => [one.topic, one]));
+  const empty = { encoding: "", bytes: 0, first: null, last: null };
+  return found.topics.map((one) => ({ ...empty, ...known.get(one.topic), ...one }));
+}

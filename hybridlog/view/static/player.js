@@ -1,0 +1,160 @@
+/** Play controls, and the keys that move the cursor and the visible range. */
+
+import { element, notice } from "./dom.js";
+import { lastTime, pan, seek, visible, zoom } from "./range.js";
+import * as state from "./state.js";
+import { moment, offset } from "./words.js";
+
+const RATES = [0.1, 0.2, 0.5, 1, 2, 5, 10];
+const UPDATE_MS = 80; // panels cannot follow every frame
+
+const HELP = [
+  ["Space", "play or pause"],
+  ["← →", "move the cursor; with Shift, in small steps"],
+  ["Page Up, Page Down", "move the visible range"],
+  ["+ −", "zoom at the cursor; the wheel zooms at the pointer"],
+  ["0", "show the whole recording"],
+  ["Home, End", "first and last message; a running recording is followed from its end"],
+  ["< >", "play slower, faster"],
+  ["Drag", "move the visible range; with Shift, zoom to the part that is dragged over"],
+  ["?", "this list"],
+];
+const SIGNS = [
+  ["Bar", "messages in this pixel, on a logarithmic scale; pale if it is an estimate"],
+  ["Thin stripes", "gap: no message for more than five usual periods"],
+  ["Cross-hatched, framed", "messages were lost"],
+  ["Flag and dashed line", "mark"],
+  ["Band, ticks below the axis", "a question holds, its matches"],
+];
+
+/** Adds the controls to an element. Returns a function that takes them away. */
+export function mountPlayer(parent, recording) {
+  let frame = 0;
+  let before = 0;
+  let told = 0;
+  let at = state.get("at");
+
+  const play = button("Play", toggle, "Play or pause (Space)");
+  const rate = element(
+    "select",
+    { "aria-label": "Speed", title: "Speed (< and >)" },
+    ...RATES.map((one) => element("option", { value: String(one), selected: one === 1 }, `${one}×`)),
+  );
+  const readout = element("output", { class: "readout", "aria-label": "Cursor" });
+  const dialog = help();
+  const bar = element(
+    "div",
+    { class: "player", role: "toolbar", "aria-label": "Player" },
+    button("⇤", () => seek(recording, recording.info.begin), "First message (Home)"),
+    play,
+    button("⇥", () => seek(recording, lastTime(recording)), "Last message (End)"),
+    rate,
+    readout,
+    element("span", { class: "space" }),
+    button("−", () => zoom(recording, 2, state.get("at")), "Zoom out (−)"),
+    button("+", () => zoom(recording, 0.5, state.get("at")), "Zoom in (+)"),
+    button("All", () => state.set({ begin: null, end: null }), "Show the whole recording (0)"),
+    button("?", () => dialog.showModal(), "Keys and signs (?)"),
+  );
+  parent.append(bar, dialog);
+  const ends = [state.on(["at"], follow)];
+  document.addEventListener("keydown", pressed);
+  follow();
+  return () => {
+    pause();
+    ends.forEach((end) => end());
+    document.removeEventListener("keydown", pressed);
+  };
+
+  function follow() {
+    const now = state.get("at");
+    // Someone else has moved the cursor while it plays.
+    if (now !== Math.round(at)) at = now;
+    readout.textContent = `${offset(now)}  ${moment(recording.toTime(now))}`;
+  }
+
+  function toggle() {
+    if (frame) pause();
+    else start();
+  }
+
+  function start() {
+    at = state.get("at");
+    if (at >= lastTime(recording) && recording.info.status !== "open") at = recording.info.begin;
+    before = told = performance.now();
+    frame = requestAnimationFrame(step);
+    play.textContent = "Pause";
+  }
+
+  function pause() {
+    cancelAnimationFrame(frame);
+    frame = 0;
+    play.textContent = "Play";
+  }
+
+  function step(now) {
+    at += (now - before) * 1e6 * Number(rate.value);
+    before = now;
+    const isOver = at >= lastTime(recording);
+    if (isOver) at = lastTime(recording);
+    if (isOver || now - told >= UPDATE_MS) {
+      told = now;
+      seek(recording, at);
+    }
+    if (isOver && recording.info.status !== "open") pause();
+    else frame = requestAnimationFrame(step);
+  }
+
+  function change(by) {
+    rate.selectedIndex = Math.min(Math.max(rate.selectedIndex + by, 0), RATES.length - 1);
+    notice(`Speed ${rate.value}×`);
+  }
+
+  function pressed(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey || dialog.open) return;
+    const { target, key } = event;
+    if (target.closest("input, textarea, select, [contenteditable]")) return;
+    const isButton = target.closest("button, a, summary") !== null;
+    if (isButton && (key === " " || key === "Enter")) return;
+    const { begin, end } = visible(recording);
+    const share = (end - begin) / (event.shiftKey ? 1000 : 50);
+    const actions = {
+      " ": toggle,
+      ArrowLeft: () => seek(recording, state.get("at") - share),
+      ArrowRight: () => seek(recording, state.get("at") + share),
+      PageUp: () => pan(recording, -0.5),
+      PageDown: () => pan(recording, 0.5),
+      "+": () => zoom(recording, 0.5, state.get("at")),
+      "=": () => zoom(recording, 0.5, state.get("at")),
+      "-": () => zoom(recording, 2, state.get("at")),
+      0: () => state.set({ begin: null, end: null }),
+      Home: () => seek(recording, recording.info.begin),
+      End: () => seek(recording, lastTime(recording)),
+      "<": () => change(-1),
+      ">": () => change(1),
+      "?": () => dialog.showModal(),
+    };
+    if (!Object.hasOwn(actions, key)) return;
+    event.preventDefault();
+    actions[key]();
+  }
+}
+
+function button(text, onclick, title) {
+  return element("button", { type: "button", onclick, title, "aria-label": title }, text);
+}
+
+function help() {
+  const rows = (list) =>
+    list.flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, text)]);
+  const dialog = element(
+    "dialog",
+    { class: "help", "aria-label": "Keys and signs" },
+    element("h2", {}, "Keys"),
+    element("dl", {}, ...rows(HELP)),
+    element("h2", {}, "Signs"),
+    element("dl", {}, ...rows(SIGNS)),
+    element("form", { method: "dialog" }, element("button", { autofocus: true }, "Close")),
+  );
+  return dialog;
+}

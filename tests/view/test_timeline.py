@@ -1,0 +1,349 @@
+"""The timeline against what queries answer, by itself and seen in a browser."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.live import LiveRecording
+from hybridlog_storage.errors import TimeError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.view.conftest import Asking, served
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from playwright.sync_api import Page
+    from starlette.testclient import TestClient
+
+SECOND = 10**9
+
+
+class Lane(NamedTuple):
+    """What the page gets of one topic."""
+
+    counts: NDArray[Any]
+    gaps: NDArray[Any]
+    exact: bool
+    period: float
+
+
+class Picture(NamedTuple):
+    head: dict[str, Any]
+    lanes: list[Lane]
+    size: int
+
+
+def picture(client: TestClient, topics: list[str], begin: int, end: int, pixels: int) -> Picture:
+    asked = {"recording": "robot", "begin": begin, "end": end, "pixels": pixels, "topic": topics}
+    answer = client.get("timeline", params=asked)
+    assert answer.status_code == 200, answer.text
+    content = answer.content
+    length = int.from_bytes(content[:4], "little")
+    head = json.loads(content[4 : 4 + length])
+    at = 4 + length
+    assert at % 8 == 0
+    lanes = []
+    for lane in head["lanes"]:
+        columns = []
+        for kind, count in ((f"<u{lane['size']}", head["bins"]), ("<u4", 2 * lane["gaps"])):
+            columns.append(np.frombuffer(content, kind, count, at))
+            at += -(-columns[-1].nbytes // 8) * 8
+        lanes.append(Lane(columns[0], columns[1].reshape(-1, 2), lane["exact"], lane["period"]))
+    assert at == len(content)
+    return Picture(head, lanes, len(content))
+
+
+def counted(store: hl.Store, topic: str, begin: int, end: int) -> int:
+    try:
+        return store.topic(topic).between(begin, end).count()
+    except TimeError:
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "pixels"),
+    [(0, 20 * SECOND, 7), (-SECOND, 2 * SECOND, 13), (3 * SECOND, 3 * SECOND + 400_000_000, 9)],
+)
+def test_bins_have_what_queries_count(
+    client: TestClient, demo_store: hl.Store, begin: int, end: int, pixels: int
+) -> None:
+    topics = ["/imu/data", "/base/scan", "/map", "/r_cart/command_pose"]
+    found = picture(client, topics, begin, end, pixels)
+    head = found.head
+    start = int(head["start"])
+    assert head["begin"] <= begin
+    assert head["begin"] + head["width"] * head["bins"] >= end
+    assert pixels / 2 < head["bins"] <= pixels + 1
+    for topic, lane in zip(topics, found.lanes, strict=True):
+        assert lane.exact
+        edges = [start + head["begin"] + n * head["width"] for n in range(head["bins"] + 1)]
+        assert lane.counts.tolist() == [
+            counted(demo_store, topic, *edges[n : n + 2]) for n in range(head["bins"])
+        ]
+
+
+def test_an_answer_is_as_large_as_the_picture(client: TestClient) -> None:
+    topics = ["/imu/data", "/odom"]
+    for pixels in (100, 1000, 4000):
+        found = picture(client, topics, 0, 20 * SECOND, pixels)
+        assert found.size <= 2 * len(topics) * (pixels + 8) + 600
+
+
+def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store) -> None:
+    (entry,) = demo_store.recordings()
+    assert entry.span is not None
+    begin, end = 0, entry.span[1] - entry.span[0] + 1
+    found = picture(client, ["/r_cart/command_pose", "/imu/data", "/map"], begin, end, 2000)
+    width = found.head["width"]
+    wanted = list(demo_store.topic("/r_cart/command_pose").gaps())
+    start = int(found.head["start"]) + found.head["begin"]
+    drawn = [(start + a * width, start + b * width) for a, b in found.lanes[0].gaps.tolist()]
+    assert len(drawn) == len(wanted) > 1
+    for (low, high), gap in zip(drawn, wanted, strict=True):
+        # Whole bins without a message; at the ends of the recording bins reach out of it.
+        assert gap.begin_ns - width < low <= gap.begin_ns + width
+        assert gap.end_ns - width <= high < gap.end_ns + width
+    assert [len(lane.gaps) for lane in found.lanes[1:]] == [0, 0]
+    assert 9e6 < found.lanes[1].period < 11e6
+    assert found.lanes[2].period == 0
+    # Before and after the recording there is no gap.
+    around = picture(client, ["/imu/data"], -10 * end, 10 * end, 500)
+    assert len(around.lanes[0].gaps) == 0
+
+
+GOOD = {"recording": "robot", "begin": "0", "end": "1000", "pixels": "10", "topic": "/odom"}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"begin": "1000"},
+        {"begin": "x"},
+        {"end": str(1 << 63)},
+        {"end": "-9000000000000000000000"},
+        {"end": str(-(1 << 62))},
+        {"pixels": "0"},
+        {"pixels": "8193"},
+        {"topic": ["/odom"] * 65},
+        {"topic": ["/odom"] * 60, "pixels": "4000"},
+        {"topic": "x" * 1025},
+        {"topic": "/nothing"},
+        {"recording": "../robot"},
+    ],
+)
+def test_impossible_pictures_are_refused(client: TestClient, changes: dict[str, Any]) -> None:
+    assert client.get("timeline", params=GOOD).status_code == 200
+    answer = client.get("timeline", params={**GOOD, **changes})
+    assert answer.status_code in {400, 404}
+    assert answer.json()["error"]
+
+
+def test_a_recording_that_has_ended_says_so(client: TestClient, demo_store: hl.Store) -> None:
+    answer = client.get("live", params={"recording": "robot"}).json()
+    whole = client.get("recording", params={"recording": "robot"}).json()
+    for key in ("status", "start", "begin", "end", "messages"):
+        assert answer[key] == whole[key]
+    assert [(row["topic"], row["messages"]) for row in answer["topics"]] == [
+        (row["topic"], row["messages"]) for row in whole["topics"]
+    ]
+    asked = {"recording": "robot", "begin": 0, "end": SECOND}
+    assert client.get("marks", params=asked).json() == {"marks": [], "more": 0}
+
+
+A, B = (Channel(name, "json", None) for name in ("/a", "/b"))
+SETTINGS = SegmentSettings(chunk_size=4096, segment_size=30_000, compression="none")
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[tuple[LiveRecording, hl.Store]]:
+    """A recording that goes on, and the store as another process has it open."""
+    with (
+        hl.open(tmp_path / "store", create=True) as writing,
+        writing.start("live", settings=SETTINGS, flush_interval_s=0.05) as recording,
+        hl.open(tmp_path / "store") as store,
+    ):
+        yield recording, store
+
+
+def write(recording: LiveRecording, channel: Channel, begin: int, count: int) -> None:
+    for n in range(begin, begin + count):
+        recording.write(channel, b'{"n": 1}', log_time=SECOND * SECOND + n * SECOND // 100)
+
+
+@pytest.mark.peer("browser")
+def test_a_recording_that_goes_on_is_followed(
+    running: tuple[LiveRecording, hl.Store], page: Page, asking: Asking
+) -> None:
+    recording, store = running
+    client = asking(store)
+
+    def live() -> dict[str, Any]:
+        answer = client.get("live", params={"recording": "live"})
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def wait_for(messages: int) -> dict[str, Any]:
+        until = time.monotonic() + 60
+        while (found := live())["messages"] != messages:
+            assert time.monotonic() < until, found
+            time.sleep(0.02)
+        return found
+
+    write(recording, A, 0, 50)
+    assert wait_for(50)["topics"] == [{"topic": "/a", "type": "", "messages": 50}]
+    with served(store) as url:
+        page.goto(f"{url}#recording=live&panels=[]")
+        page.wait_for_selector("text=being recorded")
+        row = page.locator(".timeline .name")
+        row.filter(has_text="/a").filter(has_text="50").wait_for()
+        write(recording, A, 50, 1000)  # several segments
+        write(recording, B, 1050, 50)
+        found = wait_for(1100)
+        assert found["status"] == "open"
+        page.wait_for_selector("text=1,100 messages")
+        row.filter(has_text="/b").filter(has_text="50").wait_for()
+        # The cursor was at the end, and stays there.
+        until(page, "document.querySelector('.readout').textContent.length > 0")
+        at = json.loads(page.locator(".density").get_attribute("aria-valuenow") or "null")
+        assert at == pytest.approx((live()["end"] - 1) / SECOND)
+        recording.close()
+        page.wait_for_selector("text=being recorded", state="detached")
+        assert live()["status"] == "complete"
+
+    store.mark("live", "+2s", "look <b>here</b>")
+    store.refresh()
+    marks = client.get("marks", params={"recording": "live", "begin": 0, "end": found["end"]})
+    assert marks.json() == {"marks": [{"at": 2 * SECOND, "text": "look <b>here</b>"}], "more": 0}
+
+
+def until(page: Page, condition: str) -> None:
+    """Wait for something in a page whose policy refuses `wait_for_function`."""
+    end = time.monotonic() + 15
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, condition
+        page.wait_for_timeout(20)
+
+
+def cursor(page: Page) -> float:
+    return float(page.locator(".density").get_attribute("aria-valuenow") or "nan") * SECOND
+
+
+@pytest.mark.peer("browser")
+def test_the_timeline_is_moved_and_zoomed(page: Page, demo_url: str, demo_store: hl.Store) -> None:
+    page.goto(f"{demo_url}#recording=robot&panels=[]")
+    canvas = page.locator(".timeline .density")
+    canvas.wait_for()
+    box = canvas.bounding_box()
+    assert box is not None
+    (entry,) = demo_store.recordings()
+    assert entry.span is not None
+    start, length = entry.span[0], entry.span[1] - entry.span[0] + 1
+    first = page.locator(".timeline .topic").first.inner_text()
+
+    # A click sets the cursor; what the tip says is what the store counts.
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 10)
+    until(page, "Number(document.querySelector('.density').ariaValueNow) > 9")
+    assert abs(cursor(page) - length / 2) < 2 * length / box["width"]
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 10)
+    page.wait_for_selector(f".tip:has-text('{first}')")
+    assert "in" in page.locator(".tip div").nth(2).inner_text()
+
+    # A drag with Shift shows that range.
+    page.keyboard.down("Shift")
+    page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 10)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 12)
+    page.mouse.up()
+    page.keyboard.up("Shift")
+    until(page, "location.hash.includes('begin=')")
+    shown = hash_of(page)
+    assert abs(shown["begin"] - length / 4) < 3 * length / box["width"]
+    assert abs(shown["end"] - length / 2) < 3 * length / box["width"]
+
+    # The wheel zooms around the pointer, a drag moves.
+    around = shown["begin"] + (shown["end"] - shown["begin"]) / 4
+    page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 10)
+    page.mouse.wheel(0, -300)
+    until(page, f"!location.hash.includes('begin={shown['begin']}')")
+    near = hash_of(page)
+    span = near["end"] - near["begin"]
+    assert span < 0.6 * (shown["end"] - shown["begin"])
+    assert abs(near["begin"] + span / 4 - around) < span / 50
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 10, steps=4)
+    page.mouse.up()
+    until(page, f"!location.hash.includes('begin={near['begin']}')")
+    moved = hash_of(page)
+    assert abs(near["begin"] - moved["begin"] - span / 4) < span / 50
+    assert abs(moved["end"] - moved["begin"] - span) <= 1
+
+    # Every bin that was drawn has what the store counts.
+    lanes = page.evaluate(
+        """async ([begin, end]) => {
+          const { decoded } = await import('./lanes.js');
+          const topics = ['/imu/data', '/base/scan'];
+          const asked = new URLSearchParams({recording: 'robot', begin, end, pixels: 20});
+          topics.forEach((topic) => asked.append('topic', topic));
+          const answer = await (await fetch(`timeline?${asked}`)).arrayBuffer();
+          const { lanes } = decoded(answer, topics);
+          return [...lanes].map(([topic, { begin, width, counts }]) =>
+            [topic, begin, width, [...counts]]);
+        }""",
+        [moved["begin"], moved["end"]],
+    )
+    for topic, begin, width, counts in lanes:
+        for n, found in enumerate(counts):
+            low = start + begin + n * width
+            assert found == counted(demo_store, topic, low, low + width)
+    page.keyboard.press("0")
+    until(page, "!location.hash.includes('begin=')")
+
+
+def hash_of(page: Page) -> dict[str, int]:
+    page.wait_for_timeout(300)  # the address is written when it has been still for a moment
+    pairs = dict(pair.split("=") for pair in page.evaluate("location.hash.slice(1)").split("&"))
+    return {key: int(pairs[key]) for key in ("begin", "end", "at") if key in pairs}
+
+
+@pytest.mark.peer("browser")
+def test_keys_alone(page: Page, demo_url: str) -> None:
+    page.goto(f"{demo_url}#recording=robot&panels=[]")
+    page.locator(".timeline .density").wait_for()
+    length = float(page.locator(".density").get_attribute("aria-valuemax") or "nan")
+    page.keyboard.press("End")
+    until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length - 0.001}")
+    page.keyboard.press("Home")
+    page.keyboard.press("ArrowRight")
+    until(page, "Number(document.querySelector('.density').ariaValueNow) > 0")
+    assert cursor(page) == pytest.approx(length * SECOND / 50, rel=0.01)
+    page.keyboard.press("+")
+    page.keyboard.press("PageDown")
+    until(page, "location.hash.includes('begin=')")
+    page.keyboard.press("-")
+    page.keyboard.press("?")
+    page.get_by_role("dialog").wait_for()
+    page.keyboard.press("Escape")
+    page.get_by_role("dialog").wait_for(state="hidden")
+    # Playing at ten times moves the cursor, and stops at the end.
+    page.get_by_label("Speed").select_option("10")
+    page.locator(".density").focus()
+    page.keyboard.press(" ")
+    page.get_by_role("button", name="Play or pause").filter(has_text="Pause").wait_for()
+    until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length / 3}")
+    page.keyboard.press(" ")
+    page.get_by_role("button", name="Play or pause").filter(has_text="Play").wait_for()
+    at = cursor(page)
+    page.wait_for_timeout(200)
+    assert cursor(page) == at
+    page.keyboard.press(" ")
+    until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length - 0.001}")
+    page.get_by_role("button", name="Play or pause").filter(has_text="Play").wait_for()
