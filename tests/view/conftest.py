@@ -94,6 +94,13 @@ def demo_url(demo_store: hl.Store) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
+def odd_url(odd_store: hl.Store) -> Iterator[str]:
+    """Address of the view of `odd_store`."""
+    with served(odd_store) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`."""
     from playwright.sync_api import sync_playwright

@@ -20,41 +20,41 @@ export function fieldPicker({ most, choose }) {
     "aria-label": "Search fields",
     autocomplete: "off",
     oninput: draw,
-    onkeydown: (event) => {
-      if (event.key === "Enter") add();
-      else if (event.key === "Escape") close();
-    },
+    onkeydown: (event) => event.key === "Enter" && add(),
   });
   const list = element("div", { class: "choices", role: "group", "aria-label": "Fields" });
   const inside = element("div", { class: "popup", id, hidden: true }, search, list);
   const button = element(
     "button",
-    { type: "button", "aria-expanded": "false", "aria-controls": id, onclick: toggle },
+    { type: "button", "aria-expanded": "false", "aria-controls": id, onclick: () => show(inside.hidden) },
     "Fields…",
   );
   const dom = element("span", { class: "picker" }, button, inside);
-  dom.addEventListener("focusout", (event) => {
-    if (event.relatedTarget && !dom.contains(event.relatedTarget)) close();
+  dom.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || inside.hidden) return;
+    event.stopPropagation();
+    show(false);
+    button.focus();
   });
-  return { dom, set };
+  dom.addEventListener("focusout", (event) => {
+    if (event.relatedTarget && !dom.contains(event.relatedTarget)) show(false);
+  });
+  const closing = (event) => dom.contains(event.target) || show(false);
+  document.addEventListener("pointerdown", closing);
+  return { dom, set, destroy: () => document.removeEventListener("pointerdown", closing) };
 
   function set(fields, names) {
     [known, chosen] = [fields, names];
     if (!inside.hidden) draw();
   }
 
-  function toggle() {
-    inside.hidden = !inside.hidden;
-    button.setAttribute("aria-expanded", String(!inside.hidden));
-    if (inside.hidden) return;
+  function show(isShown) {
+    inside.hidden = !isShown;
+    button.setAttribute("aria-expanded", String(isShown));
+    if (!isShown) return;
     draw();
     search.focus();
-  }
-
-  function close() {
-    if (inside.hidden) return;
-    toggle();
-    button.focus();
+    search.select();
   }
 
   function found() {

@@ -259,6 +259,7 @@ function mount(body, panel) {
     destroy() {
       isGone = true;
       watching.disconnect();
+      picker.destroy();
       scheme.removeEventListener("change", redraw);
       chart?.destroy();
     },
