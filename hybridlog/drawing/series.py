@@ -105,6 +105,15 @@ def series(
     return found
 
 
+def usual_period(steps: NDArray[np.int64]) -> float:
+    """The usual period of a topic, ns, also of one whose messages arrive some at once.
+
+    Args:
+        steps: int64[n], times from one message to the next, ns.
+    """
+    return float(np.quantile(steps, 0.9)) if len(steps) else 0.0
+
+
 def numbers_of(query: Query) -> list[str]:
     """Paths of the fields that are single numbers; none where no definition fixes them."""
     known = query.field_types() or {}
@@ -261,9 +270,7 @@ def _exact(
 ) -> list[Series]:
     times = np.concatenate([times for times, _ in held])
     steps = np.diff(times)
-    periods = steps[steps > 0]
-    usual = float(np.median(periods)) if len(periods) else 0.0
-    gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1
+    gaps = np.flatnonzero(steps > GAP_PERIODS * usual_period(steps)) + 1
     middles = times[gaps - 1] + steps[gaps - 1] // 2
     found = []
     for path in paths:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.drawing.series import GAP_PERIODS
+from hybridlog.drawing.series import GAP_PERIODS, usual_period
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import UsageError
 
@@ -228,9 +228,7 @@ class _Builder:
     def track(self) -> Track:
         """What was collected."""
         steps = np.diff(self._times)
-        usual = float(self._width)
-        if self._exact and (steps > 0).any():
-            usual = float(np.median(steps[steps > 0]))
+        usual = usual_period(steps) if self._exact else float(self._width)
         gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1
         middles = self._times[gaps - 1] + steps[gaps - 1] // 2
         return Track(

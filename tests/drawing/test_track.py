@@ -152,6 +152,16 @@ def test_the_short_way_round(store: hl.Store) -> None:
     assert (got.messages, got.fixes) == (5, 3)
 
 
+def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("pairs") as recorder:
+            for at in range(40):
+                time = BASE + (at // 2) * 100 * MS + at % 2 + (5000 * MS if at >= 20 else 0)
+                recorder.write(channel("/fix"), payload(48.0, 11.0), log_time=time)
+        got = track(store.topic("fix"), pixels=100)
+    assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [20]
+
+
 def test_json_without_a_definition(store: hl.Store) -> None:
     got = track(store.topic("json"), pixels=10)
     assert got.fixes == 5

@@ -43,16 +43,18 @@ export default {
 function mount(body, panel) {
   const colour = element("select", {
     "aria-label": "Colour by",
+    hidden: true,
     onchange: () => panel.setOptions({ colour: colour.value }),
   });
   const turn = element("button", {
     type: "button",
+    hidden: true,
     onclick: () => panel.setOptions({ above: !isAbove() }),
   });
   const fit = element("button", { type: "button", onclick: refit, title: "Show all points (0)" }, "Fit");
   const gradient = element("canvas", { "aria-hidden": "true" });
   const [low, high] = [element("span"), element("span")];
-  const legend = element("span", { class: "scale" }, low, gradient, high);
+  const legend = element("span", { class: "scale unused" }, low, gradient, high);
   const facts = element("p", { class: "facts", role: "status" }, "…");
   const problem = element("pre", { class: "problem", role: "alert", hidden: true });
   const place = element("div", { class: "space" });
@@ -232,6 +234,7 @@ function mount(body, panel) {
       fill(colour, ...options.map((name) => element("option", { value: name }, name)));
     }
     colour.value = value;
+    colour.hidden = false;
     const scale = value === COLOUR || value === PLAIN ? null : scales[value];
     legend.classList.toggle("unused", !scale);
     [low.textContent, high.textContent] = scale ? [short(scale.low), short(scale.high)] : ["", ""];
@@ -260,6 +263,7 @@ function mount(body, panel) {
     problem.textContent = text;
     problem.hidden = false;
     problem.classList.toggle("problem", isProblem);
+    problem.classList.toggle("note", !isProblem);
     place.hidden = true;
     facts.textContent = "\u00a0";
     delete place.dataset.points;
