@@ -26,6 +26,7 @@ from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
     from hybridlog.session import Session
+    from hybridlog.sql.payload_arrays import PayloadArrays
     from hybridlog.tables.reader import TablePart, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
@@ -44,7 +45,7 @@ class ScanCounts:
     """Counts of what was read for a query.
 
     Attributes:
-        files: Paths of the files of tables that were read.
+        files: Paths of the files of tables, and of payloads, that were read.
         row_groups: Row groups that were read.
         chunks: Chunks that were read.
         payload_bytes: Bytes of payloads that were decoded.
@@ -149,6 +150,14 @@ class TopicOfRecording:
     def flushed(self) -> int:
         """Number of its messages in segments that are not sealed."""
         return sum(segment.messages[channel] for segment in self._open for channel in self.channels)
+
+    @cached_property
+    def arrays(self) -> PayloadArrays:
+        """The columns of its payloads."""
+        from hybridlog.sql.payload_arrays import PayloadArrays
+
+        readers = self.session.payload_readers(self.entry, self.topic)
+        return PayloadArrays(readers or [])
 
     @property
     def is_fixed(self) -> bool:

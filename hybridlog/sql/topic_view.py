@@ -422,17 +422,22 @@ def _from_payloads(
     found: dict[tuple[str, ...], list[Any]] = {key: [] for key in leaves}
     paths = _paths(list(leaves.values()))
     for group in np.split(order, edges) if len(order) else ():
-        first = group[0]
-        chunk = recording.chunk(int(ref["seg"][first]), int(ref["chunk"][first]), counts)
-        codec = recording.channels[int(channel[first])].codec
-        decoded = codec.arrow(chunk.batch.buffer, ref["off"][group], ref["len"][group], paths)
-        counts.payload_bytes += int(ref["len"][group].sum())
+        place = int(ref["seg"][group[0]]), int(ref["chunk"][group[0]])
+        own = recording.channels[int(channel[group[0]])]
+        good = np.arange(len(group))
+        records = recording.arrays.read(own, place, ref["off"][group], paths, counts)
+        if records is None:
+            chunk = recording.chunk(*place, counts)
+            buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]
+            decoded = own.codec.arrow(buffer, at, length, paths)
+            counts.payload_bytes += int(length.sum())
+            records, good = decoded.records, decoded.rows
         for key, leaf in leaves.items():
-            values = _at(decoded.records, leaf.source)
+            values = _at(records, leaf.source)
             if values is None:
                 made = pa.nulls(len(group), leaf.type)
             else:
-                made = without(fitted(values, leaf.kind), decoded.rows, len(group))
+                made = without(fitted(values, leaf.kind), good, len(group))
             found[key].append(made)
     places = np.full(rows.size, -1, np.int64)
     places[order] = np.arange(len(order))

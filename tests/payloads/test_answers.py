@@ -201,3 +201,23 @@ def test_odd_scans_are_counted(scans: hl.Store) -> None:
     assert scans.topic("/even").between("+1.9s", None).limit(0).to_numpy() == []
     with pytest.raises(PayloadError, match="does not fit"):
         scans.topic("/even").between("+1.9s", None).to_numpy()
+
+
+@pytest.mark.parametrize(
+    ("query", "from_chunks"),
+    [
+        ("select t, ranges, intensities from scan order by t", False),
+        ("select t, ranges[21:40] from scan where angle_min < 0 and seq % 7 = 0 order by t", False),
+        ("select t, data from image order by t", False),
+        ("select t, height, data from cloud order by t", True),  # the points are columns
+    ],
+)
+def test_sql_reads_arrays_from_columns(
+    stores: tuple[hl.Store, hl.Store], query: str, *, from_chunks: bool
+) -> None:
+    answers = [store.sql(query) for store in stores]
+    expected, found = (answer.to_arrow() for answer in answers)
+    assert found.equals(expected)
+    assert found.num_rows > 10
+    assert answers[0].counts.chunks > 0
+    assert (answers[1].counts.chunks > 0) == from_chunks

@@ -174,3 +174,18 @@ def test_only_row_groups_that_may_match_are_read(store: Path) -> None:
         assert (query.count(), query.counters.chunks_read) == (5, 0)
         assert query.counters.bytes_read < read["ranges[10] < 1.05"][1] / 2
         assert 0 < read["ranges[350] < 0.5"][1] < read["ranges[10] < 1.05"][1] / 5
+
+
+def test_sql_reads_each_row_group_once(store: Path) -> None:
+    with hl.open(store) as opened:
+        answer = opened.sql("select ranges[11], list_min(ranges[341:380]) from scan order by t")
+        found = np.array(answer.rows(), np.float32)
+        (file,) = opened.recordings()[0].payloads
+        reader = opened.session.payload_readers(opened.recordings()[0], file["topic"])
+        assert reader is not None
+        groups = reader[0].file.groups
+        assert (answer.counts.chunks, answer.counts.row_groups) == (0, groups + 1)
+    numbers = np.arange(COUNT)
+    np.testing.assert_array_equal(found[:, 0], (0.1 * (numbers % 7) + 1).astype(np.float32))
+    is_near = (numbers >= 60) & (numbers < 65)
+    np.testing.assert_array_equal(found[:, 1], np.where(is_near, 0.3, 4.0).astype(np.float32))
