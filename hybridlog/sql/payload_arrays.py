@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from hybridlog.payloads.reader import PayloadReader
     from hybridlog.query.question import RecordedChannel
-    from hybridlog.sql.pieces import Paths, ScanCounts
+    from hybridlog.sql.counts import Paths, ScanCounts
 
 _MAX_GROUPS: Final = 2  # row groups that are kept; neighbouring chunks share one
 

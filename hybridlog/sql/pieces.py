@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
@@ -19,6 +18,7 @@ import pyarrow as pa
 from hybridlog.losses import lost_spans
 from hybridlog.query.question import RecordedChannel
 from hybridlog.sql.columns import whole_message
+from hybridlog.sql.counts import Paths, ScanCounts
 from hybridlog.tables.fields import without
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog_storage.catalog import ChannelStats
@@ -36,25 +36,6 @@ if TYPE_CHECKING:
 _FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""
 _MAX_CHUNKS: Final = 4  # read chunks that are kept
-Paths = Collection[str] | None
-"""Dotted paths of fields to read; None for all."""
-
-
-@dataclass(slots=True)
-class ScanCounts:
-    """Counts of what was read for a query.
-
-    Attributes:
-        files: Paths of the files of tables, and of payloads, that were read.
-        row_groups: Row groups that were read.
-        chunks: Chunks that were read.
-        payload_bytes: Bytes of payloads that were decoded.
-    """
-
-    files: set[str] = field(default_factory=set)
-    row_groups: int = 0
-    chunks: int = 0
-    payload_bytes: int = 0
 
 
 class Rows(NamedTuple):

@@ -22,7 +22,8 @@ from hybridlog.sql.columns import (
     summary_values,
     view_columns,
 )
-from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
+from hybridlog.sql.counts import ScanCounts
+from hybridlog.sql.pieces import Rows, RowSource, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
 from hybridlog.tables.fields import without
 from hybridlog.tables.layout import STATES
