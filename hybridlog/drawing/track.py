@@ -1,4 +1,4 @@
-"""The track of a satellite receiver on a local metric grid, of bounded length."""
+"""The track of a satellite receiver, or of poses, in metres and of bounded length."""
 
 from __future__ import annotations
 
@@ -68,10 +68,11 @@ class Track:
 
     Attributes:
         times: int64[n], log time, ns since the epoch.
-        xy: float64[n, 2], metres east and north of the origin. NaN where no line goes: for
-            messages without a fix, and in the middle of times without messages that are longer
-            than `GAP_PERIODS` usual periods.
-        grid: The grid, with its origin at the first fix; None without any.
+        xy: float64[n, 2], metres: east and north of the origin of the grid, or x and y of poses
+            in their frame. NaN where no line goes: for messages without a fix, and in the
+            middle of times without messages that are longer than `GAP_PERIODS` usual periods.
+        grid: The grid, with its origin at the first fix; None without any, and for poses.
+        is_geographic: False for poses.
         messages: Number of messages.
         fixes: Number of those that have a fix.
         exact: True if each message is here. Else each pixel of time has its first fix, those
@@ -81,6 +82,7 @@ class Track:
     times: NDArray[np.int64]
     xy: NDArray[np.float64]
     grid: Grid | None
+    is_geographic: bool
     messages: int
     fixes: int
     exact: bool
@@ -110,21 +112,59 @@ class Fix:
     ellipse: tuple[float, float, float] | None
 
 
-def position_of(query: Query) -> str | None:
-    """Path in front of `latitude` and `longitude` in the messages (`""`, `position.`).
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """One pose.
 
-    None if they have no such fields.
+    Attributes:
+        time: Log time, ns since the epoch.
+        x: Metres, in the frame of the message.
+        y: Metres.
+        heading: Radians from x to y; None if the message has no orientation.
     """
+
+    time: int
+    x: float
+    y: float
+    heading: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where the messages of a topic have their position.
+
+    Attributes:
+        prefix: Path in front of both values: `""`, `pose.pose.position.`.
+        is_geographic: True for `latitude` and `longitude`, False for `x` and `y`.
+    """
+
+    prefix: str
+    is_geographic: bool
+
+    @property
+    def paths(self) -> tuple[str, str]:
+        """Paths of both values."""
+        names = ("latitude", "longitude") if self.is_geographic else ("x", "y")
+        return f"{self.prefix}{names[0]}", f"{self.prefix}{names[1]}"
+
+
+def position_of(query: Query) -> Position | None:
+    """Where the messages have their position; None if they have none."""
     known = query.field_types()
     if known is None:
-        return ""
-    ends = (path for path in known if path == "latitude" or path.endswith(".latitude"))
-    found = (path.removesuffix("latitude") for path in ends)
-    return next((path for path in found if f"{path}longitude" in known), None)
+        return Position("", is_geographic=True)
+    for end, is_geographic in (("latitude", True), ("position.x", False)):
+        for path in known:
+            if path != end and not path.endswith(f".{end}"):
+                continue
+            found = Position(path[: len(path) - (8 if is_geographic else 1)], is_geographic)
+            if "[]" not in path and found.paths[1] in known:
+                return found
+    return None
 
 
 def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
-    """The positions of a topic, such as NavSatFix, over log time.
+    """The positions of a topic, such as NavSatFix or Odometry, over log time.
 
     A message has a fix if its position is one and its `status.status`, if there is one, is not
     negative. The counters of the query are set to the cost.
@@ -138,9 +178,9 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
         UsageError: several topics or recordings, no positions, `reverse`, or no pixel.
         TimeError: the range of the query is outside all recordings.
     """
-    prefix = position_of(query)
-    if prefix is None:
-        raise UsageError(f"{', '.join(query.topics)} has no latitude and longitude.")
+    position = position_of(query)
+    if position is None:
+        raise UsageError(f"{', '.join(query.topics)} has no latitude and longitude, and no pose.")
     if pixels < 1 or query.question.reverse:
         raise UsageError("A track goes forward in time, in at least one pixel.")
     spans = query.spans()
@@ -149,8 +189,8 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
             f"A track is of one topic in one recording; these are {len(query.topics)} topics in "
             f"{len(spans)} recordings."
         )
-    paths = [f"{prefix}latitude", f"{prefix}longitude"]
-    if "status.status" in (query.field_types() or {"status.status"}):
+    paths = list(position.paths)
+    if position.is_geographic and "status.status" in (query.field_types() or {"status.status"}):
         paths.append("status.status")
     asked = query.fields(*paths)
     recording, (begin, end) = next(iter(spans.items()), ("", (0, 0)))
@@ -158,7 +198,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
         begin, end = max(begin, span[0]), min(end, span[1])
         window = np.array([[begin, max(begin, end), 0]], np.int64)
         asked = asked.during(Intervals.of([(recording, window)]))
-    made = _Builder(begin, end, pixels)
+    made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
     if begin < end:
         with query.counters.timed():
             for table in asked.to_tables():
@@ -174,38 +214,48 @@ class _Builder:
         begin: Log time of the first pixel, ns.
         end: Log time of the end of the last one.
         pixels: Number of pixels.
+        is_geographic: Whether positions are in degrees.
     """
 
-    def __init__(self, begin: int, end: int, pixels: int) -> None:
+    def __init__(self, begin: int, end: int, pixels: int, *, is_geographic: bool) -> None:
         self._begin = begin
         self._width = max(1, -(-(end - begin) // pixels))
         self._limit = _KEPT * pixels
         self._times = np.empty(0, np.int64)
         self._xy = np.empty((0, 2))
         self._grid: Grid | None = None
+        self._is_geographic = is_geographic
         self._messages = 0
         self._fixes = 0
         self._exact = True
 
     def add(self, table: pa.Table, paths: list[str]) -> None:
         """Add messages, which are in order of time."""
-        latitude, longitude, *status = (_numbers(table, path) for path in paths)
-        has_fix = _is_position(latitude, longitude)
+        first, second, *status = (_numbers(table, path) for path in paths)
+        if self._is_geographic:
+            has_fix = _is_position(first, second)
+        else:
+            has_fix = np.isfinite(first) & np.isfinite(second)
         if status:
             has_fix &= ~(status[0] < 0)
         self._messages += len(has_fix)
         self._fixes += int(np.count_nonzero(has_fix))
-        if self._grid is None and has_fix.any():
-            first = int(np.argmax(has_fix))
-            self._grid = Grid.at(float(latitude[first]), float(longitude[first]))
         xy = np.full((len(has_fix), 2), np.nan)
-        if self._grid is not None:
-            xy[has_fix] = self._grid.metres(latitude[has_fix], longitude[has_fix])
+        xy[has_fix] = self._metres(first[has_fix], second[has_fix])
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
         self._times = np.concatenate([self._times, times])
         self._xy = np.concatenate([self._xy, xy])
         if len(self._times) > self._limit:
             self._thin()
+
+    def _metres(
+        self, first: NDArray[np.float64], second: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        if not self._is_geographic or not len(first):
+            return np.stack([first, second], axis=1)
+        if self._grid is None:
+            self._grid = Grid.at(float(first[0]), float(second[0]))
+        return self._grid.metres(first, second)
 
     def _thin(self) -> None:
         self._exact = False
@@ -235,6 +285,7 @@ class _Builder:
             times=np.insert(self._times, gaps, middles),
             xy=np.insert(self._xy, gaps, np.nan, axis=0),
             grid=self._grid,
+            is_geographic=self._is_geographic,
             messages=self._messages,
             fixes=self._fixes,
             exact=self._exact,
@@ -283,10 +334,8 @@ def fix_of(message: Message, prefix: str = "") -> Fix:
         UsageError: it has no position.
     """
     fields: Any = message.fields
-    inner = fields
-    for name in prefix.split(".")[:-1]:
-        inner = inner.get(name) if isinstance(inner, Mapping) else None
-    if not isinstance(inner, Mapping) or not {"latitude", "longitude"} <= inner.keys():
+    inner = _inner(fields, prefix)
+    if not {"latitude", "longitude"} <= inner.keys():
         raise UsageError(f"This message of {message.topic} has no latitude and longitude.")
     latitude, longitude, altitude = (
         _number(inner.get(name)) for name in ("latitude", "longitude", "altitude")
@@ -304,6 +353,41 @@ def fix_of(message: Message, prefix: str = "") -> Fix:
         status=status,
         ellipse=_ellipse(fields),
     )
+
+
+def pose_of(message: Message, prefix: str) -> Pose:
+    """The pose of a message.
+
+    Args:
+        message: A message with a pose.
+        prefix: Path in front of `x`, from `position_of`.
+
+    Raises:
+        UsageError: it has no pose.
+    """
+    inner = _inner(message.fields, prefix)
+    if not {"x", "y"} <= inner.keys():
+        raise UsageError(f"This message of {message.topic} has no position.")
+    around = _inner(message.fields, prefix.removesuffix("position."))
+    x, y, z, w = (_number(_inner(around, "orientation.").get(name)) for name in "xyzw")
+    length = x * x + y * y + z * z + w * w
+    return Pose(
+        time=message.log_time_ns,
+        x=_number(inner["x"]),
+        y=_number(inner["y"]),
+        heading=(
+            math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+            if math.isfinite(length) and length > 0
+            else None
+        ),
+    )
+
+
+def _inner(fields: Any, prefix: str) -> Mapping[str, Any]:
+    """The fields below a path that ends with a dot; none if there is no such path."""
+    for name in prefix.split(".")[:-1]:
+        fields = fields.get(name) if isinstance(fields, Mapping) else None
+    return fields if isinstance(fields, Mapping) else {}
 
 
 def _number(value: Any) -> float:

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
-from hybridlog.drawing.track import Grid, fix_of, position_of, track
+from hybridlog.demo.write import write_bag
+from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
 from hybridlog.query.topics import TopicMatcher
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -204,7 +206,7 @@ def test_one_fix(tmp_path: Path) -> None:
                 values = {"latitude": 48.0, "longitude": 11.0, **one}
                 recorder.write(fix, payload(**values), log_time=BASE + at)
         fixes = [fix_of(message) for message in store.topic("fix")]
-        assert position_of(store.topic("fix")) == ""
+        assert position_of(store.topic("fix")) == Position("", is_geographic=True)
     assert fixes[0].ellipse == pytest.approx((2 * 2.4477, 2.4477, math.pi / 2), abs=1e-3)
     assert fixes[0].altitude == 12.5
     assert fixes[0].time == BASE
@@ -239,3 +241,39 @@ def test_real_fixes(tmp_path: Path) -> None:
     there = got.xy[~np.isnan(got.xy[:, 0])] / (got.grid.east, got.grid.north)
     back = np.stack([there[:, 1] + got.grid.latitude, there[:, 0] + got.grid.longitude], axis=1)
     assert np.abs(back - wanted).max() < 1e-9
+
+
+def test_poses_of_a_robot(tmp_path: Path) -> None:
+    """Against the messages as rosbags reads them."""
+    bag = tmp_path / "robot.bag"
+    write_bag(bag, duration_s=8, topics=["/odom", "/r_cart/command_pose"])
+    with AnyReader([bag]) as reader:
+        (connection,) = (c for c in reader.connections if c.topic == "/odom")
+        read = [
+            (time, reader.deserialize(raw, connection.msgtype).pose.pose)
+            for _, time, raw in reader.messages([connection])
+        ]
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(bag)
+        query = store.topic("odom")
+        assert position_of(query) == Position("pose.pose.position.", is_geographic=False)
+        got = track(query, pixels=len(read))
+        assert (got.is_geographic, got.grid, got.exact) == (False, None, True)
+        assert got.times.tolist() == [time for time, _ in read]
+        assert got.xy.tolist() == [[pose.position.x, pose.position.y] for _, pose in read]
+        thin = track(query, pixels=10)
+        assert not thin.exact
+        assert (thin.messages, thin.fixes) == (len(read), len(read))
+        assert {tuple(place) for place in thin.xy.tolist()} <= {tuple(p) for p in got.xy.tolist()}
+        time, pose = read[200]
+        found = pose_of(query.at(time), "pose.pose.position.")
+        assert (found.time, found.x, found.y) == (time, pose.position.x, pose.position.y)
+        # The robot turns about z only.
+        turned = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
+        assert found.heading is not None
+        assert math.cos(found.heading - turned) == pytest.approx(1)
+        assert position_of(store.topic("r_cart/command_pose")) == Position(
+            "pose.position.", is_geographic=False
+        )
+        with pytest.raises(UsageError, match="has no position"):
+            pose_of(query.at(time), "pose.")

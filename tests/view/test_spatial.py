@@ -347,7 +347,7 @@ def test_a_track_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str]
     assert box["right"] == pytest.approx(111.92, abs=0.3)  # 15e-4 degrees at 48 degrees north
     assert json.loads(shown["fix"])["longitude"] == 11.0002
     words = page.locator("article .sum").inner_text()
-    assert "28 fixes · 3 messages without a fix" in words
+    assert "28 fixes · 3 messages without one" in words
     assert "95 % within 4.9 m" in page.locator(".facts").inner_text()
     page.wait_for_timeout(100)
     seen = view(page, "plane")

@@ -1,4 +1,4 @@
-"""The positions of a satellite receiver: its track, and the one at a time."""
+"""The positions of a satellite receiver or of a robot: the track, and the one at a time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.drawing.track import fix_of, position_of, track
+from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
 from hybridlog.view.context import route, start_of
 from hybridlog.view.current import current
 from hybridlog.view.packed import packed_response
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def track_of(context: Context, asked: Asked) -> Response:
-    """The track of a topic in metres from its first fix, and the times.
+    """The track of a topic in metres, of a receiver from its first fix, and the times.
 
     Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time.
     """
@@ -35,6 +35,7 @@ def track_of(context: Context, asked: Asked) -> Response:
     found = track(query, pixels=asked.pixels(), span=span)
     header = {
         "grid": None if found.grid is None else asdict(found.grid),
+        "is_geographic": found.is_geographic,
         "messages": found.messages,
         "fixes": found.fixes,
         "exact": found.exact,
@@ -56,8 +57,12 @@ def fix_at(context: Context, asked: Asked) -> dict[str, Any]:
     if shown.message is None:
         return answer
     query = context.query(context.recording(asked), shown.message.topic)
-    found = asdict(fix_of(shown.message, position_of(query) or ""))
-    for name in ("latitude", "longitude"):
+    position = position_of(query) or Position("", is_geographic=True)
+    if position.is_geographic:
+        found = asdict(fix_of(shown.message, position.prefix))
+    else:
+        found = asdict(pose_of(shown.message, position.prefix))
+    for name in found.keys() & {"latitude", "longitude", "x", "y"}:
         found[name] = found[name] if math.isfinite(found[name]) else None
     return {**found, **answer}
 

@@ -15,7 +15,8 @@ import points from "./panels/points.js";
  * @typedef {Object} Kind
  * @property {string} kind name in addresses
  * @property {string} title name for people
- * @property {boolean} [isFirst] whether a recording is first shown with one
+ * @property {function({topic: string, type: string}): boolean} [isFirst] whether a recording is
+ *     first shown with one of this topic
  * @property {function({topic: string, type: string, encoding: string}): boolean} accepts
  * @property {function(HTMLElement, Panel): {update: function(), destroy: function()}} mount
  * @property {function(Panel): string} python code that gets the same from the store
@@ -35,7 +36,7 @@ const KINDS = [image, points, map, plot, log, message];
 function firstPanels(topics) {
   const found = [];
   for (const { kind, isFirst, accepts } of KINDS) {
-    const topic = isFirst && topics.find((one) => one.messages && accepts(one));
+    const topic = topics.find((one) => one.messages && accepts(one) && isFirst?.(one));
     if (topic) found.push({ kind, topic: topic.topic, options: {} });
   }
   return found;

@@ -18,7 +18,7 @@ const TYPES = new Set([
 export default {
   kind: "image",
   title: "Image",
-  isFirst: true,
+  isFirst: () => true,
   accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
   mount,
   python: (panel) =>

@@ -24,7 +24,7 @@ let mounted = 0;
 export default {
   kind: "log",
   title: "Log",
-  isFirst: true,
+  isFirst: () => true,
   accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
   mount,
   python: (panel) => {

@@ -1,4 +1,4 @@
-/** The track of a satellite receiver on a grid in metres: no tiles, no network. */
+/** The track of a satellite receiver, or of a robot, on a grid in metres: no tiles, no network. */
 
 import { ApiError, bytes, get } from "../api.js";
 import { element } from "../dom.js";
@@ -18,12 +18,19 @@ const TYPES = new Set([
   "geographic_msgs/GeoPoseStamped",
   "foxglove.LocationFix",
   "foxglove_msgs/LocationFix",
+  "nav_msgs/Odometry",
+  "geometry_msgs/PoseStamped",
+  "geometry_msgs/PoseWithCovarianceStamped",
+  "geometry_msgs/Pose",
+  "foxglove.PoseInFrame",
+  "foxglove_msgs/PoseInFrame",
 ]);
+const FIRST = /Fix|Odometry/; // what a recording is first shown with
 
 export default {
   kind: "map",
   title: "Map",
-  isFirst: true,
+  isFirst: ({ type }) => FIRST.test(type),
   accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
   mount,
   python: (panel) =>
@@ -111,7 +118,8 @@ function mount(body, panel) {
       const parameters = { ...asked, begin, end, pixels: PIXELS };
       const found = unpack(await bytes("track", parameters));
       if (isGone || key !== wanted) return;
-      detail = found.grid ? { ...found, shift: shiftOf(found.grid) } : null;
+      if (!found.is_geographic) detail = found;
+      else detail = found.grid ? { ...found, shift: shiftOf(found.grid) } : null;
       drawn.redraw();
     } catch (error) {
       refuse(error);
@@ -125,17 +133,27 @@ function mount(body, panel) {
     return [turn * grid.east, (latitude - grid.latitude) * grid.north];
   }
 
+  /** Metres of what is current at the cursor; null if it has no position. */
+  function placeOf(found) {
+    if (found?.x !== undefined) return found.x === null || found.y === null ? null : [found.x, found.y];
+    return found?.has_fix && track.grid ? shiftOf(found) : null;
+  }
+
   function paint(context, view) {
     if (!track) return;
     const { begin, end } = panel.range();
     line(context, view, track, { colour: view.theme.faint, width: 1 });
     const part = detail ?? track;
     line(context, view, part, { colour: view.theme.accent, width: 2, begin, end });
-    if (!fix?.has_fix || !track.grid) return;
-    const [x, y] = shiftOf(fix);
-    const [right, down] = [view.x(x), view.y(y)];
+    const place = placeOf(fix);
+    if (!place) return;
+    const [right, down] = [view.x(place[0]), view.y(place[1])];
     context.fillStyle = view.theme.mark;
     context.strokeStyle = view.theme.mark;
+    if (Number.isFinite(fix.heading)) {
+      arrow(context, right, down, -fix.heading);
+      return;
+    }
     if (fix.ellipse) {
       const [long, across, angle] = fix.ellipse;
       context.lineWidth = 1;
@@ -167,8 +185,8 @@ function mount(body, panel) {
     if (track) {
       const without = track.messages - track.fixes;
       sum.textContent = [
-        `${count(track.fixes)} fixes`,
-        without ? `${count(without)} messages without a fix` : null,
+        `${count(track.fixes)} ${track.is_geographic ? "fixes" : "positions"}`,
+        without ? `${count(without)} messages without one` : null,
         track.grid ? `grid from ${degrees(track.grid)}` : null,
       ]
         .filter(Boolean)
@@ -182,7 +200,7 @@ function mount(body, panel) {
       });
     }
     if (!fix) return;
-    facts.textContent = fix.time === null ? "No fix at or before the cursor." : describeFix(fix);
+    facts.textContent = fix.time === null ? "Nothing at or before the cursor." : describeFix(fix);
     facts.title = facts.textContent;
     place.dataset.fix = JSON.stringify(fix);
   }
@@ -194,6 +212,21 @@ function mount(body, panel) {
     problem.hidden = false;
     place.hidden = true;
   }
+}
+
+/** Draws an arrow at a pixel; the angle is clockwise from the right, in radians. */
+function arrow(context, right, down, angle) {
+  context.save();
+  context.translate(right, down);
+  context.rotate(angle);
+  context.beginPath();
+  context.moveTo(12, 0);
+  context.lineTo(-7, 7);
+  context.lineTo(-3, 0);
+  context.lineTo(-7, -7);
+  context.closePath();
+  context.fill();
+  context.restore();
 }
 
 /** Draws a track, or the part of it in a range; NaN is a gap. */
@@ -248,7 +281,17 @@ function degrees({ latitude, longitude }) {
   return `${north}, ${Math.abs(longitude).toFixed(7)}° ${longitude < 0 ? "W" : "E"}`;
 }
 
-function describeFix({ time, has_fix: hasFix, latitude, longitude, altitude, status, ellipse }) {
+function describeFix(fix) {
+  return fix.x === undefined ? describeReceiver(fix) : describePose(fix);
+}
+
+function describePose({ time, x, y, heading }) {
+  const turned = heading === null ? null : `${((heading * 180) / Math.PI).toFixed(1)}°`;
+  const values = x === null || y === null ? ["no position"] : [`x ${x.toFixed(3)} m`, `y ${y.toFixed(3)} m`];
+  return [offset(time), ...values, turned].filter((part) => part !== null).join(" · ");
+}
+
+function describeReceiver({ time, has_fix: hasFix, latitude, longitude, altitude, status, ellipse }) {
   const isPosition = latitude !== null && longitude !== null;
   return [
     offset(time),

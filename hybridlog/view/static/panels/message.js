@@ -13,7 +13,6 @@ const MOST_REMEMBERED = 40;
 export default {
   kind: "message",
   title: "Message",
-  isFirst: false,
   accepts: () => true,
   mount,
   python: (panel) =>

@@ -19,7 +19,6 @@ const LEAST_DRAG = 5; // pixels; less is a click
 export default {
   kind: "plot",
   title: "Plot",
-  isFirst: false,
   accepts: () => true,
   mount,
   python: (panel) => {

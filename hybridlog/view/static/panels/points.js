@@ -28,7 +28,7 @@ const sizeOf = (points) => (points < 2000 ? 4 : points < 20000 ? 3 : 2);
 export default {
   kind: "points",
   title: "Points",
-  isFirst: true,
+  isFirst: () => true,
   accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
   mount,
   python: (panel) =>
