@@ -20,7 +20,7 @@ from hybridlog.view.app import make_app
 from hybridlog.view.server import ViewServer
 from tests.every_image import write_images
 from tests.odd_messages import write_odd
-from tests.view.chromium import chromium
+from tests.view.chromium import Chromium, chromium
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, ConsoleMessage, Page
@@ -101,17 +101,23 @@ def odd_url(odd_store: hl.Store) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`."""
-    from playwright.sync_api import sync_playwright
-
+def installed() -> Chromium:
+    """Where chromium lies. Tests that use it are marked `@pytest.mark.peer("browser")`."""
     found = chromium()
     if isinstance(found, str):
         pytest.skip(f"The page was NOT tested in a browser, {found}: apt-get install chromium")
+    return found
+
+
+@pytest.fixture(scope="session")
+def browser(installed: Chromium) -> Iterator[Browser]:
+    """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`."""
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         started = playwright.chromium.launch(
-            executable_path=found.path,
-            env=found.environment or dict(os.environ),
+            executable_path=installed.path,
+            env=installed.environment or dict(os.environ),
             args=["--no-sandbox", "--enable-unsafe-swiftshader"],
         )
         yield started
