@@ -6,13 +6,16 @@ import os
 import sys
 from itertools import chain, islice
 from pathlib import Path
+from typing import Final
 
 import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
+from hybridlog_storage.errors import UsageError
 
+_FOXGLOVE: Final = ("https://app.foxglove.dev", "https://embed.foxglove.dev")
 _MAX_FOLDERS = 1000
 
 
@@ -33,6 +36,17 @@ _MAX_FOLDERS = 1000
     help="Port of 127.0.0.1 to serve on.",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
+@click.option(
+    "--mcap", is_flag=True, help="Also serve selections as MCAP, to Foxglove and Lichtblick."
+)
+@click.option(
+    "--allow-origin",
+    "origins",
+    multiple=True,
+    metavar="URL",
+    help="With --mcap: let web pages of this origin read them, such as http://localhost:8080; "
+    "those of Foxglove may. Repeatable.",
+)
 @options.mongo
 @options.as_json
 def command(
@@ -41,6 +55,8 @@ def command(
     store: Path | None,
     port: int,
     opens: bool,
+    mcap: bool,
+    origins: tuple[str, ...],
     mongo: str | None,
     as_json: bool,
 ) -> None:
@@ -57,21 +73,45 @@ def command(
 
     if store is None and not os.environ.get("HYBRIDLOG_STORE"):
         store = _only_store_near()
+    if origins and not mcap:
+        raise UsageError("--allow-origin is about --mcap: add that.")
     with opened_store(store, mongo, quiet=as_json) as opened:
-        server = ViewServer(opened, port)
+        allowed = (*_FOXGLOVE, *origins) if mcap else ()
+        server = ViewServer(opened, port, origins=allowed)
         url = server.url
+        label = ""
         if recording is not None:
             (entry,) = opened.select([recording])
-            url += f"#recording={quote(entry.label, safe='')}"
+            label = quote(entry.label, safe="")
+            url += f"#recording={label}"
         if as_json:
-            output.print_json({"url": url, "port": server.port})
+            shown = {"url": url, "port": server.port}
+            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if mcap else {}))
         else:
             click.echo(url)
             output.note("Open this address in a browser. Ctrl-C ends the server.")
+            if mcap:
+                _print_mcap(f"{server.url}mcap/", label)
         sys.stdout.flush()
         if opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
         server.run()
+
+
+def _print_mcap(url: str, label: str) -> None:
+    """Print where other viewers find selections.
+
+    Args:
+        url: Address of all selections.
+        label: Label of a recording for the examples, as in a URL; empty without one.
+    """
+    from urllib.parse import quote
+
+    file = f"{url}slice.mcap?recording={label or 'RECORDING'}"
+    foxglove = f"https://app.foxglove.dev/?ds=remote-file&ds.url={quote(file, safe='')}"
+    output.note(f"MCAP file: {file}")
+    output.note(f"In Foxglove: {foxglove}")
+    output.note(f"For a remote data loader: {url}manifest")
 
 
 def _only_store_near() -> Path | None:

@@ -19,6 +19,7 @@ MAX_BYTES: Final = 16 << 30
 """Bytes that the files may have together, by default."""
 
 _NAME_DIGITS = 16
+_NAME_LENGTH = 50  # characters; a file name has 255 bytes at most
 
 
 class SliceCache:
@@ -51,7 +52,7 @@ class SliceCache:
             UsageError: The slice is larger than all files may be together, or the directory
                 cannot be used.
         """
-        path = self._directory / f"{name}-{query.fingerprint()[:_NAME_DIGITS]}.mcap"
+        path = self._directory / f"{name[:_NAME_LENGTH]}-{query.fingerprint()[:_NAME_DIGITS]}.mcap"
         if not self._use(path):
             with self._writing:  # one at a time: they would compete for the disk
                 if not self._use(path):

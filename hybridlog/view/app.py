@@ -41,10 +41,12 @@ def make_app(store: Store, token: str, port: int, *, origins: Collection[str] = 
         store: The store that is shown.
         token: The first part of every path.
         port: The port of the server.
-        origins: Origins of other pages that may read the routes below `mcap/`.
+        origins: Origins of other pages that may read the routes below `mcap/`; without any,
+            these routes do not exist.
     """
+    names = (*ROUTES, "mcap") if origins else ROUTES
     routes = [
-        route for name in ROUTES for route in import_module(f"hybridlog.view.routes.{name}").routes
+        route for name in names for route in import_module(f"hybridlog.view.routes.{name}").routes
     ]
     routes.append(Mount("/", StaticFiles(directory=_STATIC, html=True), name="page"))
     app = Starlette(routes=routes, exception_handlers={Exception: broken_response})

@@ -16,6 +16,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hybridlog.drawing.density_cache import DensityCache
+from hybridlog.export.slice_cache import SliceCache
 from hybridlog.view.asked import Asked
 from hybridlog_storage.errors import HybridlogError, TopicError
 
@@ -53,6 +54,11 @@ class Context:
     def densities(self) -> DensityCache:
         """Counts of messages by pixel."""
         return DensityCache(self.store.session)
+
+    @cached_property
+    def slices(self) -> SliceCache:
+        """MCAP files of selections."""
+        return SliceCache()
 
     @contextmanager
     def turn(self) -> Iterator[None]:

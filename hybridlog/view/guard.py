@@ -12,7 +12,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Final
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse
+from starlette.responses import PlainTextResponse, Response
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -31,6 +31,7 @@ HEADERS: Final = {
 """Headers of every answer that does not set its own."""
 
 _METHODS: Final = frozenset({"GET", "HEAD"})
+_PREFLIGHT: Final = "OPTIONS"
 _ONCE: Final = ("host", "origin")
 
 
@@ -84,6 +85,9 @@ class Guard:
             await response(scope, receive, send)
             return
         origin = headers.get("origin")
+        if scope["method"] == _PREFLIGHT:
+            await _allowed(str(origin))(scope, receive, send)
+            return
 
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -108,7 +112,8 @@ class Guard:
             return 404, "Open the address that `hybridlog view` printed; it has a token."
         if not self._is_own(headers, below):
             return 403, "Pages of other sites may not read this store."
-        if method not in _METHODS:
+        preflight = method == _PREFLIGHT and headers.get("origin") in self._origins
+        if method not in _METHODS and not preflight:
             return 405, "This server only answers GET: it never changes the store."
         return None
 
@@ -120,6 +125,16 @@ class Guard:
             return False
         site = headers.get("sec-fetch-site", "same-origin")
         return site in {"same-origin", "none"} or headers.get("sec-fetch-mode") == "navigate"
+
+
+def _allowed(origin: str) -> Response:
+    """The answer to a browser that asks whether a page may read ranges."""
+    headers = MutableHeaders(HEADERS)
+    _let_read(headers, origin)
+    headers["Access-Control-Allow-Methods"] = "GET, HEAD"
+    headers["Access-Control-Allow-Headers"] = "Range, If-Range, If-Match, If-None-Match"
+    headers["Access-Control-Allow-Private-Network"] = "true"
+    return Response(status_code=204, headers=headers)
 
 
 def _let_read(headers: MutableHeaders, origin: str) -> None:

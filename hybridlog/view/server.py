@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+from collections.abc import Collection
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,6 +22,7 @@ class ViewServer:
     Args:
         store: The store that is shown.
         port: Port of 127.0.0.1; 0 for any that is free.
+        origins: Origins of other viewers that may read selections as MCAP; see `make_app`.
 
     Attributes:
         url: The address of the page, with its token.
@@ -30,7 +32,7 @@ class ViewServer:
         UsageError: The port cannot be used.
     """
 
-    def __init__(self, store: Store, port: int = 0) -> None:
+    def __init__(self, store: Store, port: int = 0, *, origins: Collection[str] = ()) -> None:
         try:
             import uvicorn
 
@@ -45,7 +47,7 @@ class ViewServer:
         token = new_token()
         self.url = f"http://127.0.0.1:{self.port}/{token}/"
         config = uvicorn.Config(
-            make_app(store, token, self.port),
+            make_app(store, token, self.port, origins=origins),
             log_level="critical",
             access_log=False,
             lifespan="off",

@@ -74,9 +74,9 @@ def odd(odd_store: hl.Store, asking: Asking) -> TestClient:
 
 
 @contextmanager
-def served(store: hl.Store) -> Iterator[str]:
+def served(store: hl.Store, *origins: str) -> Iterator[str]:
     """Serve the view of a store; gives its address."""
-    server = ViewServer(store)
+    server = ViewServer(store, origins=origins)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:

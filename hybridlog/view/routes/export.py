@@ -40,9 +40,19 @@ def command(context: Context, asked: Asked) -> dict[str, Any]:
 def file(context: Context, asked: Asked) -> Response:
     """A part of a recording as an MCAP file."""
     question = _question(context, asked)
-    pieces = pieces_of(question.query())
+    return mcap_response(question.query(), question.file_name())
+
+
+def mcap_response(query: Query, name: str) -> Response:
+    """The messages of a query as an MCAP file, made while it is sent.
+
+    Args:
+        query: The query.
+        name: Name of the file, of plain characters.
+    """
+    pieces = pieces_of(query)
     # Most errors come before the first piece, and can still be told.
-    return file_response(_with(next(pieces), pieces), question.file_name())
+    return file_response(_with(next(pieces), pieces), name)
 
 
 def _with(first: bytes, rest: Pieces) -> Pieces:

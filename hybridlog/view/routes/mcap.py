@@ -1,0 +1,132 @@
+"""Selections as MCAP for other viewers: files to read by ranges, and data for a remote data loader.
+
+A file is written into the user's cache when it is first asked for, and served from there. The
+data of the loader is made while it is sent, and nothing is kept.
+"""
+
+from __future__ import annotations
+
+import base64
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlencode
+
+from starlette.responses import FileResponse
+
+from hybridlog.choice import Choice
+from hybridlog.export.slices import write_mcap
+from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.times import format_time
+from hybridlog.view.context import Context, route
+from hybridlog.view.routes.export import MAX_TOPICS, mcap_response
+from hybridlog_storage.errors import TimeError, UsageError
+
+if TYPE_CHECKING:
+    from starlette.responses import Response
+
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.view.asked import Asked
+    from hybridlog_storage.messages import Schema
+
+MAX_RECORDINGS: Final = 100
+_MAX_PREDICATES: Final = 16
+_MEDIA_TYPE: Final = "application/octet-stream"
+
+
+def slice_file(context: Context, asked: Asked) -> Response:
+    """A selection as an MCAP file; ranges of it can be asked for."""
+    query = _query(context, asked)
+    path = context.slices.get(query, _name(context, query), write_mcap)
+    # The name has the digest of the question and of the state of its recordings.
+    etag = path.stem.rpartition("-")[2]
+    return FileResponse(path, headers={"ETag": f'"{etag}"'}, media_type=_MEDIA_TYPE)
+
+
+def manifest(context: Context, asked: Asked) -> dict[str, Any]:
+    """What a selection holds, and where its data is: the manifest of a remote data loader."""
+    query = _query(context, asked)
+    spans = query.spans().values()
+    if not spans:
+        raise TimeError("This selection has no messages.")
+    schemas: dict[Schema, int] = {}
+    topics = [_topic(channel, schemas) for channel in query.channels() if not channel.is_reduced]
+    source = {
+        "url": f"data?{urlencode(_parameters(asked))}",
+        "id": query.fingerprint(),
+        "topics": [dict(topic) for topic in dict.fromkeys(topics)],
+        "schemas": [_schema(schema, number) for schema, number in schemas.items()],
+        "startTime": format_time(min(begin for begin, _ in spans)),
+        "endTime": format_time(max(end for _, end in spans) - 1),
+    }
+    return {"name": _name(context, query), "sources": [source]}
+
+
+def data(context: Context, asked: Asked) -> Response:
+    """A selection as an MCAP file that is read from its beginning to its end."""
+    return mcap_response(_query(context, asked), "slice.mcap")
+
+
+def _query(context: Context, asked: Asked) -> Query:
+    """The query of the parameters, which mean what the options of the command line mean."""
+    context.refresh()
+    names = asked.texts("recording", most=MAX_RECORDINGS)
+    if not names:
+        raise UsageError("The parameter recording is missing.")
+    chosen = context.store.choose(Choice.of(names)).check()
+    topics = asked.texts("topic", most=MAX_TOPICS)
+    query = chosen.topic(*topics) if topics else chosen.all_topics()
+    if asked.has("begin") or asked.has("end"):
+        query = query.between(_time(asked, "begin", "start"), _time(asked, "end", "end"))
+    for predicate in asked.texts("where", most=_MAX_PREDICATES, longest=MAX_TEXT):
+        query = query.where(predicate)
+    return query
+
+
+def _time(asked: Asked, name: str, default: str) -> str:
+    """A time as on the command line; the plus of `+10s` is a space in a URL."""
+    text = asked.text(name, default, longest=64)
+    return f"+{text[1:]}" if text.startswith(" ") else text
+
+
+def _parameters(asked: Asked) -> list[tuple[str, str]]:
+    """The parameters, for another URL."""
+    several = {"recording": MAX_RECORDINGS, "topic": MAX_TOPICS, "where": _MAX_PREDICATES}
+    found = [
+        (name, value)
+        for name, most in several.items()
+        for value in asked.texts(name, most=most, longest=MAX_TEXT)
+    ]
+    times = (("begin", "start"), ("end", "end"))
+    return found + [(name, _time(asked, name, default)) for name, default in times]
+
+
+def _name(context: Context, query: Query) -> str:
+    """The label of the recording, if it is one."""
+    ids = query.recordings
+    return context.store.entry(ids[0]).label if len(ids) == 1 else f"{len(ids)} recordings"
+
+
+def _topic(recorded: RecordedChannel, schemas: dict[Schema, int]) -> tuple[tuple[str, Any], ...]:
+    """A topic of the manifest; a new schema gets a number."""
+    channel = recorded.channel
+    schema = channel.schema
+    found = (("name", channel.topic), ("messageEncoding", channel.message_encoding))
+    if schema is None:
+        return found
+    return (*found, ("schemaId", schemas.setdefault(schema, len(schemas) + 1)))
+
+
+def _schema(schema: Schema, number: int) -> dict[str, Any]:
+    return {
+        "id": number,
+        "name": schema.name,
+        "encoding": schema.encoding,
+        "data": base64.b64encode(schema.data).decode(),
+    }
+
+
+routes = [
+    route("/mcap/slice.mcap", slice_file),
+    route("/mcap/manifest", manifest),
+    route("/mcap/data", data),
+]

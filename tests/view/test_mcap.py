@@ -1,0 +1,336 @@
+"""Selections as MCAP: read over HTTP by other people's readers."""
+
+from __future__ import annotations
+
+import base64
+import io
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import urlencode
+
+import httpx
+import pytest
+from mcap.reader import NonSeekingReader, SeekingReader
+from starlette.testclient import TestClient
+
+import hybridlog as hl
+from hybridlog.export.slice_cache import SliceCache
+from hybridlog.export.slices import write_mcap
+from hybridlog.view.app import make_app
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.messages import Channel
+from tests.independent import Seen, read_bag, read_mcap
+from tests.view.conftest import PORT, TOKEN, served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+FOXGLOVE = "https://app.foxglove.dev"
+S = 10**9
+
+
+@pytest.fixture(scope="module")
+def seen(demo_store: hl.Store) -> list[Seen]:
+    """The bag as the `rosbags` package reads it."""
+    return read_bag(demo_store.directory.path.parent / "robot.bag")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        path = tmp_path_factory.mktemp("cache")
+        patch.setenv("XDG_CACHE_HOME", str(path))
+        yield path / "hybridlog" / "slices"
+
+
+@pytest.fixture(scope="module")
+def app(demo_store: hl.Store) -> TestClient:
+    """The view with MCAP, without a server."""
+    guarded = make_app(demo_store, TOKEN, PORT, origins=[FOXGLOVE])
+    return TestClient(guarded, base_url=f"http://127.0.0.1:{PORT}/{TOKEN}/mcap/")
+
+
+class Ranges(io.RawIOBase):
+    """A file on a server, read by ranges."""
+
+    def __init__(self, url: str) -> None:
+        self._url, self._at = url, 0
+        self.taken = 0
+        head = httpx.head(url)
+        assert head.headers["accept-ranges"] == "bytes"
+        self.length, self.etag = int(head.headers["content-length"]), head.headers["etag"]
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = (0, self._at, self.length)[whence] + offset
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        end = min(self._at + len(buffer), self.length) - 1
+        if end < self._at:
+            return 0
+        got = httpx.get(self._url, headers={"Range": f"bytes={self._at}-{end}"})
+        assert got.status_code == 206
+        assert got.headers["content-range"] == f"bytes {self._at}-{end}/{self.length}"
+        assert got.headers["etag"] == self.etag
+        buffer[: len(got.content)] = got.content
+        self._at += len(got.content)
+        self.taken += len(got.content)
+        return len(got.content)
+
+
+def test_a_reader_opens_the_url(demo_store: hl.Store, seen: list[Seen]) -> None:
+    with served(demo_store, FOXGLOVE) as url:
+        file = Ranges(f"{url}mcap/slice.mcap?recording=robot")
+        reader = SeekingReader(cast("io.BytesIO", io.BufferedReader(file, 1 << 16)))
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == len(seen)
+        assert file.taken < file.length / 4, "a part of the file is enough"
+        begin = seen[0].log_time + 5 * S
+        found = [
+            Seen(channel.topic, message.log_time, message.data)
+            for _, channel, message in reader.iter_messages(
+                topics=["/base/scan"], starting_at=begin, ending_before=begin + S
+            )
+        ]
+        wanted = [m for m in seen if m.topic == "/base/scan" and begin <= m.log_time < begin + S]
+        assert found == wanted
+
+
+def test_a_slice_is_the_one_of_the_command_line(
+    app: TestClient, demo_store: hl.Store, tmp_path: Path
+) -> None:
+    wanted = {"recording": "robot", "topic": "scan", "begin": "+1s", "end": "+2s"}
+    got = app.get("slice.mcap", params={**wanted, "where": "ranges.min > 0"})
+    query = demo_store.topic("scan").between("+1s", "+2s").where("ranges.min > 0")
+    write_mcap(query, tmp_path / "own.mcap")
+    assert got.content == (tmp_path / "own.mcap").read_bytes()
+    # Typed by hand, the plus is a space.
+    typed = app.get("slice.mcap?recording=robot&topic=scan&begin=+1s&end=+2s")
+    assert typed.content == app.get("slice.mcap", params=wanted).content
+
+
+def test_ranges(app: TestClient) -> None:
+    url = "slice.mcap?recording=robot&topic=/map"
+    whole = app.get(url)
+    assert whole.status_code == 200
+    tag = whole.headers["etag"]
+    assert not tag.startswith("W/")
+    last = app.get(url, headers={"Range": "bytes=-8", "If-Range": tag})
+    assert (last.status_code, last.content) == (206, b"\x89MCAP0\r\n")
+    other = app.get(url, headers={"Range": "bytes=-8", "If-Range": '"other"'})
+    assert (other.status_code, other.content) == (200, whole.content)
+    beyond = app.get(url, headers={"Range": f"bytes={len(whole.content)}-"})
+    assert beyond.status_code == 416
+    assert app.get(url, headers={"Range": "bytes=5-2"}).status_code == 400
+    head = app.head(url)
+    assert (head.headers["content-length"], head.content) == (str(len(whole.content)), b"")
+
+
+def test_the_bytes_are_the_same_when_the_file_was_lost(app: TestClient, cache: Path) -> None:
+    url = "slice.mcap?recording=robot&topic=/odom"
+    first = app.get(url)
+    (file,) = cache.glob(f"robot-{first.headers['etag'][1:-1]}.mcap")
+    written = file.stat().st_mtime_ns
+    assert app.get(url).content == first.content
+    assert file.stat().st_mtime_ns == written, "it is written once"
+    file.unlink()
+    again = app.get(url)
+    assert again.content == first.content
+    assert again.headers["etag"] == first.headers["etag"]
+    other = app.get("slice.mcap?recording=robot&topic=/tf")
+    assert other.headers["etag"] != first.headers["etag"]
+
+
+def test_more_messages_are_another_file(tmp_path: Path) -> None:
+    slices = SliceCache(tmp_path / "slices")
+    with hl.open(tmp_path / "store", create=True) as store:
+        files = []
+        for count in (1, 2):
+            with store.start(f"run {count}") as recording:
+                recording.write(Channel("/n", "json", None), b"{}", log_time=count)
+            files.append(slices.get(store.topic("/n"), "run", write_mcap))
+            assert len(read_mcap(files[-1])) == count
+        assert files[0] != files[1]
+
+
+def test_a_data_loader_gets_what_the_manifest_says(
+    app: TestClient, demo_store: hl.Store, seen: list[Seen]
+) -> None:
+    wanted = {"recording": "robot", "topic": ["/base/scan", "/tf*"], "begin": "+2s", "end": "+4s"}
+    got = app.get("manifest", params=wanted).json()
+    assert got["name"] == "robot"
+    (source,) = got["sources"]
+    assert set(source) == {"url", "id", "topics", "schemas", "startTime", "endTime"}
+    data = app.get(source["url"])
+    assert data.status_code == 200
+    reader = NonSeekingReader(io.BytesIO(data.content))
+    messages = list(reader.iter_messages())
+    schemas = {row["id"]: row for row in source["schemas"]}
+    assert all(0 < number < 1 << 16 for number in schemas)
+    topics = {
+        (row["name"], row["messageEncoding"], *described(schemas[row["schemaId"]]))
+        for row in source["topics"]
+    }
+    found = {
+        (channel.topic, channel.message_encoding, schema.name, schema.encoding, schema.data)
+        for schema, channel, _ in messages
+        if schema is not None
+    }
+    assert found == topics
+    assert {topic for topic, *_ in found} == {"/base/scan", "/tf", "/tf_static"}
+    start, end = (hl_time(source[key]) for key in ("startTime", "endTime"))
+    assert all(start <= message.log_time <= end for *_, message in messages)
+    begin = seen[0].log_time + 2 * S
+    scans = [m for m in seen if m.topic == "/base/scan" and begin <= m.log_time < begin + 2 * S]
+    read = [Seen(c.topic, m.log_time, m.data) for _, c, m in messages]
+    assert [m for m in read if m.topic == "/base/scan"] == scans
+    again = app.get("manifest", params=wanted).json()
+    assert again == got, "a loader caches by the id"
+    other = app.get("manifest", params={**wanted, "end": "+5s"}).json()
+    assert other["sources"][0]["id"] != source["id"]
+
+
+def described(row: dict[str, Any]) -> tuple[str, str, bytes]:
+    return row["name"], row["encoding"], base64.b64decode(row["data"], validate=True)
+
+
+def hl_time(text: str) -> int:
+    from hybridlog.query.times import parse_time
+
+    return parse_time(text, start=None, end=None)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "code"),
+    [
+        ({}, 400),
+        ({"recording": "none"}, 404),
+        ({"recording": "../../etc"}, 404),
+        ({"recording": "robot", "topic": "/none"}, 404),
+        ({"recording": "robot", "topic": ["x"] * 1000}, 400),
+        ({"recording": "robot", "begin": "+1h"}, 400),
+        ({"recording": "robot", "begin": "x" * 1000}, 400),
+        ({"recording": "robot", "topic": "/odom", "where": "none > 1"}, 400),
+        ({"recording": "robot", "topic": "/odom", "where": "("}, 400),
+    ],
+)
+@pytest.mark.parametrize("path", ["slice.mcap", "manifest", "data"])
+def test_wrong_questions(path: str, parameters: dict[str, Any], code: int, app: TestClient) -> None:
+    got = app.get(path, params=parameters)
+    assert got.status_code == code
+    assert got.json()["error"]
+
+
+def test_only_with_the_option_and_only_these_routes(client: TestClient, app: TestClient) -> None:
+    from_foxglove = {"Origin": FOXGLOVE, "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "cors"}
+    url = "slice.mcap?recording=robot&topic=/map"
+    assert client.get(f"mcap/{url}").status_code == 404
+    assert client.get(f"mcap/{url}", headers=from_foxglove).status_code == 403
+    got = app.get(url, headers={**from_foxglove, "Range": "bytes=0-7"})
+    assert got.status_code == 206
+    assert got.headers["access-control-allow-origin"] == FOXGLOVE
+    assert "Content-Range" in got.headers["access-control-expose-headers"]
+    assert got.headers["vary"] == "Origin"
+    asked = {**from_foxglove, "Access-Control-Request-Method": "GET"}
+    may = app.options(url, headers={**asked, "Access-Control-Request-Headers": "range"})
+    assert may.status_code == 204
+    assert may.headers["access-control-allow-origin"] == FOXGLOVE
+    assert "Range" in may.headers["access-control-allow-headers"]
+    for headers in (from_foxglove, asked):
+        assert app.get("../recordings", headers=headers).status_code == 403
+    for origin in ("https://evil.example", "null", f"{FOXGLOVE}.evil.example"):
+        for refused in (
+            app.get(url, headers={"Origin": origin}),
+            app.options(url, headers={**asked, "Origin": origin}),
+        ):
+            assert refused.status_code == 403
+            assert "access-control-allow-origin" not in refused.headers
+    assert app.options(url).status_code == 405
+    assert app.post(url, headers=from_foxglove).status_code == 405
+    stranger = TestClient(app.app, base_url=f"http://127.0.0.1:{PORT}/other/mcap/")
+    assert stranger.get(url).status_code == 404
+    assert stranger.options(url, headers=asked).status_code == 404
+
+
+@pytest.mark.peer("browser")
+def test_a_page_of_foxglove_reads_ranges(demo_store: hl.Store, page: Page) -> None:
+    """A browser lets that page read them, and another page not."""
+    read = """async url => {
+        const got = await fetch(url, {headers: {Range: 'bytes=0-7'}})
+        return [got.status, got.headers.get('content-range'), (await got.arrayBuffer()).byteLength]
+    }"""
+    page.context.grant_permissions(["local-network-access"])
+    for site in (FOXGLOVE, "https://evil.example"):
+        page.route(f"{site}/**", lambda route: route.fulfill(body="<p>", content_type="text/html"))
+    with served(demo_store, FOXGLOVE) as url:
+        file = f"{url}mcap/slice.mcap?recording=robot&topic=/map"
+        page.goto(FOXGLOVE)
+        status, content_range, length = page.evaluate(read, file)
+        assert (status, length) == (206, 8)
+        assert content_range.startswith("bytes 0-7/")
+
+
+def test_the_oldest_slices_make_room(demo_store: hl.Store, tmp_path: Path) -> None:
+    queries = [demo_store.query([topic]) for topic in ("/odom", "/tf", "/joint_states")]
+    room = SliceCache(tmp_path / "slices")
+    first, second = (room.get(query, "a" * 300, write_mcap) for query in queries[:2])
+    taken = first.stat().st_size + second.stat().st_size
+    small = SliceCache(tmp_path / "slices", max_bytes=taken + queries[2].size_hint() - 1)
+    assert small.get(queries[0], "a" * 300, write_mcap) == first, "it is used again, so newer"
+    third = small.get(queries[2], "c", write_mcap)
+    assert sorted((tmp_path / "slices").iterdir()) == sorted([first, third])
+    assert not second.exists()
+    tiny = SliceCache(tmp_path / "slices", max_bytes=100)
+    with pytest.raises(UsageError, match="choose fewer topics or less time"):
+        tiny.get(queries[1], "b", write_mcap)
+    assert first.exists(), "a slice that is refused removes nothing"
+
+
+def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store, tmp_path: Path) -> None:
+    slices = SliceCache(tmp_path / "slices")
+    query = demo_store.query(["/odom"])
+    writers = []
+    together = threading.Barrier(4)
+
+    def write(query: hl.Query, path: Path) -> None:
+        writers.append(path)
+        write_mcap(query, path)
+
+    def get() -> None:
+        together.wait()
+        slices.get(query.copy(), "odom", write)
+
+    threads = [threading.Thread(target=get) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(writers) == 1
+    assert len(read_mcap(writers[0])) == query.count()
+
+    def fail(query: hl.Query, path: Path) -> None:
+        raise OSError("no")
+
+    with pytest.raises(OSError, match="no"):
+        slices.get(demo_store.query(["/tf"]), "tf", fail)
+    assert slices.get(demo_store.query(["/tf"]), "tf", write).exists()
+
+
+def test_every_parameter_survives_the_manifest(app: TestClient) -> None:
+    asked = [("recording", "robot"), ("topic", "/odom"), ("where", "child_frame_id != 'a&b=c'")]
+    (source,) = app.get(f"manifest?{urlencode(asked)}").json()["sources"]
+    data = app.get(source["url"])
+    assert len(list(NonSeekingReader(io.BytesIO(data.content)).iter_messages())) > 0
