@@ -114,6 +114,7 @@ def test_a_deep_message_opens_level_by_level(page: Page, odd_url: str) -> None:
 
 def test_a_plot(page: Page, demo_store: hl.Store, demo_url: str) -> None:
     fields = ["twist.twist.linear.x", "pose.pose.position.y"]
+    page.set_viewport_size({"width": 460, "height": 900})  # fewer pixels than messages
     opened(page, demo_url, "robot", ("plot", "/odom", {"fields": fields}), at=7 * S)
     plot = panel(page, "plot")
     chart = plot.locator(".chart")

@@ -24,10 +24,11 @@ const STILL_PLAYING = 250; // ms between two steps of a cursor that plays
  * @param {function(number): Promise<Answer>} parts.load asks for the message at a time
  * @param {function(Answer)} parts.show shows one
  * @param {function(Error)} parts.fail shows why there is none
- * @param {boolean} [parts.grows] whether later messages may still come
+ * @param {import("../recording.js").Recording} parts.recording
  */
-export function follow({ load, show, fail, grows = false }) {
+export function follow({ load, show, fail, recording }) {
   let kept = [];
+  let { start } = recording; // what the times of these count from
   let shown = null;
   let wanted = null;
   let last = { at: 0, when: -Infinity };
@@ -62,6 +63,14 @@ export function follow({ load, show, fail, grows = false }) {
     kept = kept.filter(({ size }, place) => (bytes += size ?? 0) <= MOST_BYTES || !place);
   }
 
+  function received(answer, at) {
+    // Of a recording that goes on, later messages may come.
+    if (answer.until === null && recording.info.status === "open") answer.until = at + 1;
+    keep(answer);
+    const isEarly = speed && answer.time > wanted;
+    if (covers(answer, wanted) || !isEarly) take(answer);
+  }
+
   async function ask() {
     if (isRunning || isGone) return;
     const at = Math.round(wanted + speed * latency);
@@ -71,11 +80,8 @@ export function follow({ load, show, fail, grows = false }) {
     try {
       const answer = await load(at);
       if (isGone) return;
-      if (grows && answer.until === null) answer.until = at + 1;
-      keep(answer);
+      if (recording.start === start) received(answer, at);
       latency += (performance.now() - begun - latency) / 4;
-      const isEarly = speed && answer.time > wanted;
-      if (covers(answer, wanted) || !isEarly) take(answer);
     } catch (error) {
       if (!(error instanceof ApiError)) throw error;
       if (isGone) return;
@@ -98,6 +104,7 @@ export function follow({ load, show, fail, grows = false }) {
   return {
     /** Shows the message that is current at a time. */
     want(at) {
+      if (recording.start !== start) [start, kept, shown] = [recording.start, [], null];
       const when = performance.now();
       const step = at - last.at;
       const isPlaying = step > 0 && when - last.when < STILL_PLAYING;

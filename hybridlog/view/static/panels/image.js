@@ -40,7 +40,7 @@ function mount(body, panel) {
     load,
     show,
     fail: (error) => problem(error.message),
-    grows: panel.recording.info.status === "open",
+    recording: panel.recording,
   });
 
   /** The picture, decoded already, so that it takes the place of another one at once. */

@@ -63,6 +63,7 @@ function mount(body, panel) {
   let at = null;
   let isGone = false;
   let typing = 0;
+  let counted = {}; // the recording when it was asked
 
   const level = element(
     "select",
@@ -107,6 +108,7 @@ function mount(body, panel) {
   /** Lines around the cursor, in the place of all others. */
   async function load() {
     at = panel.cursor();
+    counted = { ...panel.recording.info, start: panel.recording.start };
     isLoading = true;
     const parameters = { ...asked, ...chosen(), at, before: PAGE / 2, after: PAGE / 2 };
     await answered(get("log", parameters, { slot }), (found) => {
@@ -160,6 +162,7 @@ function mount(body, panel) {
       }
       point(false);
     });
+    if (!isGone) tally();
   }
 
   async function answered(request, use) {
@@ -181,15 +184,27 @@ function mount(body, panel) {
     if (JSON.stringify(wanted) !== JSON.stringify(filters)) {
       filters = wanted;
       showFilters();
-      load();
-      return;
+      return load();
     }
-    if (panel.cursor() === at) return;
+    const { info, start } = panel.recording;
+    if (start !== counted.start) return load();
+    if (info.messages !== counted.messages) grown();
+    if (panel.cursor() === at) return undefined;
     at = panel.cursor();
     const isThere =
       lines.length && (isFirst || lines[0].time <= at) && (isLast || at < lines.at(-1).time);
     if (isThere) point(true);
     else if (!isLoading) load();
+    return undefined;
+  }
+
+  /** Lines may have come at the end of a recording that goes on. */
+  function grown() {
+    counted = { ...panel.recording.info, start: panel.recording.start };
+    tallied = "";
+    if (!lines.length) load();
+    else if (isLast) more(false);
+    else tally();
   }
 
   /** Finds the line at the cursor, and with `isMoved` brings it into view. */

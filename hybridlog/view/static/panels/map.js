@@ -70,7 +70,7 @@ function mount(body, panel) {
       drawn.redraw();
     },
     fail: refuse,
-    grows: panel.recording.info.status === "open",
+    recording: panel.recording,
   });
   update();
   return {

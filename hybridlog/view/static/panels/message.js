@@ -35,7 +35,7 @@ function mount(body, panel) {
     load: (at) => get("message", { ...asked, at }),
     show,
     fail: (error) => problem(error.message),
-    grows: panel.recording.info.status === "open",
+    recording: panel.recording,
   });
 
   function show(found) {

@@ -2,8 +2,8 @@
 
 import { ApiError, get, isAborted } from "../api.js";
 import { element, fill } from "../dom.js";
+import { show } from "../range.js";
 import * as state from "../state.js";
-import { offset } from "../words.js";
 import uPlot from "../vendor/uPlot.esm.js";
 import { fieldPicker } from "./fields.js";
 import { literal, moment, opening } from "./python.js";
@@ -95,7 +95,9 @@ function mount(body, panel) {
     const { begin, end } = panel.range();
     const names = fields();
     const pixels = Math.min(Math.max(Math.round(place.clientWidth), 1), MOST_PIXELS);
-    const now = JSON.stringify([begin, end, names, pixels]);
+    const { info, start } = panel.recording;
+    const isOpen = info.status === "open";
+    const now = JSON.stringify([begin, end, names, pixels, isOpen && info.messages, `${start}`]);
     if (now === wanted) return;
     wanted = now;
     chart?.setScale("x", { min: begin, max: end }); // at once, with the values that are there
@@ -163,7 +165,7 @@ function mount(body, panel) {
         y: false,
         drag: { x: true, y: false, setScale: false, dist: LEAST_DRAG },
         sync: { key: SHARED_CURSOR, scales: ["x", null], setSeries: false },
-        bind: { dblclick: () => () => state.set({ begin: null, end: null }, { isStep: true }) },
+        bind: { dblclick: () => () => state.set({ begin: null, end: null }) },
         points: { show: drawn.exact },
       },
       hooks: { setSelect: [selected], setCursor: [showValues] },
@@ -188,7 +190,7 @@ function mount(body, panel) {
     if (width < LEAST_DRAG) return;
     const [begin, end] = [left, left + width].map((at) => Math.round(chart.posToVal(at, "x")));
     chart.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
-    if (end > begin) state.set({ begin, end }, { isStep: true });
+    show(panel.recording, begin, end);
   }
 
   function clicked(event) {
@@ -330,8 +332,8 @@ function colourReader(place) {
   };
   const series = Array.from({ length: COLOURS }, (_, n) => colour(`series-${n}`, "color"));
   const found = {
-    text: colour("axis", "color"),
-    line: colour("axis", "borderTopColor"),
+    text: colour("plot-axis", "color"),
+    line: colour("plot-axis", "borderTopColor"),
     series: (n) => series[n % COLOURS],
     band: (n) => series[n % COLOURS].replace(/^rgb\((.*)\)$/, "rgba($1, 0.35)"),
   };

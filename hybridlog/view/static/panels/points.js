@@ -76,7 +76,7 @@ function mount(body, panel) {
     load,
     show: (answer) => show(answer),
     fail: (error) => refuse(error.message),
-    grows: panel.recording.info.status === "open",
+    recording: panel.recording,
   });
   following.want(panel.cursor());
   return {
