@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.choice import Choice
 from hybridlog.query.predicate.across import Near, names_topics, parse_across
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import UsageError, WhereError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
@@ -75,17 +74,17 @@ class PageQuestion:
             raise UsageError(
                 "Messages around matches need a predicate on one topic: without other topics."
             )
+        self.query()  # the predicate is one by itself, without the brackets
         (topic,) = self.topics
         where = f"{topic}: ({self.where})"
-        condition = parse_across(where)
-        if not isinstance(condition, Near) or condition.topic != topic:
+        if _topic_of(where) != topic:
             raise UsageError(f"The name {topic!r} cannot stand in a predicate.")
         return PageQuestion(self.store, self.recording, (), where, distance, self.span)
 
     def command(self) -> str:
         """The command line that writes it to a file of `file_name`."""
         words = ["hybridlog", "fetch", "--store", str(self.store.directory.path)]
-        words += ["-r", self._name()]
+        words += ["-r", self.recording.label]
         for topic in self.topics or [_EVERY_TOPIC]:
             words += ["-t", topic]
         if self.span is not None:
@@ -98,7 +97,7 @@ class PageQuestion:
 
     def python(self) -> str:
         """A program that asks the same."""
-        steps = [f"store.query({list(self._topics())!r}, [{self._name()!r}])"]
+        steps = [f"store.query({list(self._topics())!r}, [{self.recording.label!r}])"]
         if self.span is not None:
             steps.append(f".between({self.span[0]}, {self.span[1]})")
         if self.where:
@@ -127,11 +126,14 @@ class PageQuestion:
     def _topics(self) -> Sequence[str]:
         return self.topics or sorted({channel.topic for channel in self.recording.channels})
 
-    def _name(self) -> str:
-        """The recording's label; its id, if that means several recordings."""
-        label, own = self.recording.label, self.recording.id
-        found = [one.id for one in self.store.choose(Choice.of([label])).summaries]
-        return label if found == [own] else own
+
+def _topic_of(where: str) -> str | None:
+    """The topic of a predicate that is one condition on another topic."""
+    try:
+        condition = parse_across(where)
+    except WhereError:
+        return None
+    return condition.topic if isinstance(condition, Near) else None
 
 
 def question_of(context: Context, asked: Asked) -> PageQuestion:

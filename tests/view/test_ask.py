@@ -7,7 +7,7 @@ import contextlib
 import io
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
@@ -20,6 +20,7 @@ import hybridlog as hl
 from hybridlog.cli import fetch
 from hybridlog.view.app import make_app
 from hybridlog.view.routes import ask, export
+from hybridlog_storage.segment_writer import SegmentSettings
 
 from .conftest import PORT, TOKEN
 
@@ -132,6 +133,8 @@ def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store) -
         ("export", {"topic": ["/odom"] * 201}, "201"),
         ("export-command", {"around": "2s", **BOTH}, "without other topics"),
         ("export-command", {"around": "much"}, "duration"),
+        ("export-command", {"around": "1s", "where": "a > 1) or (b > 1"}, "expected"),
+        ("export-command", {"around": "1s", "where": ""}, "need a predicate"),
     ],
 )
 def test_what_is_refused(
@@ -231,24 +234,92 @@ def test_sql_stops_when_the_client_goes(demo_store: hl.Store) -> None:
     assert json.loads(said[1]["body"])["rows"] == [["1"]]
 
 
-@pytest.fixture
-def chunked(tmp_path: Path) -> Iterator[hl.Store]:
-    """A store with a recording of many chunks."""
-    with (tmp_path / "large.mcap").open("wb") as file:
+DAMAGED = "x-1-3"
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """A store of odd names; the label of one recording is the name of another, which lost some."""
+    place = tmp_path_factory.mktemp("odd")
+    with (place / "odd.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
-        channel = writer.register_channel("/large", "raw", 0)
+        large = writer.register_channel("/large", "raw", 0)
+        spaced = writer.register_channel("/a b", "json", 0)
+        star = writer.register_channel("*", "json", 0)
         for n in range(60):
-            writer.add_message(channel, n * S, bytes(500_000), n * S)
+            writer.add_message(large, n * S, bytes(500_000), n * S)
+            for channel in (spaced, star):
+                writer.add_message(channel, n * S + 1, b'{"n": %d, "odd.name": 1}' % n, n * S)
         writer.finish()
-    with hl.open(tmp_path / "store", create=True) as store:
-        store.record(tmp_path / "large.mcap")
+    with hl.open(place / "store", create=True) as store:
+        for name in ("x [1]", "x [1]", "x-1"):
+            settings = SegmentSettings(segment_size=1)  # a chunk each
+            store.record(place / "odd.mcap", name=name, again=True, settings=settings)
+    (place / "store" / "recordings" / DAMAGED / "000001.mcap").unlink()
+    with hl.open(place / "store") as store:
         yield store
 
 
-def test_a_file_is_made_while_it_is_sent(
-    chunked: hl.Store, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"topic": "/a b", "where": "n >= 58"},
+        {"topic": ["*", "/a b"], "begin": 58 * S, "end": 60 * S},
+        {"topic": "*", "where": "n >= 59", "around": "1s"},
+    ],
+)
+def test_odd_names(
+    odd: hl.Store,
+    asking: Callable[[hl.Store], TestClient],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    asked: dict[str, Any],
 ) -> None:
+    client = asking(odd)
+    monkeypatch.chdir(tmp_path)
+    for label in ("x-1", "x-1-2"):
+        params = {"recording": label, **asked}
+        told = client.get("export-command", params=params).json()
+        done = CliRunner().invoke(
+            fetch.command, shlex.split(told["command"])[2:], catch_exceptions=False
+        )
+        assert done.exit_code == 0, done.output
+        sent = client.get("export", params=params).content
+        assert (tmp_path / told["name"]).read_bytes() == sent
+        assert run_program(told["python"])[0] == told["told"]
+
+
+def test_a_name_that_no_predicate_has_is_refused(
+    odd: hl.Store, asking: Callable[[hl.Store], TestClient]
+) -> None:
+    asked = {"recording": "x-1", "topic": "/a b", "where": "n > 1", "around": "1s"}
+    assert "'/a b' cannot stand" in asking(odd).get("export-command", params=asked).json()["error"]
+
+
+def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]) -> None:
+    client = asking(odd)
+    asked = {"recording": DAMAGED, "topic": "/large", "where": "_meta.seq >= 0"}
+    query = odd.topic("/large").in_recording(DAMAGED)
+    lost = query.lost()
+    assert 0 < lost.messages < 60
+    want = lost.describe(query.count())
+    assert "lost in this range" in want
+    assert client.get("ask", params=asked).json()["told"] == want
+    assert client.get("export-command", params=asked).json()["told"] == want
+    answer = client.get("sql", params={**asked, "text": "select count(*) from large"}).json()
+    assert any("are lost; the table losses" in line for line in answer["remarks"])
+
+
+def test_observed_fields_are_offered(
+    odd: hl.Store, asking: Callable[[hl.Store], TestClient]
+) -> None:
+    asked = {"recording": "x-1", "topic": "/a b", "text": "na", "place": 2}
+    answer = asking(odd).get("complete", params=asked).json()
+    assert answer["candidates"][0] == ["`odd.name`", "field", "integer"]
+
+
+def test_a_file_is_made_while_it_is_sent(odd: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(export, "PIECE", 1)
     made: list[int] = []
     ended: list[bool] = []
@@ -263,8 +334,8 @@ def test_a_file_is_made_while_it_is_sent(
             ended.append(True)
 
     monkeypatch.setattr(export, "pieces_of", counted)
-    app = make_app(chunked, TOKEN, PORT)
-    asked = {"recording": "large"}
+    app = make_app(odd, TOKEN, PORT)
+    asked = {"recording": "x-1"}
     said = asyncio.run(asked_for(app, "export", asked, leaves_after=9.0))
     whole = len(made)
     assert sum(made) == sum(len(message.get("body", b"")) for message in said)
@@ -336,6 +407,11 @@ def test_a_question_is_asked_and_its_matches_become_a_file(
     page.locator("li[aria-current]", has_text="#2 ").wait_for()
     page.keyboard.press("p")
     page.locator("li[aria-current]", has_text="#1 ").wait_for()
+    shown = page.evaluate(
+        "import(`${document.baseURI.split('#')[0]}overlays.js`).then((o) => o.all())"
+    )
+    assert sum(count for _, count in shown[0]["ticks"]) == len(want)
+    assert shown[0]["ticks"][0][0] == want[0] == shown[0]["bands"][0][0]
     page.get_by_role("complementary").get_by_role("button", name="#5 ").first.click()
     page.wait_for_url(lambda url: f"&at={want[4]}&" in url)
     page.get_by_role("button", name="Export").click()

@@ -105,6 +105,8 @@ def _fields_of(types: Mapping[str, str] | None) -> Iterator[Candidate]:
 
 def _spelled(path: str) -> str:
     """A path as a predicate takes it: names that are no identifiers in backquotes."""
+    if "`" in path:
+        return path  # as it is observed in messages
     return ".".join(_quoted(part) for part in path.split("."))
 
 

@@ -15,6 +15,7 @@ from hybridlog.drawing.matches import (
     matches_before,
     ticks,
 )
+from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
@@ -111,9 +112,13 @@ def completion(context: Context, asked: Asked) -> dict[str, Any]:
     def fields(topic: str | None) -> Mapping[str, str] | None:
         try:
             (name,) = resolve([topic or own], topics)
-            return context.query(recording, name).field_types()
         except (TopicError, ValueError):
             return None
+        query = context.query(recording, name)
+        known = query.field_types()
+        if known is None:
+            known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
+        return known
 
     found = complete(text, place, topics - {own}, fields, most=_MAX_CANDIDATES)
     offered = [[one.text, one.kind, one.type] for one in found.candidates]

@@ -5,7 +5,7 @@ import { completed, questionHistory } from "./completion.js";
 import { element, fill, notice } from "./dom.js";
 import { exportForm } from "./export.js";
 import { matchList } from "./match_list.js";
-import { predicate } from "./matches.js";
+import { drawMatches, predicate } from "./matches.js";
 import { sqlTable } from "./sql_table.js";
 import * as state from "./state.js";
 
@@ -83,10 +83,10 @@ export function mountAsk(main, recording) {
   );
   main.append(place, list.side);
   document.addEventListener("keydown", key);
-  const end = state.on(["ask"], answer);
+  const ends = [state.on(["ask"], answer), recording.on(update), drawMatches(recording)];
   answer();
   return () => {
-    end();
+    ends.forEach((end) => end());
     asking.abort();
     list.destroy();
     files.destroy();
@@ -158,12 +158,29 @@ export function mountAsk(main, recording) {
     const asked = predicate(recording);
     if (!asked) throw new ApiError("Choose a topic for the question.");
     const found = await get("ask", asked, { slot: "ask", signal });
-    python = found.python;
-    const is = found.count === 1 ? "match" : "matches";
-    told.textContent = `${found.told} ${found.told === String(found.count) ? is : ""}`.trim();
-    told.title = `Messages of ${asked.topic} that satisfy the predicate`;
-    fill(body, ...found.remarks.map((line) => element("p", { class: "summary" }, line)));
+    tell(found);
     list.show(found.count);
+  }
+
+  /** Counts again what has been recorded since. */
+  async function update() {
+    const asked = predicate(recording);
+    if (!asked || body.querySelector(".problem")) return;
+    try {
+      const found = await get("ask", asked, { slot: "ask", signal: asking.signal });
+      tell(found);
+      list.update(found.count);
+    } catch (error) {
+      // The next update may be answered.
+      if (!isAborted(error) && !(error instanceof ApiError)) throw error;
+    }
+  }
+
+  function tell(found) {
+    python = found.python;
+    const are = found.count === 1 ? "match" : "matches";
+    told.textContent = found.told === String(found.count) ? `${found.told} ${are}` : found.told;
+    fill(body, ...found.remarks.map((line) => element("p", { class: "summary" }, line)));
     steps.hidden = !found.count;
   }
 

@@ -39,6 +39,7 @@ export function exportForm(recording) {
   const download = element("a", { class: "button", download: true }, "Download");
   const problem = element("pre", { class: "problem", role: "alert", hidden: true });
   let python = "";
+  let newest = 0;
   const copies = element(
     "span",
     { class: "copies" },
@@ -80,8 +81,10 @@ export function exportForm(recording) {
       recording: recording.info.id,
       ...PARTS[part.value].ask(predicate(recording) ?? {}, range, around.value),
     };
+    const mine = ++newest;
     try {
       const found = await get("export-command", asked, { slot: "export" });
+      if (mine !== newest) return;
       told.textContent = `${found.told} messages`;
       command.textContent = found.command;
       python = found.python;

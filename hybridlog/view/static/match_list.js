@@ -3,6 +3,7 @@
 import { ApiError, get, isAborted } from "./api.js";
 import { element, fill, notice } from "./dom.js";
 import { predicate } from "./matches.js";
+import { seek } from "./range.js";
 import * as state from "./state.js";
 import { count, offset } from "./words.js";
 
@@ -12,9 +13,10 @@ const PAGE = 100;
  * A list of the matches of the question.
  *
  * @param {Object} recording
- * @returns {{side: HTMLElement, show: function(number|null), step: function(string),
- *     destroy: function()}} `show` lists so many matches, null hides the list; `step` moves the
- *     cursor to the `later` or `earlier` match
+ * @returns {{side: HTMLElement, show: function(number|null), update: function(number),
+ *     step: function(string), destroy: function()}} `show` lists so many matches, null hides the
+ *     list; `update` says that there are more by now; `step` moves the cursor to the `later` or
+ *     `earlier` match
  */
 export function matchList(recording) {
   const rows = element("ol", { class: "rows" });
@@ -34,7 +36,7 @@ export function matchList(recording) {
   let total = 0;
   let shown = { rows: [], before: 0 };
   const end = state.on(["at"], mark);
-  return { side, show, step, destroy: end };
+  return { side, show, update, step, destroy: end };
 
   function show(number) {
     total = number ?? 0;
@@ -42,6 +44,15 @@ export function matchList(recording) {
     shown = { rows: [], before: 0 };
     draw();
     if (number) load({ at: recording.info.begin, seq: -1, direction: "later" });
+  }
+
+  function update(number) {
+    if (number === total) return;
+    total = number;
+    const [first] = shown.rows;
+    if (!first) load({ at: recording.info.begin, seq: -1, direction: "later" });
+    else if (shown.rows.length < PAGE) load({ at: first[0], seq: first[1] - 1, direction: "later" });
+    else draw();
   }
 
   async function load(place) {
@@ -79,22 +90,11 @@ export function matchList(recording) {
       return;
     }
     const [[time, seq]] = found.rows;
-    seek(time);
+    seek(recording, time);
     if (!shown.rows.some(([known]) => known === time)) {
       await load({ at: time, seq: seq - 1, direction: "later" });
       mark();
     }
-  }
-
-  function seek(time) {
-    const changes = { at: time };
-    const [begin, end] = [state.get("begin"), state.get("end")];
-    if (begin !== null && (time < begin || time >= end)) {
-      // What is zoomed into moves along.
-      changes.begin = Math.round(time - (end - begin) / 2);
-      changes.end = changes.begin + (end - begin);
-    }
-    state.set(changes);
   }
 
   function draw() {
@@ -112,7 +112,7 @@ export function matchList(recording) {
           {},
           element(
             "button",
-            { type: "button", class: "plain", onclick: () => seek(time) },
+            { type: "button", class: "plain", onclick: () => seek(recording, time) },
             element("small", {}, `#${count(shown.before + number + 1)} `),
             offset(time),
           ),

@@ -1,18 +1,13 @@
-/** The matches of the question in the visible range: asked anew when that changes, and drawn. */
+/** The matches of the question, drawn over the timeline in the visible range. */
 
 import { ApiError, get, isAborted } from "./api.js";
+import * as overlays from "./overlays.js";
+import { visible } from "./range.js";
 import * as state from "./state.js";
 
-/**
- * @typedef {Object} Matches
- * @property {string} topic
- * @property {number} begin time of the first pixel, ns since the start of the recording
- * @property {number} width time of a pixel, ns
- * @property {number[]} pixels numbers of pixels with matches
- * @property {number[]} counts matches in each of them
- * @property {number[]} first time of the first match in each of them
- * @property {number[][]} bands begin and end of the intervals in which the predicate holds
- */
+const NAME = "matches";
+const MOST_PIXELS = 2048;
+const PAUSE_MS = 40;
 
 /** The question as the server takes it; null if there is none, or one in SQL. */
 export function predicate(recording) {
@@ -22,44 +17,46 @@ export function predicate(recording) {
   return { recording: recording.info.id, topic, where: text, within: within || null };
 }
 
-/**
- * Calls back with the matches in the visible range, now and whenever they change.
- *
- * @param {Object} recording
- * @param {function(): number} pixels width of the picture
- * @param {function(Matches|null)} callback
- * @returns {function()} ends it
- */
-export function watchMatches(recording, pixels, callback) {
-  const abort = new AbortController();
+/** Draws the matches as ticks, and bands where the predicate holds. Returns a function that ends it. */
+export function drawMatches(recording) {
+  const stop = new AbortController();
   let waiting = 0;
-  const load = async () => {
+  const ends = [state.on(["ask", "begin", "end"], soon), recording.on(soon)];
+  load();
+  return () => {
+    ends.forEach((end) => end());
+    clearTimeout(waiting);
+    stop.abort();
+    overlays.draw(NAME, null);
+  };
+
+  function soon() {
+    clearTimeout(waiting);
+    waiting = setTimeout(load, PAUSE_MS);
+  }
+
+  async function load() {
     const asked = predicate(recording);
     if (!asked) {
-      callback(null);
+      overlays.draw(NAME, null);
       return;
     }
-    const begin = state.get("begin") ?? recording.info.begin;
-    const end = Math.max(state.get("end") ?? recording.info.end, begin + 1);
-    const range = { begin: Math.round(begin), end: Math.round(end), pixels: pixels() };
+    const { begin, end } = visible(recording);
+    const picture = {
+      begin: Math.floor(begin),
+      end: Math.ceil(end),
+      pixels: Math.min(window.innerWidth, MOST_PIXELS),
+    };
     try {
-      const found = await get("matches", { ...asked, ...range }, { slot: "matches", signal: abort.signal });
-      if (!abort.signal.aborted) callback({ ...found, topic: asked.topic });
+      const options = { slot: NAME, signal: stop.signal };
+      const { first, counts, bands } = await get("matches", { ...asked, ...picture }, options);
+      if (stop.signal.aborted) return;
+      const ticks = first.map((time, n) => [time, counts[n]]);
+      overlays.draw(NAME, { title: `${asked.topic}: ${asked.where}`, ticks, bands });
     } catch (error) {
       if (isAborted(error)) return;
       if (!(error instanceof ApiError)) throw error;
-      callback(null); // the bar says why
+      overlays.draw(NAME, null); // the bar says why
     }
-  };
-  const soon = () => {
-    clearTimeout(waiting);
-    waiting = setTimeout(load, 40);
-  };
-  const end = state.on(["ask", "begin", "end", "recording"], soon);
-  load();
-  return () => {
-    end();
-    clearTimeout(waiting);
-    abort.abort();
-  };
+  }
 }

@@ -287,7 +287,10 @@ export function mountTimeline(parent, recording) {
     lines.push(...marks.filter(({ at }) => Math.abs(at - time) < near).slice(0, 5).map(({ text }) => `Mark: ${text}`));
     for (const { title, bands, ticks } of overlays.all()) {
       const isIn = bands.some(([low, high]) => low <= time && time < high);
-      if (isIn || ticks.some(([at]) => Math.abs(at - time) < near)) lines.push(title);
+      const here = ticks.filter(([at]) => Math.abs(at - time) < near);
+      const matches = here.reduce((sum, [, number]) => sum + number, 0);
+      if (matches) lines.push(`${title}: ${count(matches)} here`);
+      else if (isIn) lines.push(title);
     }
     fill(tip, ...lines.map((text) => element("div", {}, text)));
     const box = section.getBoundingClientRect();
@@ -368,7 +371,9 @@ export function mountTimeline(parent, recording) {
     const before = pointers.get(event.pointerId);
     const row = rowHeight();
     const lane = event.currentTarget === canvas ? Math.floor((at.y + scroller.scrollTop) / row) : null;
-    hover = { ...at, top: event.clientY, lane: lane !== null && lane < topics.length ? lane : null };
+    // Half a pixel above the first lane is still on its canvas.
+    const isLane = lane !== null && lane >= 0 && lane < topics.length;
+    hover = { ...at, top: event.clientY, lane: isLane ? lane : null };
     if (!before) return schedule();
     moved += Math.abs(at.x - before.x) + Math.abs(at.y - before.y);
     if (selected) selected.to = timeAt(at.x);

@@ -11,6 +11,7 @@ SCAN = {
     "range_max": "float32",
     "ranges": "float32[]",
     "odd-name": "bool",
+    "`quoted.name`": "string",
 }
 ODOM = {"pose.x": "float64", "speed": "float64"}
 
@@ -34,6 +35,7 @@ def offered(text: str) -> list[str]:
         ("not ra|nges", ["not range_max"]),
         ("(header.f|", ["(header.frame_id"]),
         ("odd|", ["`odd-name`"]),
+        ("quoted|", ["`quoted.name`"]),
         ("ranges.min < 0.5 a|", ["ranges.min < 0.5 and"]),
         ("ranges.min e|", ["ranges.min exists", "ranges.min between"]),
         ("a == t|", ["a == true"]),
