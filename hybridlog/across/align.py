@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.interpolate import interpolated, quaternion_paths
+from hybridlog.across.bins import AGGREGATES, Aggregate, Bins
+from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import HOWS, UNKNOWN, How, match
-from hybridlog.frames.answer import stream
+from hybridlog.across.regular_times import RegularTimes
+from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, together
 from hybridlog.frames.names import free_name
-from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.counters import Counters
-from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
 from hybridlog.schema.arrow_columns import DURATION, numbers
-from hybridlog.schema.arrow_types import common_schema, common_type, converted
-from hybridlog.schema.column import STAMP
+from hybridlog.schema.arrow_types import common_schema
 from hybridlog.wording import listed
-from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,25 +31,7 @@ if TYPE_CHECKING:
     from hybridlog.query.ranges import Resolved
     from hybridlog.session import Session
 
-MAX_TIMES = 100_000_000
-"""Maximum number of rows of `resample`."""
-_GRID_ROWS = 65_536
-_TIME = "log_time"
-_RECORDING = "recording"
 _DISTANCE = "distance"
-
-
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """One topic of an alignment.
-
-    Attributes:
-        question: The question about the topic.
-        prefix: Beginning of its columns' names; empty for none.
-    """
-
-    question: Question
-    prefix: str
 
 
 class Base(Protocol):
@@ -107,15 +87,32 @@ class Aligned:
         clock: Clock,
         counters: Counters,
     ) -> None:
-        if how not in HOWS:
-            raise UsageError(f"Unknown way {how!r}; choose {', '.join(HOWS)}.")
+        is_regular = isinstance(base, RegularTimes)
+        hows = (*HOWS, *AGGREGATES) if is_regular else HOWS
+        if how not in hows:
+            raise UsageError(f"Unknown way {how!r}; choose {', '.join(hows)}.")
+        if how in AGGREGATES and tolerance is not None:
+            raise UsageError(f"{how} is of the messages between two rows: leave out tolerance.")
         self.counters = counters
         self._session = session
         self._base = base
         self._others = others
-        self._how: How = how
+        self._how = how
         self._clock: Clock = clock
         self._tolerance = None if tolerance is None else parse_duration(tolerance)
+
+    def _partner(self, stream: Stream) -> _Partner | Bins:
+        if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
+            how: Aggregate = self._how
+            return Bins(self._session, stream, self._base, how=how, counters=self.counters)
+        return _Partner(
+            self._session,
+            stream,
+            how=self._how,  # type: ignore[arg-type]
+            tolerance=self._tolerance,
+            clock=self._clock,
+            counters=self.counters,
+        )
 
     def __repr__(self) -> str:
         names = [name for stream in self._others for name in stream.question.topics]
@@ -127,17 +124,7 @@ class Aligned:
         The type of a column may differ between tables if no definition fixes it.
         """
         self.counters.reset()
-        partners = [
-            _Partner(
-                self._session,
-                other,
-                how=self._how,
-                tolerance=self._tolerance,
-                clock=self._clock,
-                counters=self.counters,
-            )
-            for other in self._others
-        ]
+        partners = [self._partner(other) for other in self._others]
         several = len(self._session.chosen(self._base.question)) > 1
         given = False
         for resolved in RangeResolver(self._session, self._base.question).resolve():
@@ -168,7 +155,7 @@ class Aligned:
 
         table = self.to_arrow()
         names = table.column_names[1:]
-        return frame_of(table[_TIME], ((name, table[name]) for name in names))
+        return frame_of(table[TIME], ((name, table[name]) for name in names))
 
     def to_polars(self) -> Any:
         """The rows as a polars frame.
@@ -200,7 +187,7 @@ class TopicBase:
     """
 
     def __init__(self, session: Session, stream: Stream, clock: Clock, counters: Counters) -> None:
-        self._reader = _Reader(session, stream, clock, counters)
+        self._reader = TopicReader(session, stream, clock, counters)
 
     @property
     def question(self) -> Question:
@@ -210,176 +197,12 @@ class TopicBase:
     def empty(self) -> pa.Table:
         """No rows, with all columns."""
         table = self._reader.empty()[1]
-        return self._reader.named(table, _TIME, table[_TIME])
+        return self._reader.named(table, TIME, table[TIME])
 
     def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
         """Times and columns of the messages of a recording, in order."""
         for times, table in self._reader.tables(recording):
-            yield times, self._reader.named(table, _TIME, table[_TIME])
-
-
-class RegularTimes:
-    """Regular times as rows: from the beginning of each recording, or of the asked range.
-
-    Args:
-        session: The open store.
-        question: The question whose recordings and range count.
-        step: Time between two rows, ns.
-
-    Raises:
-        UsageError: the step is zero.
-    """
-
-    def __init__(self, session: Session, question: Question, step: int) -> None:
-        if step == 0:
-            raise UsageError("A step of 0 gives no times: name a duration, such as 100ms.")
-        self.question = question
-        self._step = step
-        spans: dict[str, list[tuple[int, int]]] = {}
-        for summary, span in RangeResolver(session, question).spans():
-            spans.setdefault(summary.id, []).append(span)
-        self._spans = spans
-        rows = sum((end - begin) // step for found in spans.values() for begin, end in found)
-        if rows > MAX_TIMES:
-            raise UsageError(f"There would be {rows} rows; use a longer step or a time range.")
-
-    def empty(self) -> pa.Table:
-        """No rows."""
-        return pa.table({_TIME: numbers(np.empty(0, np.int64), "time")})
-
-    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
-        """The times in a recording."""
-        for begin, end in self._spans.get(recording, []):
-            first = begin
-            while first < end:
-                last = min(end, first + _GRID_ROWS * self._step)
-                times = np.arange(first, last, self._step, dtype=np.int64)
-                yield times, pa.table({_TIME: numbers(times, "time")})
-                first = last if last == end else first + len(times) * self._step
-
-
-class _Reader:
-    """Reads one topic with its times on a clock.
-
-    Args:
-        session: The open store.
-        stream: The topic.
-        clock: The clock.
-        counters: Count what is read.
-    """
-
-    def __init__(self, session: Session, stream: Stream, clock: Clock, counters: Counters) -> None:
-        question = stream.question
-        if not question.returns_all or question.reverse:
-            raise UsageError(
-                "An alignment uses all messages; it cannot be combined with limit, every or "
-                "reverse."
-            )
-        self.prefix = stream.prefix
-        self._session = session
-        self._counters = counters
-        known = session.field_types(question.topics, question.recordings)
-        self.quaternions = quaternion_paths(known)
-        self._own: str | None = None  # column that only tells the time
-        self._clock_column = _TIME
-        if clock != "log":
-            # Refused where the topic does not have the clock.
-            asked = replace(question, clock=clock, bounds=question.bounds or (None, None))
-            Planner(session, asked, Counters()).parts()
-            self._clock_column = STAMP if clock == "header" else "publish_time"
-            question = self._with_clock(question, known)
-        self.question = question
-
-    def _with_clock(self, question: Question, known: dict[str, str] | None) -> Question:
-        name, fields = self._clock_column, question.fields
-        if fields is None:
-            if name == STAMP:
-                return question
-            if known is None:
-                raise UsageError("The fields of this topic are not fixed: name them.")
-            fields = tuple(dict.fromkeys(path.split(".")[0].split("[")[0] for path in known))
-        if not any(path == name or name.startswith(f"{path}.") for path in fields):
-            self._own = name
-            fields = (*fields, name)
-        return replace(question, fields=fields)
-
-    def empty(self) -> tuple[NDArray[np.int64], pa.Table]:
-        """No rows, with the columns of all recordings."""
-        question = replace(self.question, limit=0, bounds=None, during=None, predicate=None)
-        table = next(stream(Planner(self._session, question, Counters())))
-        return self._times(table), table
-
-    def tables(
-        self, recording: str, span: tuple[int, int] | None = None
-    ) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
-        """Times, ns, and columns of the messages of a recording, by log time.
-
-        Args:
-            recording: Id of the recording.
-            span: Log time `[begin, end)`, ns, of a question without a range.
-        """
-        places = self._session.chosen(self.question)
-        snapshot = self._session.snapshot()
-        if snapshot.by_id[recording] not in places:
-            return
-        question = replace(self.question, recordings=(recording,))
-        if span is not None:
-            question = replace(question, bounds=span)
-        counters = Counters()
-        try:
-            for table in stream(Planner(self._session, question, counters)):
-                if table.num_rows:
-                    yield self._times(table), table
-        except TimeError:
-            return  # the range does not touch this recording
-        finally:
-            self._counters.add(counters)
-
-    def latest(self, recording: str, moment: int) -> int | None:
-        """Log time of the last message of a recording by a time, ns."""
-        if moment >= TIME_LIMIT - 1:
-            return None
-        question = replace(self.question, recordings=(recording,))
-        found = message_at(self._session, question, self._counters, moment)
-        return None if found is None else found.log_time_ns
-
-    def following(self, recording: str, moment: int) -> int | None:
-        """Log time just behind the first message of a recording from a time on, ns."""
-        later = replace(
-            self.question, recordings=(recording,), bounds=(moment, TIME_LIMIT - 1), limit=1
-        )
-        counters = Counters()
-        try:
-            for run in Planner(self._session, later, counters).runs():
-                return int(run.batch.log_time[0]) + 1
-        except TimeError:
-            return moment  # the recording ends before
-        finally:
-            self._counters.add(counters)
-        return moment
-
-    def _times(self, table: pa.Table) -> NDArray[np.int64]:
-        column = table[self._clock_column]
-        if column.null_count:
-            column = column.cast(pa.int64()).fill_null(UNKNOWN)
-        whole = column.chunk(0) if column.num_chunks == 1 else column
-        times: NDArray[np.int64] = whole.to_numpy().view(np.int64)
-        return times
-
-    def named(self, table: pa.Table, first: str, column: Any) -> pa.Table:
-        """The columns of the answer, under their names in it.
-
-        Args:
-            table: The messages.
-            first: Name of the first column, which no field takes.
-            column: That column.
-        """
-        found: dict[str, Any] = {first: column}
-        own = {_TIME, _RECORDING, self._own}
-        for name, values in zip(table.column_names, table.columns, strict=True):
-            if name not in own:
-                found[free_name(self.prefix + name, found)] = values
-        return pa.table(found)
+            yield times, self._reader.named(table, TIME, table[TIME])
 
 
 class _Partner:
@@ -399,7 +222,7 @@ class _Partner:
         clock: Clock,
         counters: Counters,
     ) -> None:
-        self._reader = _Reader(session, stream, clock, counters)
+        self._reader = TopicReader(session, stream, clock, counters)
         self._how = how
         self._tolerance = tolerance
         self._clock = clock
@@ -543,40 +366,15 @@ def _end_of(resolved: Resolved, clock: Clock) -> int | None:
 
 def _side_by_side(table: pa.Table, label: str | None, parts: Sequence[pa.Table]) -> pa.Table:
     columns = dict(zip(table.column_names, table.columns, strict=True))
-    found: dict[str, Any] = {_TIME: columns.pop(_TIME)}
+    found: dict[str, Any] = {TIME: columns.pop(TIME)}
     if label is not None:
         text = label.encode("utf-8", "replace").decode()
-        found[_RECORDING] = pa.repeat(pa.scalar(text, pa.string()), table.num_rows)
+        found[RECORDING] = pa.repeat(pa.scalar(text, pa.string()), table.num_rows)
     found |= columns
     for part in parts:
         for name, column in zip(part.column_names, part.columns, strict=True):
             found[free_name(name, found)] = column
     return pa.table(found)
-
-
-def together(tables: Sequence[pa.Table]) -> pa.Table:
-    """Tables one after the other; a column has the common exact type of all of them."""
-    if len(tables) == 1:
-        return tables[0]
-    if all(table.schema == tables[0].schema for table in tables):
-        return pa.concat_tables(tables)
-    columns: dict[str, Any] = {}
-    for name in dict.fromkeys(chain.from_iterable(table.column_names for table in tables)):
-        chunks = [
-            table[name].combine_chunks() if name in table.column_names else table.num_rows
-            for table in tables
-        ]
-        arrays = [
-            pa.concat_arrays(chunk.chunks) if isinstance(chunk, pa.ChunkedArray) else chunk
-            for chunk in chunks
-        ]
-        kind = common_type([array for array in arrays if not isinstance(array, int)])
-        parts = [
-            pa.nulls(array, kind) if isinstance(array, int) else converted(array, kind)
-            for array in arrays
-        ]
-        columns[name] = pa.chunked_array(parts, kind)
-    return pa.table(columns)
 
 
 def side_by_side(

@@ -42,7 +42,12 @@ if TYPE_CHECKING:
     shell_complete=complete_topic,
     help="A topic beside it: full name, an unambiguous short one, a glob, or re:REGEX. Repeatable.",
 )
-@options.how
+@click.option(
+    "--how",
+    type=click.Choice(["asof", "nearest", "interpolate"]),
+    default="asof",
+    help="The last message not after the row, the nearest one, or between the last and the next.",
+)
 @options.near
 @click.option(
     "--clock",

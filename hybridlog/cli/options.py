@@ -207,12 +207,6 @@ where = click.option(
     help="Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'. "
     "Repeatable.",
 )
-how = click.option(
-    "--how",
-    type=click.Choice(["asof", "nearest", "interpolate"]),
-    default="asof",
-    help="The last message not after the row, the nearest one, or between the last and the next.",
-)
 near = click.option(
     "--tolerance",
     metavar="DURATION",

@@ -22,7 +22,16 @@ if TYPE_CHECKING:
 @click.command()
 @options.topics
 @click.option("--step", required=True, metavar="DURATION", help="Time between two rows: 100ms.")
-@options.how
+@click.option(
+    "--how",
+    type=click.Choice(
+        ["asof", "nearest", "interpolate", "count", "first", "last", "min", "max", "mean"]
+    ),
+    default="asof",
+    help="The last message not after the row, the nearest one, or between the last and the next. "
+    "Or of the messages from a row to the next: their number, the first, the last, or the least, "
+    "greatest or mean of each number.",
+)
 @options.near
 @options.store
 @options.between
@@ -49,9 +58,9 @@ def command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Show topics at regular times.
+    """Show topics at regular times, or what they say from each to the next.
 
-    They begin with each recording, or with the range of --between.
+    The times begin with each recording, or with the range of --between.
     """
     choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
     started = time.monotonic()

@@ -772,16 +772,19 @@ class Query:
         """The topics at regular log times: every `step` from the beginning of each recording.
 
         With `between` or `during`, from the beginning of the range. Columns are those of
-        `Store.align`; those of a single topic have no prefix.
+        `Store.align`; those of a single topic have no prefix. With an aggregate, `count` is in
+        place of `distance`: the number of messages from a row to the next, or to the end.
 
         Args:
             step: Time between two rows, a duration.
-            how: `asof`, `nearest` or `interpolate`, as for `Store.align`.
+            how: `asof`, `nearest` or `interpolate`, as for `Store.align`. Or an aggregate of
+                the messages from a row to the next: `count`; `first` or `last`, their fields;
+                `min`, `max` or `mean` of finite numbers, null without any.
             tolerance: Greatest distance in time; None for any.
 
         Raises:
-            UsageError: an unknown way, a step of 0, another clock than the log's, or limit,
-                every or reverse.
+            UsageError: an unknown way, a step of 0, a tolerance for an aggregate, a field that
+                has none, another clock than the log's, or limit, every or reverse.
             TimeError: no duration, or a range outside of all recordings.
         """
         from hybridlog.across.align import resampled

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.across import align
+from hybridlog.across import topic_reader
 from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import UNKNOWN, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
@@ -29,14 +29,14 @@ TOLERANCE_MS = 7
 @pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
 def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Topics are read in blocks of so many rows, also with messages of one time in two of them."""
-    read, size = align._Reader.tables, request.param
+    read, size = topic_reader.TopicReader.tables, request.param
 
-    def tables(reader: align._Reader, *arguments: Any) -> Iterator[Any]:
+    def tables(reader: topic_reader.TopicReader, *arguments: Any) -> Iterator[Any]:
         for times, table in read(reader, *arguments):
             for begin in range(0, len(times), size):
                 yield times[begin : begin + size], table.slice(begin, size)
 
-    monkeypatch.setattr(align._Reader, "tables", tables)
+    monkeypatch.setattr(topic_reader.TopicReader, "tables", tables)
 
 
 def naive(
