@@ -58,6 +58,7 @@ ALLOWED = {
     "pyarrow": (
         "hybridlog.across",
         "hybridlog.cli",
+        "hybridlog.drawing.flushed",
         "hybridlog.drawing.series",
         "hybridlog.drawing.track",
         "hybridlog.drawing.tree",

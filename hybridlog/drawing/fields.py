@@ -13,7 +13,7 @@ from hybridlog.query.answers.infer_fields import infer_fields
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from hybridlog.query.query import Query
+    from hybridlog.message import Message
 
 MAX_FIELDS: Final = 5000
 """Most fields of a topic that are listed."""
@@ -33,18 +33,20 @@ class Field(NamedTuple):
     type: str
 
 
-def fields_of(query: Query) -> list[Field]:
+def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> list[Field]:
     """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
 
-    Where no definition fixes the fields, those of the first messages.
+    Args:
+        known: Types of all fields by path; None where no definition fixes them, and those of
+            the first messages count.
+        messages: The messages; only the first ones are read.
     """
-    known = query.field_types()
-    found = _observed(query) if known is None else _defined(known, query)
+    found = _observed(messages) if known is None else _defined(known, messages)
     return list(islice(found, MAX_FIELDS))
 
 
-def _defined(known: dict[str, str], query: Query) -> Iterator[Field]:
-    first = query.first()
+def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
+    first = next(messages, None)
     values = {} if first is None else first.fields
     for path, kind in known.items():
         if "[" in path:
@@ -73,8 +75,8 @@ def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
     return width if width <= MAX_ELEMENTS else 0
 
 
-def _observed(query: Query) -> Iterator[Field]:
-    for found in infer_fields(query):
+def _observed(messages: Iterator[Message]) -> Iterator[Field]:
+    for found in infer_fields(messages):
         path, kinds = str(found["path"]), str(found["type"]).split("|")
         # A name within backquotes may have dots, which a path cannot tell from its own.
         if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):

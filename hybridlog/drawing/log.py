@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
+from hybridlog.drawing.flushed import END
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.drawing.flushed import Flushed
     from hybridlog.message import Message
     from hybridlog.query.query import Query
+    from hybridlog.query.question import Span
 
 LEVELS: Final = ("debug", "info", "warning", "error", "fatal")
 """From the least to the greatest."""
@@ -81,51 +86,100 @@ def kind_of(type_name: str) -> Kind:
     return kind
 
 
-def filtered(query: Query, kind: Kind, level: str = "", text: str = "") -> Query:
-    """The lines of at least a level whose text or sender contains a text, in any case.
+@dataclass(frozen=True)
+class Log:
+    """The lines of a log that pass some filters.
 
-    Args:
-        query: The query, of one topic.
+    Attributes:
+        query: About one topic of one recording; None for none but `flushed`.
         kind: Its kind of messages.
-        level: One of `LEVELS`; empty for all lines.
-        text: Characters, not a regular expression; empty for all lines.
+        level: Least level, one of `LEVELS`; empty for all lines.
+        text: Characters that the text or the sender has, in any case; no regular expression.
+        flushed: Later messages of the topic, of a recording that goes on.
     """
-    if level and kind.levels:
-        query = query.where(f"level >= {kind.levels[LEVELS.index(level)]}")
-    if text:
-        # Written as numbers, characters mean nothing to the pattern nor to the predicate.
-        pattern = "".join(c if c.isalnum() else f"\\x{{{ord(c):x}}}" for c in text)
-        fields = [field for field in (kind.text, kind.name) if field]
-        query = query.where(" or ".join(f'{field} ~ "(?i){pattern}"' for field in fields))
-    return query
+
+    query: Query | None
+    kind: Kind
+    level: str = ""
+    text: str = ""
+    flushed: Flushed | None = None
+
+    @cached_property
+    def filtered(self) -> Query | None:
+        """The query for these lines."""
+        query, kind = self.query, self.kind
+        if query is None:
+            return None
+        if self.level and kind.levels:
+            query = query.where(f"level >= {kind.levels[LEVELS.index(self.level)]}")
+        if self.text:
+            # Written as numbers, characters mean nothing to the pattern nor to the predicate.
+            pattern = "".join(c if c.isalnum() else f"\\x{{{ord(c):x}}}" for c in self.text)
+            fields = [field for field in (kind.text, kind.name) if field]
+            query = query.where(" or ".join(f'{field} ~ "(?i){pattern}"' for field in fields))
+        return query
+
+    def after(self, time: int, seq: int, count: int) -> list[Line]:
+        """The next lines, in order.
+
+        Args:
+            time: Log time of the line before them, ns.
+            seq: Arrival number of that line; -1 for all lines of that time, too.
+            count: Most lines.
+        """
+        found: list[Line] = []
+        if self.filtered is not None:
+            beside = self.filtered.between(time, time + 1).where(f"_meta.seq > {seq}")
+            found = self._read((beside, self.filtered.between(time + 1)), count)
+        if self.flushed is not None:
+            lines = self._flushed((time, END), reverse=False)
+            found += islice((one for one in lines if (one.time, one.seq) > (time, seq)), count)
+        return sorted(found, key=_place)[:count]
+
+    def before(self, time: int, seq: int, count: int) -> list[Line]:
+        """The lines before one, in order; see `after`."""
+        found: list[Line] = []
+        if self.filtered is not None:
+            beside = self.filtered.between(time, time + 1).where(f"_meta.seq < {seq}").reverse()
+            found = self._read((beside, self.filtered.between(None, time).reverse()), count)
+        if self.flushed is not None:
+            lines = self._flushed((0, time + 1), reverse=True)
+            found += islice((one for one in lines if (one.time, one.seq) < (time, seq)), count)
+        return sorted(found, key=_place)[-count:] if count else []
+
+    def count(self) -> int | None:
+        """Number of lines; None if it is not known without reading what was flushed."""
+        found = 0
+        with suppress(TimeError):
+            found = 0 if self.filtered is None else self.filtered.count()
+        if self.flushed is None:
+            return found
+        return None if self.level or self.text else found + self.flushed.count
+
+    def _read(self, queries: tuple[Query, ...], count: int) -> list[Line]:
+        found: list[Line] = []
+        for query in queries:
+            with suppress(TimeError):  # a range before or behind the recording has no lines
+                limited = query.limit(count - len(found))
+                found += [_line(message, self.kind) for message in limited]
+        return found
+
+    def _flushed(self, span: Span, *, reverse: bool) -> Iterator[Line]:
+        assert self.flushed is not None
+        levels = LEVELS[LEVELS.index(self.level) :] if self.level and self.kind.levels else ()
+        text = self.text.lower()
+        for message in self.flushed.messages(span, reverse=reverse):
+            line = _line(message, self.kind)
+            if levels and line.level not in levels:
+                continue
+            if text and not any(text in part.lower() for part in (line.text, line.name)):
+                continue
+            if line.is_readable or not (levels or text):
+                yield line
 
 
-def lines_after(query: Query, kind: Kind, time: int, seq: int, count: int) -> list[Line]:
-    """The next lines, in order.
-
-    Args:
-        query: The query, of one topic of one recording.
-        kind: Its kind of messages.
-        time: Log time of the line before them, ns.
-        seq: Arrival number of that line; -1 for all lines of that time, too.
-        count: Most lines.
-    """
-    beside = query.between(time, time + 1).where(f"_meta.seq > {seq}")
-    return _lines(kind, (beside, query.between(time + 1)), count)
-
-
-def lines_before(query: Query, kind: Kind, time: int, seq: int, count: int) -> list[Line]:
-    """The lines before one, in order; see `lines_after`."""
-    beside = query.between(time, time + 1).where(f"_meta.seq < {seq}").reverse()
-    return _lines(kind, (beside, query.between(None, time).reverse()), count)[::-1]
-
-
-def _lines(kind: Kind, queries: tuple[Query, ...], count: int) -> list[Line]:
-    found: list[Line] = []
-    for query in queries:
-        with suppress(TimeError):  # a range before or behind the recording has no lines
-            found += [_line(message, kind) for message in query.limit(count - len(found))]
-    return found
+def _place(line: Line) -> tuple[int, int]:
+    return line.time, line.seq
 
 
 def _line(message: Message, kind: Kind) -> Line:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from hybridlog.frames.names import FIELD
+from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.wording import listed
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.drawing.flushed import Flushed
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
@@ -56,7 +59,12 @@ class Series:
 
 
 def series(
-    query: Query, fields: Sequence[str], *, pixels: int, span: Span | None = None
+    query: Query | None,
+    fields: Sequence[str],
+    *,
+    pixels: int,
+    span: Span | None = None,
+    flushed: Flushed | None = None,
 ) -> list[Series]:
     """Fields of the messages of a query over log time.
 
@@ -64,11 +72,12 @@ def series(
     counters of the query are set to the cost.
 
     Args:
-        query: About one topic of one recording.
+        query: About one topic of one recording; None for none but `flushed`.
         fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
             (`twist.linear`), which give a series for each.
         pixels: Width of the picture. Up to twice as many messages are returned exactly.
         span: Log time `[begin, end)` of the picture, ns; None for that of the messages.
+        flushed: Later messages of the topic, of a recording that goes on.
 
     Raises:
         TopicError: no such field exists.
@@ -78,9 +87,38 @@ def series(
     """
     if pixels < 1:
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
+    wanted = [_Wanted.of(text) for text in fields]
+    extents, tables = [], []
+    counters, cost = Counters(), Counters()
+    if query is not None:
+        asked, extent = _asked(query, wanted, span)
+        counters, cost = query.counters, asked.counters
+        extents.append(extent)
+        tables.append(asked.to_tables())
+    if flushed is not None and flushed.span is not None:
+        begin, end = flushed.span
+        extents.append((begin, end) if span is None else (max(begin, span[0]), min(end, span[1])))
+        tables.append(flushed.tables([one.path for one in wanted], extents[-1]))
+    present = [n for n, (begin, end) in enumerate(extents) if begin < end]
+    if not present:
+        none = np.empty(0)
+        return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
+    whole = min(extents[n][0] for n in present), max(extents[n][1] for n in present)
+    with counters.timed():
+        rows = chain.from_iterable(tables[n] for n in present)
+        found = _read(rows, wanted, _Grid.over(span or whole, pixels))
+        counters.add(cost)
+    return found
+
+
+def _asked(query: Query, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Query, Span]:
+    """The query for the wanted fields, and the part of the span that it covers.
+
+    Raises:
+        UsageError, TopicError, TimeError: see `series`.
+    """
     if query.question.reverse:
         raise UsageError("Time runs from left to right here: leave out reverse.")
-    wanted = [_Wanted.of(text) for text in fields]
     if not wanted:
         raise UsageError(f"Name a field, such as {listed(numbers_of(query), _SHOWN)}.")
     asked = query.fields(*dict.fromkeys(one.path for one in wanted))
@@ -96,13 +134,7 @@ def series(
         begin, end = max(begin, span[0]), min(end, span[1])
         window = np.array([[begin, max(begin, end), 0]], np.int64)
         asked = asked.during(Intervals.of([(recording, window)])) if recording else asked
-    if begin >= end:
-        none = np.empty(0)
-        return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
-    with query.counters.timed():
-        found = _read(asked, wanted, _Grid.over(span or (begin, end), pixels))
-        query.counters.add(asked.counters)
-    return found
+    return asked, (begin, end)
 
 
 def usual_period(steps: NDArray[np.int64]) -> float:
@@ -233,8 +265,8 @@ def _numbers_in_json(texts: Any) -> Any:
     return pc.if_else(is_number, texts, pa.scalar(None, texts.type))
 
 
-def _read(asked: Query, wanted: Sequence[_Wanted], grid: _Grid) -> list[Series]:
-    """The series from the tables of an answer.
+def _read(tables: Iterable[pa.Table], wanted: Sequence[_Wanted], grid: _Grid) -> list[Series]:
+    """The series from tables of messages, which are in order.
 
     Raises:
         UsageError: a field is no number.
@@ -242,7 +274,7 @@ def _read(asked: Query, wanted: Sequence[_Wanted], grid: _Grid) -> list[Series]:
     held: list[tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]] = []
     names: list[dict[str, None]] = [{} for _ in wanted]
     rows = 0
-    for table in asked.to_tables():
+    for table in tables:
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
         columns: dict[str, NDArray[np.float64]] = {}
         for one, known in zip(wanted, names, strict=True):

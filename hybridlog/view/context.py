@@ -23,6 +23,7 @@ from hybridlog_storage.errors import HybridlogError, TopicError
 if TYPE_CHECKING:
     from starlette.requests import Request
 
+    from hybridlog.drawing.flushed import FlushedMessages
     from hybridlog.query.query import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
@@ -59,6 +60,13 @@ class Context:
     def slices(self) -> SliceCache:
         """MCAP files of selections."""
         return SliceCache()
+
+    @cached_property
+    def flushed(self) -> FlushedMessages:
+        """What running recordings have flushed."""
+        from hybridlog.drawing.flushed import FlushedMessages
+
+        return FlushedMessages(self.store.session)
 
     @contextmanager
     def turn(self) -> Iterator[None]:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog.view.context import start_of
-from hybridlog_storage.errors import TimeError, TopicError
+from hybridlog.view.topic import Topic
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
-    from hybridlog.query.query import Query
     from hybridlog.view.asked import Asked
     from hybridlog.view.context import Context
 
@@ -50,22 +48,14 @@ def current(context: Context, asked: Asked) -> Current:
         TopicError: No such recording or topic exists.
         UsageError: A parameter is missing or out of bounds.
     """
-    entry = context.recording(asked)
-    query = context.query(entry, asked.text("topic"))
-    start = start_of(entry)
-    moment = start + asked.offset("at")
-    try:
-        message = query.at(max(moment, 0))
-    except TopicError:
-        return Current(None, None, _next(query, moment, start))
+    topic = Topic(context, asked)
+    moment = max(topic.start + asked.offset("at"), 0)
+    message = topic.at(moment)
     # Of messages with the same time, the last one is current: the next one is later.
-    time = message.log_time_ns
-    return Current(message, time - start, _next(query, time + 1, start))
-
-
-def _next(query: Query, moment: int, start: int) -> int | None:
-    try:
-        found = query.between(max(moment, 0)).first()
-    except TimeError:  # behind the end of the recording
-        return None
-    return None if found is None else found.log_time_ns - start
+    later = moment if message is None else message.log_time_ns + 1
+    following = next(topic.messages(later), None)
+    return Current(
+        message,
+        None if message is None else message.log_time_ns - topic.start,
+        None if following is None else following.log_time_ns - topic.start,
+    )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 import hybridlog as hl
-from hybridlog.drawing.log import LEVELS, Line, filtered, kind_of, lines_after, lines_before
-from hybridlog.query.query import Query
+from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
 from hybridlog_storage.errors import UsageError
 from tests.odd_messages import HOSTILE, LOGS, START, log_time
 
@@ -18,8 +17,8 @@ TOPICS = {
 }
 
 
-def asked(odd: hl.Store, topic: str) -> Query:
-    return odd.query([topic])
+def log_of(odd: hl.Store, topic: str, level: str = "", text: str = "") -> Log:
+    return Log(odd.query([topic]), kind_of(TOPICS[topic]), level, text)
 
 
 def written(topic: str, numbers: range) -> list[tuple[int, str, str, str]]:
@@ -40,10 +39,10 @@ def told(lines: list[Line]) -> list[tuple[int, str, str, str]]:
 @pytest.mark.parametrize("topic", TOPICS)
 def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, topic: str) -> None:
     """Pages of 7 lines, while 5 lines share each time."""
-    query, kind = asked(odd, topic), kind_of(TOPICS[topic])
+    log = log_of(odd, topic)
     found: list[Line] = []
     time, seq = 0, -1
-    while page := lines_after(query, kind, time, seq, 7):
+    while page := log.after(time, seq, 7):
         found += page
         time, seq = page[-1].time, page[-1].seq
     if topic == "/rosout":
@@ -54,35 +53,30 @@ def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, top
     assert all(line.is_readable and line.is_whole for line in found)
     back: list[Line] = []
     time, seq = found[-1].time + 1, 0
-    while page := lines_before(query, kind, time, seq, 7):
+    while page := log.before(time, seq, 7):
         back = page + back
         time, seq = page[0].time, page[0].seq
     assert back == found
 
 
 def test_lines_around_a_line(odd: hl.Store) -> None:
-    query, kind = asked(odd, "/rosout2"), kind_of(TOPICS["/rosout2"])
-    seq = lines_after(query, kind, log_time(100), -1, 3)[2].seq
-    assert told(lines_before(query, kind, log_time(102), seq, 4)) == written(
-        "/rosout2", range(98, 102)
-    )
-    assert told(lines_after(query, kind, log_time(102), seq, 4)) == written(
-        "/rosout2", range(103, 107)
-    )
-    assert lines_before(query, kind, START, -1, 5) == []
-    assert lines_after(query, kind, START * 2, -1, 5) == []
+    log = log_of(odd, "/rosout2")
+    seq = log.after(log_time(100), -1, 3)[2].seq
+    assert told(log.before(log_time(102), seq, 4)) == written("/rosout2", range(98, 102))
+    assert told(log.after(log_time(102), seq, 4)) == written("/rosout2", range(103, 107))
+    assert log.before(START, -1, 5) == []
+    assert log.after(START * 2, -1, 5) == []
 
 
 @pytest.mark.parametrize("topic", [name for name in TOPICS if name != HOSTILE])
 @pytest.mark.parametrize("level", ["debug", "warning", "fatal"])
 def test_lines_of_a_level_and_above(odd: hl.Store, topic: str, level: str) -> None:
-    kind = kind_of(TOPICS[topic])
-    query = filtered(asked(odd, topic), kind, level)
+    log = log_of(odd, topic, level)
     wanted = [
         row for row in written(topic, range(len(LOGS))) if row[1] in LEVELS[LEVELS.index(level) :]
     ]
-    assert told(lines_after(query, kind, 0, -1, 1000)) == wanted
-    assert query.count() == len(wanted)
+    assert told(log.after(0, -1, 1000)) == wanted
+    assert log.count() == len(wanted)
 
 
 @pytest.mark.parametrize(
@@ -91,14 +85,13 @@ def test_lines_of_a_level_and_above(odd: hl.Store, topic: str, level: str) -> No
 )
 def test_lines_with_a_text(odd: hl.Store, text: str) -> None:
     for topic in ("/rosout", "/fox", HOSTILE):
-        kind = kind_of(TOPICS[topic])
-        query = filtered(asked(odd, topic), kind, text=text)
+        log = log_of(odd, topic, text=text)
         wanted = [
             row
             for row in written(topic, range(len(LOGS)))
             if text.lower() in row[2].lower() or text.lower() in row[3].lower()
         ]
-        assert told(lines_after(query, kind, 0, -1, 1000)) == wanted
+        assert told(log.after(0, -1, 1000)) == wanted
 
 
 def test_other_types_are_refused() -> None:

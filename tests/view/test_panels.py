@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,10 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
 from tests.every_image import BROKEN, COMPRESSED, FORMS, HEIGHT, PIXELS, RAW, SAMPLES, WIDTH
 from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time
+from tests.view.conftest import served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
@@ -356,3 +359,35 @@ def test_panels_fit_the_page(
         page.locator(".line").first.wait_for()
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         picture_of(page, f"panels-{scheme}-{width}")
+
+
+def test_panels_of_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
+    begun = time.time_ns()  # before messages are sealed, times count from about now
+    said = Channel("/said", "json", Schema("foxglove.Log", "jsonschema", b"{}"))
+
+    def write(numbers: range) -> None:
+        for n in numbers:
+            text = json.dumps({"level": 2, "message": f"said {n}", "n": n}).encode()
+            recording.write(said, text, log_time=begun + n * S)
+
+    with (
+        hl.open(tmp_path / "store", create=True) as writing,
+        writing.start("live", flush_interval_s=0.05) as recording,
+        hl.open(tmp_path / "store") as store,
+    ):
+        write(range(10))
+        kinds = [("message", "/said", {}), ("log", "/said", {}), ("plot", "/said", {})]
+        with served(store) as url:
+            page.goto(url)
+            page.get_by_role("link", name="live").wait_for()
+            opened(page, url, "live", *kinds)
+            panel(page, "log").get_by_text("10 lines").wait_for()
+            write(range(10, 30))
+            panel(page, "log").get_by_text("30 lines").wait_for()
+            panel(page, "log").locator("[aria-current=true]", has_text="said 29").wait_for()
+            panel(page, "message").get_by_text("said 29").wait_for()
+            output = panel(page, "plot").locator("output[data-field=n]")
+            output.get_by_text("29", exact=True).wait_for()
+            seek(page, state(page, "at") - 24 * S)
+            panel(page, "message").get_by_text("said 5").wait_for()
+            output.get_by_text("5", exact=True).wait_for()

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines_after, lines_before
-from hybridlog.view.context import route, start_of
-from hybridlog_storage.errors import TimeError
+from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
+from hybridlog.view.context import route
+from hybridlog.view.topic import Topic
 
 if TYPE_CHECKING:
-    from hybridlog.query.query import Query
     from hybridlog.view.asked import Asked
     from hybridlog.view.context import Context
 
@@ -22,36 +21,29 @@ def log(context: Context, asked: Asked) -> dict[str, Any]:
     """Lines before and after a time; with `seq`, before and after the line of that number."""
     before = asked.integer("before", 0, _MAX_LINES, 0)
     after = asked.integer("after", 0, _MAX_LINES, 0)
-    query, kind, start = _query(context, asked)
-    time = max(start + asked.offset("at"), 0)
+    topic = Topic(context, asked)
+    lines = _log(topic, asked)
+    time = max(topic.start + asked.offset("at"), 0)
     # A line at the time itself is before the cursor, as it is current there.
     seq = asked.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
-    found = lines_before(query, kind, time, seq, before) if before else []
-    later = lines_after(query, kind, time, seq, after) if after else []
+    found = lines.before(time, seq, before)
+    later = lines.after(time, seq, after)
     return {
-        "lines": [_line(line, start) for line in (*found, *later)],
+        "lines": [_line(line, topic.start) for line in (*found, *later)],
         "first": len(found) < before,
         "last": len(later) < after,
     }
 
 
 def log_count(context: Context, asked: Asked) -> dict[str, Any]:
-    """Number of lines that pass the filters."""
-    query, _, _ = _query(context, asked)
-    try:
-        return {"count": query.count()}
-    except TimeError:
-        return {"count": 0}
+    """Number of lines that pass the filters; null while that is not known."""
+    return {"count": _log(Topic(context, asked), asked).count()}
 
 
-def _query(context: Context, asked: Asked) -> tuple[Query, Kind, int]:
-    entry = context.recording(asked)
-    query = context.query(entry, asked.text("topic"))
-    types = {channel.channel.schema for channel in query.channels()}
-    kind = kind_of(next((schema.name for schema in types if schema is not None), ""))
+def _log(topic: Topic, asked: Asked) -> Log:
     level = asked.word("level", ("", *LEVELS), "")
     text = asked.text("text", "", longest=_MAX_FILTER)
-    return filtered(query, kind, level, text), kind, start_of(entry)
+    return Log(topic.query, kind_of(topic.type), level, text, topic.flushed)
 
 
 def _line(line: Line, start: int) -> dict[str, Any]:

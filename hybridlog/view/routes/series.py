@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.fields import fields_of
 from hybridlog.drawing.series import series as read_series
-from hybridlog.view.context import route, start_of
+from hybridlog.view.context import route
+from hybridlog.view.topic import Topic
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -23,20 +24,26 @@ MAX_FIELDS: Final = 16
 
 def fields(context: Context, asked: Asked) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
-    query = context.query(context.recording(asked), asked.text("topic"))
-    return {"fields": [{"path": path, "type": kind} for path, kind in fields_of(query)]}
+    topic = Topic(context, asked)
+    found = fields_of(topic.field_types(), topic.messages())
+    return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
 def series(context: Context, asked: Asked) -> dict[str, Any]:
     """Least and greatest values by pixel, or each value if there are few."""
-    entry = context.recording(asked)
-    query = context.query(entry, asked.text("topic"))
-    start = start_of(entry)
+    topic = Topic(context, asked)
+    start = topic.start
     begin, end = asked.offset("begin"), asked.offset("end")
     if end <= begin:
         raise UsageError("end must be behind begin.")
     wanted = asked.texts("field", most=MAX_FIELDS)
-    found = read_series(query, wanted, pixels=asked.pixels(), span=(start + begin, start + end))
+    found = read_series(
+        topic.query,
+        wanted,
+        pixels=asked.pixels(),
+        span=(start + begin, start + end),
+        flushed=topic.flushed,
+    )
     if len(found) > MAX_FIELDS:
         raise UsageError(f"These are {len(found)} fields, at most {MAX_FIELDS} fit in a plot.")
     return {

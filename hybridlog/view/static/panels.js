@@ -44,15 +44,16 @@ function firstPanels(topics) {
 
 /** Shows the panels of a recording. Returns a function that takes them away. */
 export function mountPanels(main, recording) {
-  const topics = recording.info.topics;
   const grid = element("section", { class: "panels", "aria-label": "Panels" });
+  const choice = element("select", { "aria-label": "Panel to add" });
   const shown = [];
+  let offered = 0; // number of topics in the menu
   main.append(grid, menu());
   draw();
   const ends = [
     state.on(["panels"], draw),
     state.on(["at", "begin", "end"], update),
-    recording.on(update),
+    recording.on(draw), // topics may have come
   ];
   return () => {
     ends.forEach((end) => end());
@@ -64,15 +65,22 @@ export function mountPanels(main, recording) {
   }
 
   function panels() {
-    return state.get("panels") ?? firstPanels(topics);
+    return state.get("panels") ?? firstPanels(recording.info.topics);
+  }
+
+  function topicOf(panel) {
+    return recording.info.topics.find((one) => one.topic === panel.topic);
   }
 
   function draw() {
+    offer();
     const wanted = panels();
     // What is shown already stays as it is, so that nothing jumps or loads again.
     const kept = shown.splice(0);
     for (const panel of wanted) {
-      const place = kept.findIndex(({ panel: { kind, topic } }) => kind === panel.kind && topic === panel.topic);
+      const place = kept.findIndex(
+        (one) => isSame(one.panel, panel) && Boolean(one.running) === isPossible(panel),
+      );
       if (place >= 0) shown.push({ ...kept.splice(place, 1)[0], panel });
       else shown.push(made(panel));
     }
@@ -84,9 +92,13 @@ export function mountPanels(main, recording) {
     shown.forEach(({ running }) => running?.update());
   }
 
+  function isPossible(panel) {
+    return KINDS.some(({ kind }) => kind === panel.kind) && Boolean(topicOf(panel));
+  }
+
   function made(panel) {
     const kind = KINDS.find((one) => one.kind === panel.kind);
-    const topic = topics.find((one) => one.topic === panel.topic);
+    const topic = topicOf(panel);
     const body = element("div", { class: "body" });
     const close = () => state.set({ panels: panels().filter((one) => !isSame(one, panel)) });
     const copy = async () => {
@@ -131,15 +143,21 @@ export function mountPanels(main, recording) {
     return { panel, frame, running: kind.mount(body, seen) };
   }
 
-  function menu() {
-    const choice = element("select", { "aria-label": "Panel to add" });
-    for (const topic of topics) {
-      for (const { kind, title, accepts } of KINDS) {
-        if (!accepts(topic)) continue;
+  /** Fills the menu with a panel of each kind for each topic. */
+  function offer() {
+    const { topics } = recording.info;
+    if (topics.length === offered) return;
+    offered = topics.length;
+    const options = topics.flatMap((topic) =>
+      KINDS.filter(({ accepts }) => accepts(topic)).map(({ kind, title }) => {
         const value = JSON.stringify({ kind, topic: topic.topic, options: {} });
-        choice.append(element("option", { value }, `${topic.topic} – ${title}`));
-      }
-    }
+        return element("option", { value }, `${topic.topic} – ${title}`);
+      }),
+    );
+    fill(choice, ...options);
+  }
+
+  function menu() {
     const add = () => {
       const panel = JSON.parse(choice.value);
       if (panels().some((one) => isSame(one, panel))) notice("This panel is shown already.");

@@ -33,12 +33,12 @@ export default {
     const { recording } = panel;
     return [
       opening(panel),
-      "from hybridlog.drawing.log import filtered, kind_of, lines_after",
+      "from hybridlog.drawing.log import Log, kind_of",
       "",
-      `kind = kind_of(${literal(panel.topic.type)})`,
       `query = query.between(${moment(recording, begin)}, ${moment(recording, end)})`,
-      `query = filtered(query, kind, ${literal(level)}, ${literal(text)})`,
-      "for message in query.limit(1000):",
+      `kind = kind_of(${literal(panel.topic.type)})`,
+      `log = Log(query, kind, ${literal(level)}, ${literal(text)})`,
+      "for message in log.filtered.limit(1000):",
       "    print(message.log_time_ns, message.fields)",
     ].join("\n");
   },
@@ -129,7 +129,7 @@ function mount(body, panel) {
     tallied = now;
     number.textContent = "…";
     await answered(get("log/count", { ...asked, ...chosen() }, { slot: `${slot} count` }), (found) => {
-      number.textContent = `${count(found.count)} lines`;
+      number.textContent = found.count === null ? "" : `${count(found.count)} lines`;
     });
   }
 
