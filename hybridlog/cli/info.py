@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,11 +23,16 @@ from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
+    from hybridlog.drawing.density import Density
     from hybridlog.maintenance.sizes import Size, Sizes
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
 _MAX_LINE = 100  # characters of a name and what follows it
+_MOST_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
+_DRAWN_WORK = 1 << 20  # see `density`: little is read for a sparkline
+_LETTERS = 40  # of the coverage bar and of the longest sparkline
+_OVER_TIME = "over time"
 
 
 @click.command()
@@ -67,6 +73,9 @@ def command(
         index = opened.index_place
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
         extras = {entry.id: _extras(opened, entry) for entry in chosen}
+        drawn = {}
+        if sys.stdout.isatty() and not as_json and len(chosen) <= _MOST_DRAWN:
+            drawn = {entry.id: _densities(opened, entry) for entry in chosen}
     if as_json:
         full = [_as_dict(entry, *extras[entry.id]) for entry in chosen]
         for about, entry in zip(full, chosen, strict=True):
@@ -79,7 +88,7 @@ def command(
     for number, entry in enumerate(chosen):
         if number:
             output.say()
-        _print_recording(entry, index, *extras[entry.id])
+        _print_recording(entry, index, *extras[entry.id], drawn.get(entry.id))
         if entry.label in found:
             output.say()
             of_one = found[entry.label]
@@ -174,6 +183,7 @@ def _print_recording(
     index: str | None,
     attachments: list[StoredAttachment],
     metadata: list[StoredMetadata],
+    drawn: Density | None,
 ) -> None:
     from hybridlog.entries import summary_of
     from hybridlog.query.times import format_duration, format_time
@@ -200,7 +210,7 @@ def _print_recording(
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
         ("messages", str(entry.messages) if has_content else "-"),
         ("stored", held if has_content else "-"),
-        ("coverage", coverage.describe(entry, losses)),
+        *_coverage(entry, coverage.describe(entry, losses)),
         *(("", coverage.line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
@@ -223,13 +233,65 @@ def _print_recording(
     ]
     if not narrow:
         columns.insert(4, ("payload", "right"))
-    output.print_table(
-        columns,
-        [
-            _channel_row(c, is_decoded=entry.is_decoded, narrow=narrow)
-            for c in sorted(entry.channels, key=lambda c: c.topic)
-        ],
-    )
+    channels = sorted(entry.channels, key=lambda c: c.topic)
+
+    def rows_with(*, short: bool) -> list[list[str]]:
+        known = entry.is_decoded
+        return [_channel_row(c, is_decoded=known, narrow=narrow, short=short) for c in channels]
+
+    cells = rows_with(short=narrow)
+    if drawn is not None:
+        headings = [name for name, _ in columns]
+        # Names of types are cut short if that makes room for lines.
+        for shown in (cells, rows_with(short=True)):
+            # The heading has taken its share of the room.
+            room = output.room([*headings, _OVER_TIME], shown)
+            lines = _sparklines(drawn, room + len(_OVER_TIME) if room >= 0 else 0)
+            if lines:
+                cells = [
+                    [*row[:-1], lines.get(channel.topic, ""), row[-1]]
+                    for channel, row in zip(channels, shown, strict=True)
+                ]
+                columns.insert(-1, (_OVER_TIME, "whole"))
+                break
+    output.print_table(columns, cells)
+
+
+def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
+    """The row about coverage; on a terminal with a bar."""
+    if entry.span is None or not sys.stdout.isatty():
+        return [("coverage", words)]
+    from hybridlog.cli.sparkline import bar
+    from hybridlog.drawing.coverage import lost_parts
+    from hybridlog.losses import extent_of
+
+    return [("coverage", bar(lost_parts(entry, extent_of(entry), _LETTERS))), ("", words)]
+
+
+def _densities(store: Store, entry: RecordingEntry) -> Density | None:
+    """Messages of each topic over time; None for a recording without any, or a damaged one."""
+    from hybridlog.drawing.density import density
+    from hybridlog.losses import extent_of
+
+    begin, end = extent_of(entry)
+    if begin == end:
+        return None
+    try:
+        return density(store.session, entry, (begin, end), _LETTERS, most_work=_DRAWN_WORK)
+    except SegmentError as error:
+        output.note(f"{entry.label}: {error}")
+        return None
+
+
+def _sparklines(drawn: Density, room: int) -> dict[str, str]:
+    """A line for each topic, as long as there is room for, by topic; none without room."""
+    from hybridlog.cli.sparkline import densities
+
+    for step in (1, 2, 4):
+        if _LETTERS // step <= room:
+            counts = drawn.counts.reshape(len(drawn.topics), -1, step).sum(axis=2)
+            return dict(zip(drawn.topics, map(densities, counts), strict=True))
+    return {}
 
 
 def _content(attachment: StoredAttachment) -> str:
@@ -247,7 +309,9 @@ def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
     return [*rows, (name, f"and {more} more")] if more else rows
 
 
-def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> list[str]:
+def _channel_row(
+    channel: ChannelEntry, *, is_decoded: bool, narrow: bool, short: bool
+) -> list[str]:
     from hybridlog.latching import depth_of
     from hybridlog_storage.messages import REDUCED, SUPPLIED, Channel
 
@@ -272,7 +336,7 @@ def _channel_row(channel: ChannelEntry, *, is_decoded: bool, narrow: bool) -> li
     kind = channel.type or channel.message_encoding
     cells = [
         channel.topic,
-        kind.rpartition("/")[2] if narrow else kind,
+        kind.rpartition("/")[2] if short else kind,
         str(stats.messages),
         f"{rate:.2f}" if rate is not None else "-",
         skew,

@@ -8,6 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, is_dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Literal
 
 from hybridlog_storage.errors import UsageError
@@ -93,10 +94,18 @@ def is_narrow() -> bool:
 
 def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
     """True when rows fit the terminal as a table; files and pipes fit any row."""
-    if not sys.stdout.isatty():
-        return True
-    widths = [max(map(len, cells)) for cells in zip(names, *rows, strict=True)]
-    return sum(widths) + 2 * len(widths) <= console().width
+    return not sys.stdout.isatty() or room(names, rows) >= 0
+
+
+def room(names: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
+    """Columns of the terminal that a table leaves.
+
+    Args:
+        names: Headings; one more than cells in a row is a column that is yet empty.
+        rows: Cells.
+    """
+    widths = [max(map(len, cells)) for cells in zip_longest(names, *rows, fillvalue="")]
+    return console().width - sum(widths) - 2 * len(widths)
 
 
 def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:

@@ -53,6 +53,8 @@ def density(
     span: tuple[int, int],
     pixels: int,
     topics: Sequence[str] | None = None,
+    *,
+    most_work: int = MOST_WORK,
 ) -> Density:
     """Counts of messages by pixel.
 
@@ -62,11 +64,12 @@ def density(
         span: Log time `[begin, end)`, ns.
         pixels: Number of parts of the span; their lengths differ by one nanosecond at most.
         topics: Full names; None for all topics of the recording.
+        most_work: As for `count`.
     """
     chunks = RecordedChunks(session, recording)
     chosen = tuple(chunks.topics() if topics is None else topics)
     edges = _edges(span, pixels)
-    counts, exact = count(chunks, chosen, edges)
+    counts, exact = count(chunks, chosen, edges, most_work=most_work)
     return Density(chosen, edges, counts, exact)
 
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from hybridlog.choice import Choice
+from hybridlog.drawing.coverage import lost_parts
 from hybridlog.losses import extent_of, losses_of
 from hybridlog.view.context import Context, route, start_of
 
@@ -115,16 +118,9 @@ def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
 
 def _lost_parts(entry: RecordingEntry, begin: int, end: int) -> list[tuple[float, float]]:
     """Parts of a recording in which messages were lost, as fractions of its time."""
-    length = max(end - begin, 1)
-    found = set()
-    for loss in losses_of(entry):
-        if loss.get("from") is None or loss.get("to") is None or loss["count"] == 0:
-            continue
-        low = round((loss["from"] - begin) / length * _MAX_PARTS)
-        high = round((loss["to"] - begin) / length * _MAX_PARTS)
-        low = min(max(low, 0), _MAX_PARTS - 1)
-        found.add((low / _MAX_PARTS, min(max(high, low + 1), _MAX_PARTS) / _MAX_PARTS))
-    return sorted(found)
+    is_lost = lost_parts(entry, (begin, end), _MAX_PARTS)
+    edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)) / _MAX_PARTS
+    return [(low, high) for low, high in edges.reshape(-1, 2).tolist()]
 
 
 def _extent(entry: RecordingEntry) -> tuple[int, int]:
