@@ -38,6 +38,7 @@ ALLOWED = {
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog.drawing.pixels", "hybridlog_storage.checksum"),
     "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
+    "matplotlib": ("hybridlog.drawing.figure", "hybridlog.query.query"),
     "mcap": (
         "hybridlog.export.mcap",
         "hybridlog.sources",

@@ -35,6 +35,7 @@ COMMANDS: Final = (
     "rate",
     "gaps",
     "stats",
+    "plot",
     "sql",
     "view",
     "export",

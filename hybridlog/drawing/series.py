@@ -15,14 +15,14 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.wording import listed
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.drawing.asked import Asked
     from hybridlog.drawing.flushed import Flushed
-    from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
 GAP_PERIODS: Final = 5
@@ -57,9 +57,43 @@ class Series:
     greatest: NDArray[np.float64]
     exact: bool
 
+    def by_column(self, columns: int) -> NDArray[np.float64]:
+        """Means of the middle between least and greatest, NaN for none, in order of time.
+
+        Args:
+            columns: Number of columns; there are no more than entries.
+        """
+        columns = max(1, min(columns, len(self.times)))
+        middle = self.least / 2 + self.greatest / 2
+        is_known = np.isfinite(middle)
+        if not is_known.any():
+            return np.full(columns, np.nan)
+        begin, end = int(self.times[0]), int(self.times[-1]) + 1
+        width = -(-(end - begin) // columns)
+        column = ((self.times - begin) // width)[is_known]
+        counts = np.bincount(column, minlength=columns)
+        with np.errstate(invalid="ignore"):
+            found: NDArray[np.float64] = (
+                np.bincount(column, middle[is_known], minlength=columns) / counts
+            )
+        return found
+
+    def alone(self) -> NDArray[np.bool_]:
+        """bool[n], True for entries between two gaps: no line goes through them."""
+        is_known = np.isfinite(self.least) & np.isfinite(self.greatest)
+        edged = np.concatenate([[False], is_known, [False]])
+        found: NDArray[np.bool_] = is_known & ~edged[:-2] & ~edged[2:]
+        return found
+
+    def polyline(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Corners of the line: times, ns, and values. A pixel has its least and its greatest."""
+        if self.exact:
+            return self.times, self.least
+        return np.repeat(self.times, 2), np.stack([self.least, self.greatest], axis=1).ravel()
+
 
 def series(
-    query: Query | None,
+    query: Asked | None,
     fields: Sequence[str],
     *,
     pixels: int,
@@ -111,7 +145,7 @@ def series(
     return found
 
 
-def _asked(query: Query, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Query, Span]:
+def _asked(query: Asked, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Asked, Span]:
     """The query for the wanted fields, and the part of the span that it covers.
 
     Raises:
@@ -146,7 +180,7 @@ def usual_period(steps: NDArray[np.int64]) -> float:
     return float(np.quantile(steps, 0.9)) if len(steps) else 0.0
 
 
-def numbers_of(query: Query) -> list[str]:
+def numbers_of(query: Asked) -> list[str]:
     """Paths of the fields that are single numbers; none where no definition fixes them."""
     known = query.field_types() or {}
     return [p for p, kind in known.items() if _NUMBER.fullmatch(kind) and "[" not in p]
@@ -199,9 +233,9 @@ class _Wanted:
             raise UsageError(f"{text!r} names no single number: write position[0] for an element.")
         return cls(text, path, tuple(int(m[1]) if m[1] else m[2] for m in found))
 
-    def columns(self, table: pa.Table) -> dict[str, NDArray[np.float64]]:
-        """Its numbers in a table, by path; those of other types are left out."""
-        found = {}
+    def columns(self, table: pa.Table) -> dict[str, NDArray[np.float64] | None]:
+        """Its columns in a table, by path; None for what is no number."""
+        found: dict[str, NDArray[np.float64] | None] = {}
         for field, column in zip(table.schema, table.columns, strict=True):
             path = (field.metadata or {}).get(FIELD, field.name.encode()).decode()
             if path != self.path and (self.access or not path.startswith(f"{self.path}.")):
@@ -209,9 +243,8 @@ class _Wanted:
             array = column.combine_chunks()
             for step in self.access:
                 array = _stepped(array, step)
-            values = None if array is None else _numbers(array)
-            if values is not None:
-                found[self.text if path == self.path else path] = values
+            name = self.text if path == self.path else path
+            found[name] = None if array is None else _numbers(array)
         return found
 
 
@@ -269,18 +302,20 @@ def _read(tables: Iterable[pa.Table], wanted: Sequence[_Wanted], grid: _Grid) ->
     """The series from tables of messages, which are in order.
 
     Raises:
+        TopicError: a field does not exist.
         UsageError: a field is no number.
     """
     held: list[tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]] = []
-    names: list[dict[str, None]] = [{} for _ in wanted]
+    names: list[dict[str, bool]] = [{} for _ in wanted]  # of columns, True for numbers
     rows = 0
     for table in tables:
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
         columns: dict[str, NDArray[np.float64]] = {}
         for one, known in zip(wanted, names, strict=True):
-            found = one.columns(table)
-            known.update(dict.fromkeys(found))
-            columns.update(found)
+            for path, values in one.columns(table).items():
+                known[path] = known.get(path, False) or values is not None
+                if values is not None:
+                    columns[path] = values
         rows += len(times)
         held.append((times, columns))
         if rows > 2 * grid.pixels:
@@ -289,8 +324,10 @@ def _read(tables: Iterable[pa.Table], wanted: Sequence[_Wanted], grid: _Grid) ->
             held.clear()
     for one, known in zip(wanted, names, strict=True):
         if not known and rows:
+            raise TopicError(f"No message here has a field {one.text!r}.")
+        if not any(known.values()) and rows:
             raise UsageError(f"{one.text} is no number: only numbers can be drawn.")
-    paths = list(dict.fromkeys(path for known in names for path in known))
+    paths = list(dict.fromkeys(p for known in names for p, is_number in known.items() if is_number))
     if rows > 2 * grid.pixels:
         return grid.series(paths)
     return _exact(held, paths)

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
     import pyarrow as pa
+    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from hybridlog.across.align import Aligned
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
+    from hybridlog_storage.summary import RecordingSummary
 
 _MAX_STEP = 2**62  # longer than any topic, and an int64
 
@@ -158,8 +160,7 @@ class Query:
     @property
     def recordings(self) -> tuple[str, ...]:
         """Ids of the recordings, oldest first."""
-        summaries = self._session.snapshot().summaries
-        return tuple(summaries[n].id for n in self._session.chosen(self.question).tolist())
+        return tuple(summary.id for summary in self.summaries())
 
     @property
     def spent(self) -> Counters:
@@ -763,6 +764,32 @@ class Query:
 
         return schema_of(Planner(self._session, self.question, Counters()))
 
+    def plot(self, *fields: str, ax: Axes | None = None) -> Axes:
+        """Draw fields over time with matplotlib, a line for each topic and recording.
+
+        Where messages are closer than pixels, the line goes through the least and the greatest
+        value of each pixel. Times without messages, and values that are NaN, are gaps.
+
+        Args:
+            fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
+                (`twist.linear`).
+            ax: Where to draw; None for a new figure of pyplot.
+
+        Returns:
+            The axes; seconds since the beginning of each recording are from left to right.
+
+        Raises:
+            TopicError: no topic has such a field.
+            UsageError: no field, a field that is no number, `reverse`, or too many lines.
+            TimeError: the range is outside all recordings.
+            MissingDependencyError: matplotlib is not installed.
+        """
+        from hybridlog.drawing.figure import new_axes, plot
+
+        axes = new_axes() if ax is None else ax
+        plot(axes, self, fields)
+        return axes
+
     def resample(
         self,
         step: DurationLike,
@@ -912,6 +939,11 @@ class Query:
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
         return self._session.field_types(self.topics, self.question.recordings)
+
+    def summaries(self) -> list[RecordingSummary]:
+        """The recordings in short, oldest first; some may have no message in the answer."""
+        summaries = self._session.snapshot().summaries
+        return [summaries[place] for place in self._session.chosen(self.question).tolist()]
 
     def spans(self) -> dict[str, Span]:
         """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.

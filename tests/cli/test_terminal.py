@@ -119,8 +119,27 @@ def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None
     code, shown = on_terminal("info", "robot", "--store", store, width=80)
     assert code == 0
     assert re.search(r"(?m)^/base/scan +LaserScan +\d", plain(shown))
+    assert "over time" not in shown
     code, shown = on_terminal("info", "robot", "--store", store, width=160)
     assert re.search(r"(?m)^/base/scan +sensor_msgs/LaserScan +\d", plain(shown))
+    # What is whole, and when the messages came.
+    assert re.search(r"(?m)^coverage +█{40} *\n +complete *$", plain(shown))
+    lines = dict(re.findall(r"(?m)^(/\S+) .* ([ ▁-█]{20}) {2,}(?:latched)? *$", plain(shown)))
+    assert set(lines["/base/scan"]) <= {*"▆▇█"}
+    assert lines["/tf_static"].strip() == "█"
+    assert len(plain(shown).splitlines()[-1]) <= 160
+
+
+def test_a_plot_of_text_is_as_wide_as_the_screen(store: Path) -> None:
+    ask = ("plot", "-t", "odom", "-r", "robot", "--fields", "twist.twist.linear", "-q")
+    for width in (60, 100):
+        code, shown = on_terminal(*ask, "--store", store, width=width)
+        assert code == 0
+        head, *rows = plain(shown).splitlines()
+        assert head.split() == ["field", "least", "greatest"]
+        assert [row.split()[0][-1] for row in rows] == ["x", "y", "z"]
+        assert width - 4 <= max(map(len, rows)) <= width
+        assert len({*rows[0][-20:]} & {*"▁▂▃▄▅▆▇█"}) > 2
 
 
 def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:

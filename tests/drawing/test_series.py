@@ -135,6 +135,8 @@ def test_fields_without_a_definition(drive: Drive) -> None:
     assert np.array_equal(np.delete(on.least, at), want, equal_nan=True)
     with pytest.raises(UsageError, match="name is no number"):
         series(drive.store.topic("loose"), ["name"], pixels=300)
+    with pytest.raises(TopicError, match="No message here has a field 'speed'"):
+        series(drive.store.topic("loose"), ["speed"], pixels=300)
 
 
 def test_only_columns_of_the_table_are_read(drive: Drive) -> None:

@@ -1,0 +1,188 @@
+"""`hybridlog plot`."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.output_path import check_room, not_written
+from hybridlog.cli.query_options import asked, parse_fields
+from hybridlog.cli.signals import if_stopped
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hybridlog.choice import Choice
+    from hybridlog.drawing.lines import Line
+    from hybridlog.drawing.series import Series
+
+_FORMATS = ("png", "svg", "pdf", "html")
+_WIDTH, _HEIGHT = 1200, 400
+_LETTERS = 60  # of a line of text in a file
+_MOST_LETTERS = 500
+_PAGE_PIXELS = 10_000  # of a page, in which one can zoom
+_SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
+
+
+@click.command()
+@options.topics
+@click.option(
+    "--fields",
+    metavar="A,B.C",
+    help="Fields that are numbers (ranges.min, position[2]), or messages with numbers.",
+)
+@click.option(
+    "--output",
+    "-o",
+    type=options.PATH,
+    metavar="FILE",
+    help="Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard output. "
+    "Without: a line of text for each field.",
+)
+@click.option(
+    "--format", "-F", "form", type=click.Choice(_FORMATS), help="Without: by the suffix of -o."
+)
+@click.option(
+    "--size",
+    metavar="WxH",
+    help=f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each further "
+    "topic.",
+)
+@options.store
+@options.between
+@options.where
+@options.choice
+@options.strict
+@options.force
+@options.mongo
+@options.quiet
+def command(
+    *,
+    topic: tuple[str, ...],
+    fields: str | None,
+    output: Path | None,
+    form: str | None,
+    size: str | None,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    where: tuple[str, ...],
+    choice: Choice,
+    strict: bool,
+    force: bool,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Draw fields over time."""
+    form = _form(output, form)
+    shape = None if size is None else _size(size)
+    is_file = output is not None and str(output) != "-"
+    if output is not None and is_file:
+        check_room(output, force=force)
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        from hybridlog.drawing.lines import lines
+
+        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
+        names = [] if fields is None else parse_fields(fields)
+        height = _HEIGHT * max(1, len(query.topics))
+        shape = shape or (_WIDTH, height)
+        pixels = {"": _MOST_LETTERS, "html": _PAGE_PIXELS}.get(form, shape[0])
+        found = lines(query, names, pixels=pixels)
+        if not form:
+            _print(found)
+        else:
+            with if_stopped(partial(not_written, output) if output and is_file else ""):
+                _write(found, form, shape, output if is_file else None)
+        sys.stdout.flush()
+        if not quiet:
+            print_cost(query.counters, time.monotonic() - started, count=True)
+            print_left_out(query, query.counters)
+            print_remarks(query, topic, is_empty=not any(len(x.series.times) for x in found))
+            print_gaps(query, between)
+
+
+def _form(path: Path | None, form: str | None) -> str:
+    """The format; empty for text."""
+    if path is None:
+        if form is not None:
+            raise UsageError(f"{form} needs a name: -o FILE.{form}, or -o - for standard output.")
+        return ""
+    if str(path) == "-" and form is not None and sys.stdout.isatty():
+        raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
+    suffix = path.suffix.lower().removeprefix(".")
+    found = form or {"htm": "html"}.get(suffix, suffix)
+    if found not in _FORMATS:
+        raise UsageError(
+            f"The name {path} does not give the format: add --format, or end it in "
+            f"{', '.join(f'.{name}' for name in _FORMATS)}."
+        )
+    return found
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = _SIZE.fullmatch(text)
+    if match is None:
+        raise UsageError(f"A size is 1200x400, from 10 to 9999 pixels, not {text!r}.")
+    return int(match[1]), int(match[2])
+
+
+def _write(found: Sequence[Line], form: str, size: tuple[int, int], path: Path | None) -> None:
+    from hybridlog.export.base import Sink
+
+    if form == "html":
+        from hybridlog.drawing.page import page
+
+        made = page(found, ", ".join(dict.fromkeys(line.topic for line in found)) or "No message")
+    else:
+        from hybridlog.drawing.figure import figure
+
+        made = figure(found, size=size, form=form)
+    sink = Sink(sys.stdout.buffer if path is None else path)
+    try:
+        sink.write(made)
+        sink.commit()
+    finally:
+        sink.abort()
+
+
+def _print(found: Sequence[Line]) -> None:
+    """A row for each line: its least and greatest value, and a sparkline."""
+    from hybridlog.cli.sparkline import sparkline
+
+    shared = [
+        ("topic", [line.topic for line in found]),
+        ("recording", [line.recording for line in found]),
+    ]
+    beside = [(name, cells) for name, cells in shared if len(set(cells)) > 1]
+    columns: list[output.Column] = [(name, "left") for name, _ in beside]
+    columns += [("field", "left"), ("least", "right"), ("greatest", "right"), ("", "whole")]
+    rows = [
+        [*(cells[number] for _, cells in beside), line.series.field, *_ends(line.series)]
+        for number, line in enumerate(found)
+    ]
+    width = _LETTERS
+    if sys.stdout.isatty():
+        width = max(_LETTERS // 4, output.room([name for name, _ in columns], rows))
+    for row, line in zip(rows, found, strict=True):
+        row.append(sparkline(line.series.by_column(width)))
+    output.print_table(columns, rows)
+
+
+def _ends(series: Series) -> tuple[str, str]:
+    """The least and the greatest finite value."""
+    import numpy as np
+
+    least, greatest = (side[np.isfinite(side)] for side in (series.least, series.greatest))
+    if not len(least) or not len(greatest):
+        return "", ""
+    return f"{least.min():.6g}", f"{greatest.max():.6g}"

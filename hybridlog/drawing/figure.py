@@ -1,0 +1,171 @@
+"""Plots by matplotlib."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import groupby
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from hybridlog.drawing.lines import Line, lines
+from hybridlog.query.times import format_time
+from hybridlog_storage.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.text import Text
+
+    from hybridlog.drawing.asked import Asked
+
+DPI: Final = 100
+FEW: Final = 100
+"""Messages of a line that are marked, each of them."""
+_UNITS = ((300, 1, "seconds"), (3 * 3600, 60, "minutes"), (3 * 86_400, 3600, "hours"))
+_EXACT_COLOURS = 10  # of matplotlib's own
+_ABOVE, _ABOVE_LETTERS = 4, 90  # names in a row above the axes
+
+
+@contextmanager
+def _matplotlib() -> Iterator[None]:
+    try:
+        import matplotlib as mpl  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            "a plot needs matplotlib: pip install 'hybridlog[plot]'; an HTML page (-o NAME.html) "
+            "does not"
+        ) from error
+    with warnings.catch_warnings():
+        # Names in logs may have letters that the font lacks: they are shown as boxes.
+        warnings.filterwarnings("ignore", "Glyph")
+        yield
+
+
+def new_axes() -> Axes:
+    """Axes in a new figure of pyplot.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    with _matplotlib():
+        from matplotlib import pyplot as plt
+
+        return plt.subplots(layout="constrained")[1]
+
+
+def plot(axes: Axes, query: Asked, fields: Sequence[str]) -> None:
+    """Draw fields of a query over time; see `Query.plot`."""
+    with _matplotlib():
+        width = max(1, round(axes.get_window_extent().width))
+        draw(axes, lines(query, fields, pixels=width))
+
+
+def figure(found: Sequence[Line], *, size: tuple[int, int], form: str) -> bytes:
+    """A picture with axes for each topic, one below the other.
+
+    Args:
+        found: The lines, by topic.
+        size: Width and height, pixels.
+        form: `png`, `svg` or `pdf`.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    with _matplotlib():
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+
+        topics = [list(group) for _, group in groupby(found, key=lambda line: line.topic)]
+        # Text stays text, and the same data make the same file.
+        with rc_context({"svg.fonttype": "none", "svg.hashsalt": "hybridlog"}):
+            made = Figure((size[0] / DPI, size[1] / DPI), dpi=DPI, layout="constrained")
+            several = made.subplots(max(len(topics), 1), 1, sharex=True, squeeze=False)[:, 0]
+            for axes, group in zip(several, topics, strict=False):
+                draw(axes, group)
+            for axes in several[:-1]:
+                axes.set_xlabel("")
+            file = io.BytesIO()
+            about = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(form)
+            made.savefig(file, format=form, dpi=DPI, metadata=about)
+        return file.getvalue()
+
+
+def draw(axes: Axes, found: Sequence[Line]) -> None:
+    """Draw lines, with names, units and a legend."""
+    ends = [line.series.times[-1] - line.start for line in found if len(line.series.times)]
+    length = max(ends, default=0) / 1e9
+    step, unit = next(((s, u) for most, s, u in _UNITS if length <= most), (86_400, "days"))
+    names = _names(found)
+    colours = _colours(len(found))
+    drawn = []
+    for line, colour in zip(found, colours, strict=True):
+        times, values = line.series.polyline()
+        at = (times - line.start) / (1e9 * step)
+        (curve,) = axes.plot(at, values, color=colour, linewidth=1.2, solid_joinstyle="round")
+        is_marked = line.series.alone() if len(line.series.times) > FEW else slice(None)
+        marks = (line.series.times[is_marked] - line.start) / (1e9 * step)
+        axes.plot(marks, line.series.least[is_marked], ".", color=colour, markersize=4)
+        drawn.append(curve)
+    recordings = {(line.recording, line.start) for line in found}
+    since = "the beginning of each recording"
+    if len(recordings) == 1:
+        ((label, start),) = recordings
+        since = f"{format_time(start)}, {label}"
+    _label(axes.set_xlabel(""), f"{unit} since {since}")
+    topics = list(dict.fromkeys(line.topic for line in found))
+    _label(axes.set_title("", loc="left", fontsize="medium"), ", ".join(topics))
+    axes.grid(visible=True, alpha=0.3)
+    axes.margins(x=0.01)
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(found) == 1:
+        _label(axes.set_ylabel(""), names[0])
+    elif found:
+        # Beside the title if there is room, else on the right. Matplotlib hides names that
+        # begin with an underscore.
+        is_short = len(found) <= _ABOVE and sum(map(len, names)) <= _ABOVE_LETTERS
+        legend = axes.legend(
+            drawn,
+            [f" {name}" for name in names],
+            loc="lower right" if is_short else "upper left",
+            bbox_to_anchor=(1, 1),
+            ncols=len(names) if is_short else 1,
+            fontsize="small",
+            frameon=False,
+        )
+        for text, name in zip(legend.get_texts(), names, strict=True):
+            _label(text, name)
+
+
+def _names(found: Sequence[Line]) -> list[str]:
+    """Names that tell the lines apart."""
+    several_topics = len({line.topic for line in found}) > 1
+    several_recordings = len({line.recording for line in found}) > 1
+    return [
+        " ".join(
+            [
+                *([line.topic] if several_topics else []),
+                line.series.field,
+                *([line.recording] if several_recordings else []),
+            ]
+        )
+        for line in found
+    ]
+
+
+def _colours(count: int) -> list[object]:
+    from matplotlib import colormaps
+
+    if count <= _EXACT_COLOURS:
+        return [f"C{number}" for number in range(count)]
+    return [*colormaps["turbo"](np.linspace(0.05, 0.95, count))]
+
+
+def _label(text: Text, words: str) -> None:
+    """Set a text that is shown as it is: names in logs are no formulas."""
+    text.set_parse_math(False)
+    text.set_text(
+        "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in words)
+    )

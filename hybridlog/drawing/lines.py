@@ -1,0 +1,114 @@
+"""The lines of a plot: fields of several topics and recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from hybridlog.drawing.series import Series, numbers_of, series
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TopicError, UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.drawing.asked import Asked
+
+MOST: Final = 50
+"""Lines that can be told apart, with good will."""
+_SHOWN = 8  # names in a message
+
+
+@dataclass(frozen=True)
+class Line:
+    """A field of a topic in a recording.
+
+    Attributes:
+        topic: Full name.
+        recording: Label.
+        start: Beginning of the recording, ns.
+        series: The values.
+    """
+
+    topic: str
+    recording: str
+    start: int
+    series: Series
+
+
+def lines(query: Asked, fields: Sequence[str], *, pixels: int) -> list[Line]:
+    """The fields of a query over time, by topic and recording; the query's counters are set.
+
+    Args:
+        query: Each of its topics has a line for each of the fields that it has.
+        fields: As for `series`.
+        pixels: Width of the picture.
+
+    Raises:
+        TopicError: no topic has such a field.
+        UsageError: no field, a field that is no number, `reverse`, or more than `MOST` lines.
+        TimeError: the range is outside all recordings.
+    """
+    if not fields:
+        numbers = [name for one in _by_topic(query) for name in numbers_of(one)]
+        raise UsageError(f"Name a field, such as {listed(dict.fromkeys(numbers), _SHOWN)}.")
+    summaries = {summary.id: summary for summary in query.summaries()}
+    with query.counters.timed():
+        found: list[Line] = []
+        missing: dict[str, TopicError] = {}
+        had: set[str] = set()
+        for one in _by_topic(query):
+            for recording in one.spans():
+                part = one.in_recording(recording)
+                about = summaries[recording]
+                for group in _groups(part, fields, missing):
+                    try:
+                        drawn = series(part, group, pixels=pixels)
+                    except TopicError as error:
+                        missing.update(dict.fromkeys(group, error))
+                        continue
+                    query.counters.add(part.counters)
+                    had.update(group)
+                    found += [Line(one.topics[0], about.label, about.extent[0], x) for x in drawn]
+                if len(found) > MOST:
+                    raise UsageError(
+                        f"A plot has at most {MOST} lines: name fewer fields, or choose "
+                        "recordings with -r."
+                    )
+    for field, problem in missing.items():
+        if field not in had:
+            raise problem
+    return found
+
+
+def _groups(
+    query: Asked, fields: Sequence[str], missing: dict[str, TopicError]
+) -> Iterator[list[str]]:
+    """The fields that a topic has, together; one by one where only messages tell.
+
+    Args:
+        query: About one topic.
+        fields: Paths.
+        missing: Gets the fields that it does not have.
+    """
+    if query.field_types() is None:
+        yield from ([field] for field in fields)
+        return
+    own = []
+    for field in fields:
+        try:
+            query.fields(field.partition("[")[0])
+        except TopicError as error:
+            missing[field] = error
+        else:
+            own.append(field)
+    if own:
+        yield own
+
+
+def _by_topic(query: Asked) -> Iterator[Asked]:
+    return (query.with_topic(topic) for topic in query.topics)
+
+
+def printable(text: str) -> str:
+    """Text without control characters: names in logs are untrusted."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

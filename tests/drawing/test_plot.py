@@ -1,0 +1,261 @@
+"""`hybridlog plot`, `Query.plot`, and small bars of text."""
+
+from __future__ import annotations
+
+import builtins
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hybridlog.cli.sparkline import bar, densities, sparkline
+from hybridlog.drawing.coverage import lost_parts
+from hybridlog.drawing.figure import figure
+from hybridlog.drawing.lines import MOST, Line, lines
+from hybridlog.drawing.series import Series
+from hybridlog.losses import Cause
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError
+from tests.cli.within import Answer, answer
+
+from .conftest import BASE, Drive
+
+NAN = float("nan")
+
+
+def plot(drive: Drive, *arguments: object, code: int = 0) -> Answer:
+    return answer("plot", *arguments, store=drive.directory, code=code)
+
+
+def made(times: list[float], values: list[float], field: str = "x", topic: str = "/a") -> Line:
+    at = np.array([BASE + round(time * 1e9) for time in times], np.int64)
+    numbers = np.array(values, np.float64)
+    return Line(topic, "one", BASE, Series(field, at, numbers, numbers, True))
+
+
+def test_lines_are_by_topic_and_recording(drive: Drive) -> None:
+    query = drive.store.topic("drive", "loose")
+    found = lines(query, ["linear.z", "w"], pixels=3000)
+    assert [(x.topic, x.recording, x.series.field) for x in found] == [
+        ("/drive", "drive", "linear.z"),
+        ("/loose", "drive", "w"),
+    ]
+    assert {x.start for x in found} == {BASE}
+    assert query.counters.messages == 5100
+    with pytest.raises(TopicError, match="nothing"):
+        lines(drive.store.topic("drive"), ["y", "nothing"], pixels=9)
+    with pytest.raises(UsageError, match=f"at most {MOST} lines"):
+        lines(drive.store.topic("drive"), [f"wide[{n}]" for n in range(MOST + 1)], pixels=9)
+    with pytest.raises(UsageError, match=r"Name a field, such as linear\.x"):
+        lines(drive.store.topic("drive"), [], pixels=9)
+
+
+@pytest.mark.parametrize("form", ["png", "svg", "pdf", "html"])
+def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
+    path = tmp_path / f"speed.{form}"
+    ask = ("-t", "drive", "--fields", "linear.z,y", "-o", path)
+    assert "0 B of payload" in plot(drive, *ask, "--size", "600x200").err
+    content = path.read_bytes()
+    if form == "png":
+        with Image.open(path) as picture:
+            assert picture.size == (600, 200)
+            colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+        for colour in ((31, 119, 180), (255, 127, 14)):  # blue and orange
+            assert (np.abs(colours.astype(int) - colour).max(axis=1) < 20).sum() > 200
+    elif form == "svg":
+        text = content.decode()
+        assert all(f">{name}<" in text for name in ("linear.z", "y", "/drive"))
+        assert "seconds since 2025-06-03T08:00:00Z, drive" in text
+        assert len(content) < 200_000
+        again = tmp_path / "again.svg"
+        plot(drive, *ask[:-1], again, "--size", "600x200")
+        assert again.read_bytes() == content
+    else:
+        assert content.startswith({"pdf": b"%PDF", "html": b"<!doctype html>"}[form])
+    plot(drive, *ask, code=2)
+    assert path.read_bytes() == content
+    plot(drive, *ask, "--force", "--between", "+1s", "+2s")
+    assert path.read_bytes() != content
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith("speed")] == [path.name]
+
+
+def test_standard_output_and_text(drive: Drive) -> None:
+    done = plot(drive, "-t", "drive", "--fields", "linear.z", "-F", "svg", "-o", "-")
+    assert done.out.startswith("<?xml")
+    done = plot(drive, "-t", "drive", "--fields", "ticks,linear", "--between", "+0s", "+3s", "-q")
+    assert done.err == ""
+    head, *rows = done.lines
+    assert head.split() == ["field", "least", "greatest"]
+    assert [row.split()[0] for row in rows] == ["ticks", "linear.x", "linear.z"]
+    z = drive.z[:300]
+    assert rows[2].split()[1:3] == [f"{z.min():.6g}", f"{z.max():.6g}"]
+    drawn = rows[2][len(rows[2]) - 60 :]
+    columns = [z[n * 5 : n * 5 + 5].mean() for n in range(60)]
+    assert drawn == sparkline(np.array(columns))
+    done = plot(drive, "-t", "drive", "-t", "loose", "--fields", "w,y")
+    assert done.lines[0].split() == ["topic", "field", "least", "greatest"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("-o", "x.gif"), "end it in .png, .svg, .pdf, .html"),
+        (("-F", "svg"), "-o FILE.svg"),
+        (("-o", "x.png", "--size", "1x1"), "A size is 1200x400"),
+        (("-o", "x.png", "--size", "99999x100"), "A size is 1200x400"),
+    ],
+)
+def test_what_is_refused(
+    drive: Drive,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+    problem: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    from click.testing import CliRunner
+
+    from hybridlog.cli.app import app
+
+    environment = {"HYBRIDLOG_STORE": str(drive.directory)}
+    asked = ["plot", "-t", "drive", "--fields", "y", *arguments]
+    done = CliRunner().invoke(app, asked, env=environment, standalone_mode=False)
+    assert isinstance(done.exception, UsageError)
+    assert problem in str(done.exception)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_query_plot(drive: Drive) -> None:
+    import matplotlib as mpl
+    from matplotlib import pyplot as plt
+
+    mpl.use("Agg")
+    query = drive.store.topic("drive").between("+1s", "+2s")
+    axes = query.plot("linear.z", "ticks")
+    try:
+        curves = [line for line in axes.get_lines() if line.get_linestyle() == "-"]
+        at, values = curves[0].get_data()
+        assert np.allclose(at, np.arange(1, 2, 0.01))
+        assert np.array_equal(values, drive.z[100:200])
+        assert np.array_equal(curves[1].get_data()[1], drive.ticks[100:200])
+        legend = axes.get_legend()
+        assert legend is not None
+        assert [text.get_text() for text in legend.get_texts()] == ["linear.z", "ticks"]
+        assert query.counters.messages == 100
+        assert query.plot("linear.x", ax=axes) is axes
+        assert len(plt.get_fignums()) == 1
+        with pytest.raises(UsageError, match="Name a field"):
+            query.plot(ax=axes)
+    finally:
+        plt.close("all")
+
+
+def curves_of(found: list[Line]) -> str:
+    return figure(found, size=(500, 300), form="svg").decode()
+
+
+def test_names_are_no_formulas_and_letters_may_lack() -> None:
+    names = ["$x", "_hidden", "a$b^$\\frac", "\x1b[31m", "日本 \U0001f916"]
+    found = [made([0, 1], [0, 1], name, "$\\topic$") for name in names]
+    text = curves_of(found)
+    assert "$\\topic$" in text
+    for name in names:
+        want = name.replace("\x1b", "\N{REPLACEMENT CHARACTER}")
+        assert f">{want}<" in text.replace("&amp;", "&")
+    assert "$x" in curves_of(found[:1])
+    assert figure(found, size=(500, 300), form="png").startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("length", "unit"),
+    [(299, "seconds"), (301, "minutes"), (10_801, "hours"), (259_201, "days")],
+)
+def test_units_of_time(length: float, unit: str) -> None:
+    assert f">{unit} since " in curves_of([made([0, length], [0, 1])])
+
+
+def test_odd_lines() -> None:
+    assert "svg" in curves_of([])
+    assert "svg" in curves_of([made([], [])])
+    assert "svg" in curves_of([made([0, 1], [NAN, NAN]), made([0], [np.inf])])
+    # Above ten lines, colours are those of a map.
+    many = [made([0, 1], [n, n], f"f{n}") for n in range(12)]
+    assert len({*re.findall(r"stroke: (#[0-9a-f]{6}); stroke-width: 1\.2", curves_of(many))}) == 12
+
+
+def test_values_between_two_gaps_are_marked() -> None:
+    series = made([0, 1, 2, 3, 4, 5, 6], [1, NAN, 2, 3, NAN, np.inf, 7]).series
+    assert series.alone().tolist() == [True, False, False, False, False, False, True]
+
+
+def test_corners_of_a_line() -> None:
+    times, least = np.array([10, 20, 30]), np.array([0.0, NAN, 2.0])
+    times_, values = Series("x", times, least, least + 1, False).polyline()
+    assert times_.tolist() == [10, 10, 20, 20, 30, 30]
+    assert np.array_equal(values, [0, 1, NAN, NAN, 2, 3], equal_nan=True)
+
+
+def test_columns_of_text() -> None:
+    series = made([0, 1, 2, 3, 8, 9], [2, 4, NAN, 6, 8, np.inf]).series
+    assert series.by_column(3).tolist() == pytest.approx([4, NAN, 8], nan_ok=True)
+    assert len(series.by_column(99)) == 6
+    assert np.isnan(made([], []).series.by_column(5)).tolist() == [True]
+    assert made([5], [3]).series.by_column(5).tolist() == [3]
+
+
+def test_without_matplotlib(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def refusing(name: str, *others: Any, **more: Any) -> Any:
+        if name.split(".", maxsplit=1)[0] == "matplotlib":
+            raise ImportError(name)
+        return real(name, *others, **more)
+
+    monkeypatch.setattr(builtins, "__import__", refusing)
+    ask = ("-t", "drive", "--fields", "y")
+    with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[plot\]'"):
+        drive.store.topic("drive").plot("y")
+    plot(drive, *ask, "-o", tmp_path / "y.png", code=MissingDependencyError.exit_code)
+    assert [*tmp_path.iterdir()] == []
+    plot(drive, *ask, "-o", tmp_path / "y.html")
+    assert plot(drive, *ask).lines
+
+
+def test_sparklines(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert sparkline(np.array([0, 1, 2, 3, 4, 5, 6, 7.0])) == "▁▂▃▄▅▆▇█"
+    assert sparkline(np.array([NAN, -1.7e308, 1.7e308, np.inf])) == " ▁█ "
+    assert sparkline(np.array([3.0, 3.0])) == "▅▅"
+    assert sparkline(np.array([])) == ""
+    assert densities(np.array([0, 1, 50, 100])) == " ▁▄█"
+    assert densities(np.array([0, 0])) == "  "
+    assert bar(np.array([False, True, False])) == "█░█"
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
+    assert sparkline(np.array([0, 7.0])) == "_#"
+    assert densities(np.array([0, 1, 8])) == " _#"
+    assert bar(np.array([False, True])) == "#."
+
+
+def test_parts_with_losses(drive: Drive) -> None:
+    (summary,) = (one for one in drive.store.summaries() if one.label == "drive")
+    entry: RecordingEntry = drive.store.entry(summary.id)
+
+    def lost(*rows: tuple[int | None, int | None, int | None, Cause]) -> list[int]:
+        losses = [
+            {"from": first, "to": last, "count": count, "cause": cause}
+            for first, last, count, cause in rows
+        ]
+        end = {**entry.end, "losses": losses}
+        other = RecordingEntry(**{n: getattr(entry, n) for n in entry.__slots__} | {"end": end})
+        return np.flatnonzero(lost_parts(other, (BASE, BASE + 1000), 10)).tolist()
+
+    cause = Cause.TRANSPORT
+    assert lost((BASE + 100, BASE + 299, 5, cause)) == [1, 2]
+    assert lost((BASE + 100, BASE + 300, None, cause)) == [1, 2, 3]
+    assert lost((BASE - 50, BASE, 1, cause), (BASE + 999, BASE + 5000, 1, cause)) == [0, 9]
+    assert lost((BASE - 50, BASE - 1, 1, cause), (BASE + 1000, BASE + 5000, 1, cause)) == []
+    assert lost((None, None, 5, cause), (BASE, BASE, 0, cause)) == []
+    assert lost((BASE, BASE, 5, Cause.THROTTLE)) == []
