@@ -194,7 +194,8 @@ def _add_read(
             is_unread[row] = True
             continue
         bounds = np.searchsorted(found, edges[low + 1 : high + 1])
-        steps = np.diff(bounds, prepend=0, append=len(found))
+        steps = np.append(bounds, len(found))
+        steps[1:] -= bounds
         begin, end = max(low, 0), min(high + 1, pixels)
         counts[topic, begin:end] += steps[begin - low : end - low]
     return placed.take(is_unread)

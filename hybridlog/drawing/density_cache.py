@@ -32,8 +32,9 @@ _RECORDINGS: Final = 4
 _MOST_BYTES: Final = 24 << 20  # of the blocks of one recording
 _BLOCK: Final = 10  # a block has 2^10 bins
 _STEPS: Final = 4  # of zooming in that are drawn from the same bins
-_MOST_BINS: Final = 1 << 22  # that are counted for one picture
+_MOST_BINS: Final = 1 << 21  # that are counted for one picture
 _LIGHT: Final = 1 << 20  # messages that are read for finer bins in any case
+_DEARER: Final = 4  # times more messages that finer bins may cost
 _LATEST: Final = np.iinfo(np.int64).max
 
 
@@ -192,7 +193,7 @@ class _Recorded:
             if plain is None:
                 plain = reading_work(chunks, topics, _edges(level, begin, end))
             work = reading_work(chunks, topics, _edges(fine, begin << steps, end << steps))
-            if work <= min(max(2 * plain, _LIGHT), MOST_WORK):
+            if work <= min(max(_DEARER * plain, _LIGHT), MOST_WORK):
                 return fine
         return level
 

@@ -325,6 +325,7 @@ def test_keys_alone(page: Page, demo_url: str) -> None:
     page.keyboard.press("ArrowRight")
     until(page, "Number(document.querySelector('.density').ariaValueNow) > 0")
     assert cursor(page) == pytest.approx(length * SECOND / 50, rel=0.01)
+    page.locator(".density").focus()
     page.keyboard.press("+")
     page.keyboard.press("PageDown")
     until(page, "location.hash.includes('begin=')")

@@ -11,7 +11,7 @@ const UPDATE_MS = 80; // panels cannot follow every frame
 const HELP = [
   ["Space", "play or pause"],
   ["← →", "move the cursor; with Shift, in small steps"],
-  ["Page Up, Page Down", "move the visible range"],
+  ["Page Up, Page Down", "move the visible range, in the timeline"],
   ["+ −", "zoom at the cursor; the wheel zooms at the pointer"],
   ["0", "show the whole recording"],
   ["Home, End", "first and last message; a running recording is followed from its end"],
@@ -116,6 +116,8 @@ export function mountPlayer(parent, recording) {
     if (event.ctrlKey || event.metaKey || event.altKey || dialog.open) return;
     const { target, key } = event;
     if (target.closest("input, textarea, select, [contenteditable]")) return;
+    // Elsewhere these scroll the page.
+    if (key.startsWith("Page") && !target.closest(".timeline")) return;
     const isButton = target.closest("button, a, summary") !== null;
     if (isButton && (key === " " || key === "Enter")) return;
     const { begin, end } = visible(recording);

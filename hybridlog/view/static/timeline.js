@@ -205,15 +205,16 @@ export function mountTimeline(parent, recording) {
     drawCursor(picture, paints);
   }
 
+  /** Bands with edges, for what holds for a while. */
   function drawBands({ context, width, height, toX }, paints) {
-    context.fillStyle = paints.held;
-    context.strokeStyle = paints.mark;
-    for (const { bands, ticks } of overlays.all()) {
-      for (const [begin, end] of bands) {
-        const [low, high] = [Math.max(toX(begin), -2), Math.min(toX(end), width + 2)];
-        if (high > 0 && low < width) context.fillRect(low, 0, Math.max(high - low, 1), height);
-      }
-      if (!bands.length) for (const [time] of ticks) line(context, toX(time), 0, 4);
+    for (const [begin, end] of overlays.all().flatMap(({ bands }) => bands)) {
+      const [low, high] = [Math.max(toX(begin), -2), Math.min(toX(end), width + 2)];
+      if (high < 0 || low > width) continue;
+      context.fillStyle = paints.held;
+      context.fillRect(low, 0, Math.max(high - low, 1), height);
+      context.fillStyle = paints.faint;
+      context.fillRect(low, 0, 1, height);
+      context.fillRect(Math.max(high - 1, low), 0, 1, height);
     }
   }
 
@@ -256,8 +257,9 @@ export function mountTimeline(parent, recording) {
     }
     context.fillStyle = paints.mark;
     for (const { at } of marks) flag(context, toX(at));
+    context.fillStyle = paints.text;
     for (const { ticks } of overlays.all()) {
-      for (const [time] of ticks) context.fillRect(Math.round(toX(time)), AXIS - 7, 1.5, 7);
+      for (const [time] of ticks) context.fillRect(Math.round(toX(time)) - 0.5, AXIS - 6, 1.5, 6);
     }
     context.fillStyle = paints.warn;
     for (const loss of recording.info.losses) {

@@ -18,8 +18,10 @@ export function size(bytes) {
   return `${place ? value.toFixed(1) : value} ${SIZES[place]}`;
 }
 
-/** `1:02:03`, `4.2 s` or `35 ms`, of nanoseconds. */
+/** `1:02:03`, `4.2 s`, `35 ms`, `2.1 µs` or `8 ns`, of nanoseconds. */
 export function duration(ns) {
+  if (ns < 1000) return `${Math.round(ns)} ns`;
+  if (ns < 1e6) return `${(ns / 1000).toFixed(ns < 1e4 ? 1 : 0)} µs`;
   const seconds = ns / 1e9;
   if (seconds < 1) return `${(seconds * 1000).toFixed(seconds < 0.01 ? 2 : 0)} ms`;
   if (seconds < 60) return `${seconds.toFixed(1)} s`;
