@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -217,11 +218,12 @@ def test_a_recording_that_goes_on_is_followed(
         assert at == pytest.approx((live()["end"] - 1) / SECOND)
         recording.close()
         page.wait_for_selector("text=being recorded", state="detached")
-        assert live()["status"] == "complete"
+        ended = live()
+        assert ended["status"] == "complete"
 
     store.mark("live", "+2s", "look <b>here</b>")
     store.refresh()
-    marks = client.get("marks", params={"recording": "live", "begin": 0, "end": found["end"]})
+    marks = client.get("marks", params={"recording": "live", "begin": 0, "end": ended["end"]})
     assert marks.json() == {"marks": [{"at": 2 * SECOND, "text": "look <b>here</b>"}], "more": 0}
 
 
@@ -306,6 +308,50 @@ def test_the_timeline_is_moved_and_zoomed(page: Page, demo_url: str, demo_store:
             assert found == counted(demo_store, topic, low, low + width)
     page.keyboard.press("0")
     until(page, "!location.hash.includes('begin=')")
+
+    # A name opens a panel; the arrows go on to lanes that are out of sight.
+    names = page.locator(".timeline .topic")
+    names.first.focus()
+    for _ in range(15):
+        page.keyboard.press("ArrowDown")
+    topic = page.evaluate("document.activeElement.textContent")
+    assert page.evaluate("document.querySelector('.lanes').scrollTop") > 0
+    page.keyboard.press("Enter")
+    page.get_by_role("article", name=topic).wait_for()
+
+
+@pytest.mark.peer("browser")
+def test_what_is_lost_is_said(
+    page: Page, demo_store: hl.Store, tmp_path: Path, picture_of: Callable[[Page, str], Path]
+) -> None:
+    skipped = shutil.ignore_patterns("mongod*")
+    shutil.copytree(demo_store.directory.path, tmp_path / "store", ignore=skipped)
+    (entry,) = demo_store.recordings()
+    table = demo_store.session.chunk_table(entry, 0)
+    chunk = table.chunks[len(table.chunks) // 2]
+    path = tmp_path / "store" / "recordings" / "robot" / "000000.mcap"
+    content = bytearray(path.read_bytes())
+    content[int(chunk["offset"]) + int(chunk["length"]) // 2] ^= 0xFF
+    path.write_bytes(content)
+    with hl.open(tmp_path / "store") as store:
+        store.verify()
+        store.refresh()
+        (loss,) = [loss for loss in store.entry("robot").end["losses"] if loss["count"]][:1]
+        with served(store) as url:
+            middle = (loss["from"] + loss["to"]) // 2 - store.entry("robot").span[0]
+            page.goto(
+                f"{url}#recording=robot&panels=[]&begin={middle - SECOND}&end={middle + SECOND}"
+            )
+            row = page.locator(".timeline .name").filter(has_text=loss["topic"])
+            row.scroll_into_view_if_needed()
+            lane, box = row.bounding_box(), page.locator(".density").bounding_box()
+            assert lane is not None
+            assert box is not None
+            page.mouse.move(box["x"] + box["width"] / 2, lane["y"] + lane["height"] / 2)
+            tip = page.locator(".tip")
+            tip.filter(has_text=f"{loss['count']} lost ({loss['cause']}").wait_for()
+            assert loss["topic"] in tip.inner_text()
+            picture_of(page, "lost")
 
 
 def hash_of(page: Page) -> dict[str, int]:

@@ -42,6 +42,18 @@ function firstPanels(topics) {
   return found;
 }
 
+/** Shows a panel of a topic: of the first kind that is made for it, unless it is shown already. */
+export function openPanel(recording, name) {
+  const { topics } = recording.info;
+  const topic = topics.find((one) => one.topic === name);
+  const kinds = KINDS.filter(({ accepts }) => accepts(topic));
+  const { kind } = kinds.find(({ isFirst }) => isFirst?.(topic)) ?? kinds[0];
+  const panels = state.get("panels") ?? firstPanels(topics);
+  const panel = { kind, topic: name, options: {} };
+  if (panels.some((one) => isSame(one, panel))) notice("This panel is shown already.");
+  else state.set({ panels: [...panels, panel] });
+}
+
 /** Shows the panels of a recording. Returns a function that takes them away. */
 export function mountPanels(main, recording) {
   const grid = element("section", { class: "panels", "aria-label": "Panels" });

@@ -6,6 +6,7 @@ import { element, fill } from "./dom.js";
 import { countBetween, Lanes } from "./lanes.js";
 import * as overlays from "./overlays.js";
 import { drawLane, hatches, Colours } from "./paint.js";
+import { openPanel } from "./panels.js";
 import { mountPlayer } from "./player.js";
 import { seek, show, visible, zoom } from "./range.js";
 import * as state from "./state.js";
@@ -59,6 +60,7 @@ export function mountTimeline(parent, recording) {
     listen(one, "pointerleave", leave);
   }
   listen(scroller, "scroll", schedule);
+  listen(names, "keydown", step);
   listen(NARROW, "change", () => recorded());
   listen(DARK, "change", () => {
     colours.forget();
@@ -146,15 +148,20 @@ export function mountTimeline(parent, recording) {
   function drawNames() {
     const height = rowHeight();
     const { first, topics: shown } = seen();
+    const drawn = JSON.stringify([height, first, shown.map(({ topic, messages }) => [topic, messages])]);
+    if (drawn === names.dataset.drawn) return; // so that a name keeps the focus
+    names.dataset.drawn = drawn;
+    const focused = names.contains(document.activeElement) ? document.activeElement.textContent : null;
     fill(
       names,
       ...shown.map(({ topic, type, messages }, place) => {
-        const group = groupOf(type);
         const said = `${topic}, ${type || "unknown type"}, ${count(messages)} messages`;
+        const open = () => openPanel(recording, topic);
+        const name = { type: "button", class: "plain topic", title: said, onclick: open };
         const row = element(
           "div",
-          { class: "name", title: said, "data-group": group },
-          element("span", { class: "topic" }, topic),
+          { class: "name" },
+          element("button", name, topic),
           element("span", { class: "type" }, shortType(type)),
           element("span", { class: "number" }, count(messages)),
         );
@@ -163,6 +170,27 @@ export function mountTimeline(parent, recording) {
         return row;
       }),
     );
+    if (focused !== null) focusName(focused);
+  }
+
+  function focusName(topic) {
+    const found = [...names.querySelectorAll(".topic")].find((one) => one.textContent === topic);
+    found?.focus({ preventScroll: true });
+  }
+
+  /** Moves from one name to the next one, which may be out of sight. */
+  function step(event) {
+    const by = { ArrowUp: -1, ArrowDown: 1 }[event.key];
+    const from = topics.findIndex(({ topic }) => topic === document.activeElement.textContent);
+    const next = topics[from + by];
+    if (!by || from < 0 || !next) return;
+    event.preventDefault();
+    const [top, height] = [(from + by) * rowHeight(), rowHeight()];
+    if (top < scroller.scrollTop) scroller.scrollTop = top;
+    const below = top + height - scroller.scrollTop - scroller.clientHeight;
+    if (below > 0) scroller.scrollTop += below;
+    drawNames();
+    focusName(next.topic);
   }
 
   /** A canvas in pixels of the device, its context, and a function from times to pixels. */
