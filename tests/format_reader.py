@@ -1,7 +1,7 @@
 """A second reader of stores, written from `docs/format.md` alone.
 
-It shares no code with hybridlog: `struct`, `zlib`, `json` and `zstandard` are all it needs.
-Whatever it reads, it has checked before.
+It shares no code with hybridlog: `struct`, `zlib`, `json` and `zstandard` are all it needs, and
+`pyarrow` for columns of payloads (`format_columns.py`). Whatever it reads, it has checked before.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import zstandard
+
+from tests.format_columns import Columns, WrongColumnsError
 
 MAGIC = b"\x89MCAP0\r\n"
 JOINED_NS = 12 * 10**9
@@ -173,6 +175,8 @@ class Journal:
         self.sealed: dict[int, dict[str, Any]] = {}
         self.replaced: list[tuple[dict[str, Any], dict[str, Any]]] = []
         self.end: dict[str, Any] | None = None
+        self.files: dict[str, dict[str, Any]] = {}  # of columns, by path
+        self.thinned: dict[int, list[tuple[str, int]]] = {}
         self.is_rebuilt = False
         self.is_removing = False
         for line in events:
@@ -217,6 +221,11 @@ class Journal:
                 self.marks.append(line)
             case "adopted":
                 self.store = line["store"]
+            case "compacted":
+                self.files |= {file["file"]: file for file in line.get("files", ())}
+                for one in line.get("segments", ()):
+                    written = one["digest"], one["bytes"]
+                    self.thinned.setdefault(one["segment"], []).append(written)
             case "rebuilt":
                 self.is_rebuilt = True
             case "removing":
@@ -235,6 +244,7 @@ class Segment:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.columns: Columns | None = None
         self.data = path.read_bytes()
         data = self.data
         demand(len(data) > 8 + 29 + 8 and data[-8:] == MAGIC, "no magic at the end")
@@ -277,6 +287,7 @@ class Segment:
         assert table is not None
         self._table(table, start)
         self.about = self._json("hybridlog.recording")[0]
+        self.compacted = next(iter(self._json("hybridlog.compacted")), None)
         self.end = next(iter(self._json("hybridlog.end")), None)
         self.losses = [row for said in self._json("hybridlog.losses") for row in said["rows"]]
 
@@ -307,9 +318,12 @@ class Segment:
             demand(bool(parts) and channels == sorted(set(channels)), "the parts of a chunk")
             demand(chunk.first == min(p.first for p in parts), "the first time of a chunk")
             demand(chunk.last == max(p.last for p in parts), "the last time of a chunk")
-            for part in parts:
+            for part in parts if not self.is_moved(number) else ():
                 counts[part.channel] = counts.get(part.channel, 0) + part.messages
         demand(counts == {c: n for c, n in self._counts.items() if n}, "the statistics")
+
+    def is_moved(self, number: int) -> bool:
+        return self.data[self.chunks[number].offset] == 0x93
 
     def parts_of(self, number: int) -> list[Part]:
         before = sum(chunk.parts for chunk in self.chunks[:number])
@@ -349,8 +363,11 @@ class Segment:
         demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
         is_indexed = zlib.crc32(trailer) == place.trailer_crc
         ((_, opcode, body),) = records(record)
-        demand(opcode == 0x06, "no chunk")
-        content = self._content(Content(body), place)
+        demand(opcode == (0x93 if self.is_moved(number) else 0x06), "no chunk")
+        if self.is_moved(number):
+            content = self._moved(number, Content(body), place)
+        else:
+            content = self._content(Content(body), place)
         messages = list(records(content))
         *indexes, (_, opcode, arrivals) = records(trailer)
         demand(opcode == 0x90, "no arrival record")
@@ -374,6 +391,19 @@ class Segment:
             listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
             demand(sorted(heads) == sorted(listed), "the message indexes")
         self._compare(number, messages)
+
+    def _moved(self, number: int, body: Content, place: Chunk) -> bytes:
+        times = body.take("<Q"), body.take("<Q")
+        demand(times == (place.first, place.last), "the times of a moved chunk")
+        size, crc = body.take("<Q"), body.take("<I")
+        demand(not body.rest() and self.columns is not None, "the record of a moved chunk")
+        assert self.columns is not None
+        try:
+            content = self.columns.content(self.about["segment"], number)
+        except WrongColumnsError as error:
+            raise Damaged(str(error)) from error
+        demand(len(content) == size and zlib.crc32(content) == crc, "the content of a moved chunk")
+        return content
 
     @staticmethod
     def _content(body: Content, place: Chunk) -> bytes:
@@ -448,9 +478,14 @@ class Recording:
             if segment is not None and self._is_believed(number, segment, listed.get(number))
         }
         self.unlisted = self.segments.keys() - listed.keys()
+        for segment in self.segments.values():
+            files = self.journal.files if self.journal is not None else {}
+            files = files or {f["file"]: f for f in (segment.compacted or {}).get("files", ())}
+            segment.columns = Columns(path / "payloads", files, self.id)
         self.end = self._end()
         self.damage = dict(self._damage())
         self.lost = [*self._lost_segments(listed), *self._lost_in_crash(), *self._lost_chunks()]
+        self.lost += self._lost_columns()
         self.status = self._status()
 
     def _id(self, sealed: Mapping[int, Segment | None]) -> str:
@@ -463,8 +498,16 @@ class Recording:
         about = segment.about
         if about["format"] != 2 or (about["id"], about["segment"]) != (self.id, number):
             return False
+        if listed is None:
+            return True
+        was = listed["digest"], listed["bytes"]
         are = segment.digest, len(segment.data)
-        return listed is None or are == (listed["digest"], listed["bytes"])
+        assert self.journal is not None
+        if are == was or are in self.journal.thinned.get(number, ()):
+            return True
+        whole = segment.compacted or {}
+        said = whole.get("digest"), whole.get("bytes")
+        return not self.journal.is_proof and said == was
 
     def _end(self) -> dict[str, Any] | None:
         if self.journal is not None and self.journal.end is not None:
@@ -505,11 +548,28 @@ class Recording:
     def _lost_chunks(self) -> Iterator[dict[str, Any]]:
         for number, chunk in self.damage:
             segment = self.segments[number]
+            if segment.is_moved(chunk):
+                continue
             place = segment.chunks[chunk]
             for part in segment.parts_of(chunk):
                 topic = segment.channels[part.channel][1]
                 about = (part.messages, topic, part.first, part.last)
                 yield _row(segment.path.name, place.offset, place.length, *about)
+
+    def _lost_columns(self) -> Iterator[dict[str, Any]]:
+        moved: dict[str, list[Part]] = {}
+        for segment in self.segments.values():
+            for chunk in filter(segment.is_moved, range(len(segment.chunks))):
+                for part in segment.parts_of(chunk):
+                    moved.setdefault(segment.channels[part.channel][1], []).append(part)
+        for file in self.journal.files.values() if self.journal is not None else ():
+            path = self.path / "payloads" / file["file"]
+            is_there = path.is_file() and path.stat().st_size == file["bytes"]
+            parts = moved.get(file["topic"], [])
+            if parts and not is_there:
+                times = min(p.first for p in parts), max(p.last for p in parts)
+                about = (file["messages"], file["topic"], *times)
+                yield _row(f"payloads/{file['file']}", None, file["bytes"], *about)
 
     def _status(self) -> str:
         if self._is_held() and (self.end is None or self.open):
