@@ -91,6 +91,7 @@ SLOW = frozenset(
         "cli/test_stopping.py",
         "cli/test_terminal.py",
         "demo/test_tour.py",
+        "drawing/test_plot.py",
         "export/test_base.py",
         "faults/test_some.py",
         "live/sources/test_ros2_live.py",
