@@ -9,6 +9,7 @@ import { follow } from "./follow.js";
 import { opening } from "./python.js";
 
 const PIXELS = 2000; // steps of time of a track
+const REST = 10; // times as long as the last track took
 const NEAR = 12; // pixels within which a click means the track
 const TYPES = new Set([
   "sensor_msgs/NavSatFix",
@@ -57,7 +58,9 @@ function mount(body, panel) {
   let detail = null; // of the visible range, if that shows more
   let wanted = ""; // the range that was asked for last
   let fix = null;
-  let messages = -1;
+  let messages = -1; // of the topic when the track was asked for
+  let rested = 0; // when the track may be asked for again
+  let timer = 0;
   let isGone = false;
 
   const drawn = plane(place, { label: `Track of ${panel.topic.topic}`, paint, pick });
@@ -69,7 +72,11 @@ function mount(body, panel) {
       describe();
       drawn.redraw();
     },
-    fail: refuse,
+    fail(error) {
+      fix = null;
+      facts.textContent = error.message;
+      drawn.redraw();
+    },
     recording: panel.recording,
   });
   update();
@@ -77,6 +84,7 @@ function mount(body, panel) {
     update,
     destroy() {
       isGone = true;
+      clearTimeout(timer);
       following.destroy();
       drawn.destroy();
     },
@@ -84,28 +92,34 @@ function mount(body, panel) {
 
   function update() {
     following.want(panel.cursor());
-    if (messages !== panel.topic.messages) {
-      messages = panel.topic.messages;
-      load();
-    } else {
-      look();
-    }
+    const { topics } = panel.recording.info;
+    const now = topics.find(({ topic }) => topic === panel.topic.topic)?.messages;
+    clearTimeout(timer);
+    if (now === messages) look();
+    else if (performance.now() >= rested) load(now);
+    else timer = setTimeout(update, rested - performance.now());
     drawn.redraw();
   }
 
-  async function load() {
+  async function load(now) {
+    messages = now;
+    rested = Infinity;
+    const begun = performance.now();
     try {
       const found = unpack(await bytes("track", { ...asked, pixels: PIXELS }));
       if (isGone) return;
       track = found;
+      wanted = "";
       problem.hidden = true;
       place.hidden = false;
       drawn.fit(boxOf(track.arrays.xy));
       describe();
-      look();
     } catch (error) {
       refuse(error);
     }
+    // A track that grows is asked for again, but not all the time.
+    rested = performance.now() + REST * (performance.now() - begun);
+    if (!isGone) update();
   }
 
   /** Asks for more of the visible range than the whole track shows. */

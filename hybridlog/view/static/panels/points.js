@@ -2,7 +2,8 @@
 
 import { bytes } from "../api.js";
 import { element, fill } from "../dom.js";
-import { coloursOf, packedColours, paintScale, sameColour, themeOf } from "../spatial/colours.js";
+import { Colours } from "../paint.js";
+import { coloursOf, onTheme, packedColours, paintScale, sameColour } from "../spatial/colours.js";
 import { unpack } from "../spatial/packed.js";
 import { metres, plane } from "../spatial/plane.js";
 import { count, offset } from "../words.js";
@@ -72,6 +73,11 @@ function mount(body, panel) {
   let isGone = false;
   let asked = chosen();
 
+  const paints = new Colours(place);
+  const endTheme = onTheme(() => {
+    paints.forget();
+    drawn?.show(found.arrays.xyz, colours());
+  });
   const following = follow({
     load,
     show: (answer) => show(answer),
@@ -90,6 +96,7 @@ function mount(body, panel) {
     },
     destroy() {
       isGone = true;
+      endTheme();
       following.destroy();
       drawn?.destroy();
     },
@@ -209,7 +216,7 @@ function mount(body, panel) {
     if (arrays.value && scale) {
       return coloursOf(arrays.value, { low: scale.low - base, high: scale.high - base });
     }
-    return sameColour(arrays.xyz.length / 3, themeOf(place).accent);
+    return sameColour(arrays.xyz.length / 3, paints.all().accent);
   }
 
   function describe() {

@@ -1,19 +1,4 @@
-/** Colours of the style sheet as a canvas needs them, and colours for values. */
-
-import { element } from "../dom.js";
-
-/** The colours of the style sheet, as they are now, by the name of their variable. */
-export function themeOf(place) {
-  const probe = element("span", { hidden: true });
-  place.append(probe);
-  const found = {};
-  for (const name of ["ground", "raised", "text", "faint", "line", "accent", "warn", "mark"]) {
-    probe.style.color = `var(--${name})`;
-    found[name] = getComputedStyle(probe).color;
-  }
-  probe.remove();
-  return found;
-}
+/** Colours for values, and turns from dark to light. */
 
 /** Calls back when the page turns dark or light. Returns a function that ends this. */
 export function onTheme(callback) {

@@ -1,7 +1,8 @@
 /** A plane seen from above, with a grid in metres, which can be moved and zoomed. */
 
 import { element } from "../dom.js";
-import { onTheme, themeOf } from "./colours.js";
+import { Colours } from "../paint.js";
+import { onTheme } from "./colours.js";
 
 const LEAST_SCALE = 1e-6; // pixels a metre
 const MOST_SCALE = 1e5;
@@ -54,7 +55,7 @@ export function plane(parent, { label, paint, pick }) {
   });
   parent.append(canvas);
   const context = canvas.getContext("2d");
-  let theme = null;
+  const colours = new Colours(parent);
   let centre = { x: 0, y: 0 };
   let scale = 20;
   let box = null;
@@ -73,7 +74,7 @@ export function plane(parent, { label, paint, pick }) {
   });
   watching.observe(canvas);
   const endTheme = onTheme(() => {
-    theme = null;
+    colours.forget();
     redraw();
   });
 
@@ -82,7 +83,7 @@ export function plane(parent, { label, paint, pick }) {
     y: (up) => size.height / 2 - (up - centre.y) * scale,
     scale,
     ...size,
-    theme,
+    theme: colours.all(),
   });
 
   function show() {
@@ -102,7 +103,6 @@ export function plane(parent, { label, paint, pick }) {
     pending = 0;
     context.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
     context.clearRect(0, 0, size.width, size.height);
-    theme ??= themeOf(parent);
     const seen = view();
     paintGrid(context, seen, centre);
     paint(context, seen);

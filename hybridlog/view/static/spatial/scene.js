@@ -15,7 +15,8 @@ import {
   WebGLRenderer,
 } from "../vendor/three.module.min.js";
 import { element } from "../dom.js";
-import { onTheme, themeOf } from "./colours.js";
+import { Colours } from "../paint.js";
+import { onTheme } from "./colours.js";
 import { follow, niceStep } from "./plane.js";
 
 // Colours are drawn as they are given, as on the rest of the page.
@@ -62,6 +63,7 @@ export function scene(parent, { label }) {
   const axes = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ vertexColors: true }));
   world.add(grid, axes, cloud);
 
+  const paints = new Colours(parent);
   let eye = { ...START, distance: 10, target: [0, 0, 0] };
   let whole = { centre: [0, 0, 0], radius: 5, floor: 0 };
   let isOwn = false;
@@ -80,7 +82,8 @@ export function scene(parent, { label }) {
   paint();
 
   function paint() {
-    const theme = themeOf(parent);
+    paints.forget();
+    const theme = paints.all();
     world.background = new Color(theme.raised);
     grid.material.color = new Color(theme.line);
     redraw();
