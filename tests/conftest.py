@@ -149,7 +149,9 @@ SLOW = frozenset(
         "test_sensor_messages.py",
         "test_sizes.py",
         "test_style.py",
+        "view/test_guard.py",
         "view/test_mcap.py",
+        "view/test_spatial.py",
     )
 )
 """Files left out by `-m "not slow"`: with them, a run takes ten minutes instead of one."""

@@ -37,6 +37,7 @@ class ViewServer:
             import uvicorn
 
             from hybridlog.view.app import make_app
+            from hybridlog.view.connection import BoundedConnection
             from hybridlog.view.guard import new_token
         except ModuleNotFoundError as error:
             raise MissingDependencyError(
@@ -51,6 +52,7 @@ class ViewServer:
             log_level="critical",
             access_log=False,
             lifespan="off",
+            http=BoundedConnection,
             ws="none",
             server_header=False,
             limit_concurrency=_MAX_CONNECTIONS,
