@@ -160,7 +160,7 @@ def test_other_hosts_are_refused(door: Door, host: str) -> None:
     assert door.below("recordings", host=host.format(port=door.port)).status in {400, 421}
 
 
-def test_one_host_must_be_named(door: Door) -> None:
+def test_one_host_and_origin_are_named(door: Door) -> None:
     line = f"GET /{door.token}/recordings HTTP/1.{{}}\r\n"
     host = f"Host: 127.0.0.1:{door.port}\r\n"
     end = "Connection: close\r\n\r\n"
@@ -168,6 +168,10 @@ def test_one_host_must_be_named(door: Door) -> None:
         heard = door.say((line.format(minor) + hosts + end).encode())
         assert heard.split(b" ")[1] in {b"400", b"421"}, (minor, hosts)
     assert door.say((line.format(1) + host + end).encode()).split(b" ")[1] == b"200"
+    own = f"Origin: http://127.0.0.1:{door.port}\r\n"
+    for origins in (own + "Origin: https://evil.example\r\n", own + own):
+        heard = door.say((line.format(1) + host + origins + end).encode())
+        assert heard.split(b" ")[1] == b"400"
     # With an absolute address, the Host header still counts.
     for named, code in (("127.0.0.1", b"404"), ("evil.example", b"404")):
         absolute = f"GET http://{named}:{door.port}/{door.token}/ HTTP/1.1\r\n{host}{end}"
@@ -206,7 +210,8 @@ def test_other_origins_are_refused(door: Door, headers: dict[str, str]) -> None:
 )
 def test_only_get_is_answered(door: Door, method: str) -> None:
     for path in ("recordings", "", "app.js"):
-        assert door.below(path, method=method).status == 405
+        answer = door.below(path, method=method)
+        assert (answer.status, b"never changes the store" in answer.body) == (405, True)
         assert door.below(path, {"Content-Length": "1000000"}, method=method).status == 405
     assert door.ask("/x/recordings", method=method).status == 404
     head = door.below("recordings", method="HEAD")
