@@ -82,7 +82,7 @@ ALLOWED = {
     "rosbags": ("hybridlog.demo", "hybridlog.export", "hybridlog.schema"),
     "sqlite3": ("hybridlog.sources.rosbag2_sqlite", "hybridlog_storage.catalog"),
     "starlette": ("hybridlog.view",),
-    "uvicorn": ("hybridlog.view.server",),
+    "uvicorn": ("hybridlog.view.connection", "hybridlog.view.server"),
     "websockets": (
         "hybridlog.playback.server",
         "hybridlog.live.sources.foxglove.connection",
