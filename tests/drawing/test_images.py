@@ -368,3 +368,14 @@ def test_png_of_a_photograph_is_compressed() -> None:
     rows, columns = np.mgrid[:200, :300]
     smooth = ((rows + columns) // 2 % 256).astype(np.uint8)
     assert len(png(smooth)) < smooth.size / 20
+
+
+@pytest.mark.parametrize("side", [8200, 14_000])
+def test_a_small_file_with_very_many_pixels_is_no_picture_for_the_eye(side: int) -> None:
+    file = io.BytesIO()
+    Pillow.new("1", (side, side)).save(file, "PNG")
+    vast = compressed("png", file.getvalue())
+    assert len(file.getvalue()) < 1 << 17
+    with pytest.raises(PayloadError, match="too large to be shown"):
+        picture(vast, raw=False)
+    assert picture(vast).data == file.getvalue()
