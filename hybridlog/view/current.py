@@ -53,9 +53,9 @@ def current(context: Context, asked: Asked) -> Current:
     message = topic.at(moment)
     # Of messages with the same time, the last one is current: the next one is later.
     later = moment if message is None else message.log_time_ns + 1
-    following = next(topic.messages(later), None)
+    until = topic.next_time(later)
     return Current(
         message,
         None if message is None else message.log_time_ns - topic.start,
-        None if following is None else following.log_time_ns - topic.start,
+        None if until is None else until - topic.start,
     )

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from hybridlog.drawing.flushed import END
+from hybridlog.query.answers.next_time import next_time
 from hybridlog.query.question import field_types
 from hybridlog.view.context import start_of
 from hybridlog_storage.errors import TimeError, TopicError
@@ -39,6 +41,7 @@ class Topic:
     def __init__(self, context: Context, asked: Asked) -> None:
         entry = context.recording(asked)
         name = asked.text("topic")
+        self._session, self._entry, self._name = context.store.session, entry, name
         self.start = start_of(entry)
         self.flushed: Flushed | None = None
         self.query: Query | None = None
@@ -65,13 +68,25 @@ class Topic:
             return self.query.field_types()
         return field_types(tuple(self.flushed.channels)) if self.flushed is not None else {}
 
-    def messages(self, begin: int = 0) -> Iterator[Message]:
-        """Its messages from a log time on, ns."""
+    def messages(self, begin: int, most: int) -> Iterator[Message]:
+        """Its first messages from a log time on, ns: at most so many."""
+        rest = most
         with suppress(TimeError):  # the query has none from there on
             if self.query is not None:
-                yield from self.query.between(begin)
+                for message in self.query.between(begin).limit(most):
+                    rest -= 1
+                    yield message
         if self.flushed is not None:
-            yield from self.flushed.messages((begin, END))
+            yield from islice(self.flushed.messages((begin, END)), rest)
+
+    def next_time(self, moment: int) -> int | None:
+        """The least log time of its messages that is not before a time, ns."""
+        found = next_time(self._session, self._entry, self._name, moment)
+        if self.flushed is not None:
+            later = next(self.flushed.messages((moment, END)), None)
+            if later is not None and (found is None or later.log_time_ns < found):
+                return later.log_time_ns
+        return found
 
     def at(self, moment: int) -> Message | None:
         """The last message not after a log time, ns."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,10 @@ from starlette.testclient import TestClient
 import hybridlog as hl
 from hybridlog.drawing.series import series
 from hybridlog.drawing.tree import MAX_SHOWN, tree
+from hybridlog.query.answers.next_time import next_time
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
 from tests.every_image import (
     BROKEN,
     COMPRESSED,
@@ -42,7 +46,8 @@ def test_the_message_is_the_one_that_the_store_has_at_a_time(
     (entry,) = demo_store.recordings()
     assert entry.span is not None
     start = entry.span[0]
-    for topic in ("/base/scan", "/tf_static", "/r_gripper_controller/command", "/rosout"):
+    topics = ("/base/scan", "/tf_static", "/rosout", "/camera/front/image_raw")
+    for topic in (*topics, "/r_gripper_controller/command"):
         query = demo_store.topic(topic)
         times = query.to_arrow()["log_time"].cast("int64").to_numpy()
         for at in (-S, 0, 51 * MS, 5 * S, int(times[2 % len(times)]) - start, 19 * S, 60 * S):
@@ -237,3 +242,23 @@ def test_what_is_not_there_is_not_found(odd: TestClient, path: str) -> None:
     for recording, topic in (("odd", "/scan"), ("odd", "own"), ("even", "/own"), ("", HOSTILE)):
         answer = odd.get(path, params={"recording": recording, "topic": topic, **asked})
         assert answer.status_code == 404
+
+
+def test_the_next_time_is_found_in_any_chunk(tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    # Late messages, pauses of hours and messages at the same time, in chunks of a few messages.
+    steps = rng.choice([0, 0, 1, 10, -5, 1000, 10_000_000], 400)
+    times = np.maximum(START + np.cumsum(steps) * MS, START)
+    channels = [Channel(name, "json", None) for name in ("/a", "/b")]
+    with hl.open(tmp_path / "store", create=True) as store:
+        settings = SegmentSettings(chunk_size=1024, segment_size=1 << 16)
+        with store.start("late", settings=settings) as recording:
+            for n, time in enumerate(times.tolist()):
+                recording.write(channels[n % 3 == 0], b'{"n": 1, "text": "x"}', log_time=time)
+        entry = store.entry("late")
+        own = np.sort(times[np.arange(400) % 3 == 0])
+        for moment in {0, *(own[::7] - 1).tolist(), *own[::7].tolist(), *(own[::7] + 1).tolist()}:
+            later = own[own >= moment]
+            found = next_time(store.session, entry, "/b", moment)
+            assert found == (int(later[0]) if len(later) else None)
+        assert next_time(store.session, entry, "/c", 0) is None

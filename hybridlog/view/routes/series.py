@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.fields import fields_of
 from hybridlog.drawing.series import series as read_series
+from hybridlog.query.answers.infer_fields import SAMPLE
 from hybridlog.view.context import route
 from hybridlog.view.topic import Topic
 from hybridlog_storage.errors import UsageError
@@ -25,7 +26,7 @@ MAX_FIELDS: Final = 16
 def fields(context: Context, asked: Asked) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
     topic = Topic(context, asked)
-    found = fields_of(topic.field_types(), topic.messages())
+    found = fields_of(topic.field_types(), topic.messages(0, SAMPLE))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
