@@ -23,6 +23,7 @@ MAX_POINTS: Final = 500_000
 COLOUR: Final = "rgb"
 """Name of the values that are colours: red * 65536 + green * 256 + blue."""
 _MAX_VALUES = 64
+_BLOCK = 1 << 18  # points that are looked at together, which bounds the memory
 _FAR = 8192.0  # m; from here on float32 has steps of a millimetre
 _AXES = ("x", "y", "z")
 _NONE: Final = np.empty(0)
@@ -97,45 +98,62 @@ def points(
 def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, limit: int) -> Points:
     is_scan = hasattr(decoded, "ranges")
     remarks: list[str] = []
-    dropped: dict[str, int] = {}
+    least, greatest = _bounds_of_ranges(decoded, remarks)
+    pose = getattr(decoded, "pose", None)
+
+    def axes_of(part: NDArray[Any]) -> list[NDArray[Any]]:
+        return _posed(_scanned(part) if is_scan else _axes(part), pose)
+
     with np.errstate(over="ignore", invalid="ignore"):
-        axes = _scanned(rows) if is_scan else _axes(rows)
-        axes = _posed(axes, getattr(decoded, "pose", None))
-        origin = tuple(_origin(axis) for axis in axes)
-        near = [(axis - base).astype(np.float32) for axis, base in zip(axes, origin, strict=True)]
-        finite = np.isfinite(near[0]) & np.isfinite(near[1]) & np.isfinite(near[2])
-        chosen = finite
-        if is_scan and hasattr(decoded, "range_min"):
-            chosen = finite & _in_range(rows["range"], decoded, remarks)
-    if not finite.all():
-        dropped["not finite"] = int(len(rows) - np.count_nonzero(finite))
-    outside = int(np.count_nonzero(finite) - np.count_nonzero(chosen))
-    if outside:
-        dropped["out of range"] = outside
-    places = np.flatnonzero(chosen)
-    every = max(1, -(-len(places) // max(limit, 1)))
-    places = places[::every]
-    xyz = np.stack([axis[places] for axis in near], axis=1)
-    offered = _offered(rows[places])
-    with np.errstate(over="ignore", invalid="ignore"):
-        taken = {
+        origin = tuple(_origin(axis) for axis in axes_of(_some(rows)))
+
+        def near(part: NDArray[Any]) -> NDArray[np.float32]:
+            axes = zip(axes_of(part), origin, strict=True)
+            return np.stack([(axis - base).astype(np.float32) for axis, base in axes], axis=1)
+
+        chosen = np.empty(len(rows), np.bool_)
+        finite = 0
+        for begin in range(0, len(rows), _BLOCK):
+            part = rows[begin : begin + _BLOCK]
+            is_finite = np.isfinite(near(part)).all(axis=1)
+            finite += int(np.count_nonzero(is_finite))
+            if is_scan:
+                is_finite &= (part["range"] >= least) & (part["range"] <= greatest)
+            chosen[begin : begin + _BLOCK] = is_finite
+        count = int(np.count_nonzero(chosen))
+        every = max(1, -(-count // max(limit, 1)))
+        taken = rows[_every(chosen, every)]
+        xyz = near(taken)
+        offered = _offered(taken)
+        chosen_values = {
             name: _relative(column) if name != COLOUR else (column.astype(np.float32), 0.0)
             for name, column in offered.items()
             if values is None or name in values
         }
+    dropped = {"not finite": len(rows) - finite, "out of range": finite - count}
     return Points(
         xyz=xyz,
-        values={name: value for name, (value, _) in taken.items()},
+        values={name: value for name, (value, _) in chosen_values.items()},
         frame=_frame(decoded),
         names=tuple(offered),
         total=len(rows),
-        dropped=dropped,
+        dropped={why: number for why, number in dropped.items() if number},
         every=every,
         origin=(origin[0], origin[1], origin[2]),
-        bases={name: base for name, (_, base) in taken.items()},
+        bases={name: base for name, (_, base) in chosen_values.items()},
         is_flat=is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
         remarks=tuple(remarks),
     )
+
+
+def _every(chosen: NDArray[np.bool_], step: int) -> NDArray[np.intp]:
+    """Places of every n-th that is chosen, from the first one on."""
+    found, seen = [np.empty(0, np.intp)], 0
+    for begin in range(0, len(chosen), _BLOCK):
+        places = np.flatnonzero(chosen[begin : begin + _BLOCK])
+        found.append(places[-seen % step :: step] + begin)
+        seen += len(places)
+    return np.concatenate(found)
 
 
 def _scanned(rows: NDArray[Any]) -> list[NDArray[Any]]:
@@ -201,15 +219,18 @@ def _origin(axis: NDArray[Any]) -> float:
     return float(round(middle)) if far > _FAR and far > 2 * (high - low) else 0.0
 
 
-def _in_range(ranges: NDArray[np.float32], scan: Any, remarks: list[str]) -> NDArray[np.bool_]:
-    """True for ranges that the scanner can measure."""
+def _bounds_of_ranges(scan: Any, remarks: list[str]) -> tuple[np.float32, np.float32]:
+    """Least and greatest range that the scanner can measure, m."""
+    everything = np.float32(-np.inf), np.float32(np.inf)
+    if not hasattr(scan, "range_min"):
+        return everything
     least, greatest = np.float32(scan.range_min), np.float32(scan.range_max)
-    if not least < greatest:
-        remarks.append(
-            f"range_min {least:g} is not below range_max {greatest:g}: every finite range is drawn."
-        )
-        return np.ones(len(ranges), np.bool_)
-    return (ranges >= least) & (ranges <= greatest)
+    if least < greatest:
+        return least, greatest
+    remarks.append(
+        f"range_min {least:g} is not below range_max {greatest:g}: every finite range is drawn."
+    )
+    return everything
 
 
 def _offered(rows: NDArray[Any]) -> dict[str, NDArray[Any]]:

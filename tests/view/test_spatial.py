@@ -311,6 +311,14 @@ def test_a_cloud_is_drawn_in_space(page: Page, url: str) -> None:
     assert view(page, "scene") == before
     page.get_by_role("button", name="From above").click()
     page.wait_for_selector(".space[data-drawing='flat']")
+    page.get_by_role("button", name="In space").click()
+    page.wait_for_selector(".space[data-drawing='space']")
+    # Browsers take WebGL from a page that has many scenes.
+    canvas.evaluate(
+        "one => one.getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+    )
+    page.wait_for_selector(".space[data-drawing='flat']")
+    assert "too much with WebGL: points are shown from above" in page.locator(".facts").inner_text()
 
 
 def pixels(png: bytes, colour: tuple[int, int, int]) -> int:

@@ -150,11 +150,17 @@ function mount(body, panel) {
 
   function made() {
     try {
-      if (!isFlat()) return deep(module, place, panel);
+      if (!isFlat()) return deep(module, place, panel, lost);
     } catch (error) {
       without = `${error.message}: points are shown from above.`;
     }
     return flat(place, panel);
+  }
+
+  /** Browsers draw few scenes at a time, and take WebGL from the oldest one. */
+  function lost() {
+    without = "The browser draws too much with WebGL: points are shown from above.";
+    show(found);
   }
 
   function isAbove() {
@@ -319,8 +325,8 @@ function flat(place, panel) {
 }
 
 /** Points in space. */
-function deep(module, place, panel) {
-  const made = module.scene(place, { label: `Points of ${panel.topic.topic}` });
+function deep(module, place, panel, lost) {
+  const made = module.scene(place, { label: `Points of ${panel.topic.topic}`, lost });
   return {
     isFlat: false,
     fit: made.fit,

@@ -33,10 +33,10 @@ const START = { azimuth: -2.3, height: 0.55 }; // from behind, to the right and 
  * Puts a scene into an element.
  *
  * @param {HTMLElement} parent
- * @param {{label: string}} parts
+ * @param {{label: string, lost: function()}} parts `lost` is called if WebGL ends
  * @throws {Error} this browser has no WebGL
  */
-export function scene(parent, { label }) {
+export function scene(parent, { label, lost }) {
   const canvas = element("canvas", {
     class: "scene",
     tabindex: 0,
@@ -69,6 +69,9 @@ export function scene(parent, { label }) {
   let isOwn = false;
   let pending = 0;
   let step = 1;
+
+  let isGone = false;
+  canvas.addEventListener("webglcontextlost", () => isGone || lost());
 
   const watching = new ResizeObserver(() => {
     const { width, height } = parent.getBoundingClientRect();
@@ -228,6 +231,7 @@ export function scene(parent, { label }) {
       else redraw();
     },
     destroy() {
+      isGone = true;
       cancelAnimationFrame(pending);
       watching.disconnect();
       endTheme();
