@@ -107,6 +107,8 @@ class Planner:
 
     def _files(self, part: Part, need: Need) -> tuple[Engine, ...]:
         """The engines that need no server."""
+        if part.predicate is None and need is Need.OUTCOMES:
+            return *self._catalog, self._tables, self._scan
         if part.predicate is None and need is not Need.VALUES:
             return *self._catalog, self._scan
         if part.recording.payloads:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,18 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.query.answers import rates
 from hybridlog.query.answers.field_statistics import _Running
+from hybridlog.query.counters import Counters
+from hybridlog.query.engines.base import Need, Outcomes
+from hybridlog.query.engines.chunk_index import ChunkIndex
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Part
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs
@@ -25,6 +36,22 @@ from .conftest import BASE, MS, Logs
 def ends(logs: Logs, label: str) -> tuple[int, int]:
     times = [m.time for m in logs.said[label]]
     return min(times), max(times) + 1
+
+
+@pytest.fixture(params=["whole", "in blocks"])
+def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Times come all at once, or a few at a time and are read again for a second look."""
+    if request.param == "whole":
+        return
+    outcomes = Planner.outcomes
+
+    def cut(planner: Planner, part: Part) -> Iterator[Outcomes]:
+        for one in outcomes(planner, part):
+            for begin in range(0, len(one.log_time), 3):
+                yield Outcomes(*(column[begin : begin + 3] for column in one))
+
+    monkeypatch.setattr(Planner, "outcomes", cut)
+    monkeypatch.setattr(rates, "_KEPT", 4)
 
 
 def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
@@ -50,6 +77,7 @@ def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
     ("window", "between", "where"),
     [("100ms", None, None), ("70ms", ("+95ms", "+800ms"), None), ("250ms", None, "on == true")],
 )
+@pytest.mark.usefixtures("blocks")
 def test_rates_by_window(
     logs: Logs, window: str, between: tuple[str, str] | None, where: str | None
 ) -> None:
@@ -85,6 +113,7 @@ def test_rates_by_window(
     ("longer", "periods"), [("12ms", None), (None, 2.5), (None, None), ("9ms", 2.0), ("0s", None)]
 )
 @pytest.mark.parametrize("between", [None, ("+100ms", "+700ms")])
+@pytest.mark.usefixtures("blocks")
 def test_gaps(
     logs: Logs, longer: str | None, periods: float | None, between: tuple[str, str] | None
 ) -> None:
@@ -106,6 +135,47 @@ def test_gaps(
         want += [(a, b) for a, b in pairwise([low, *times, high]) if b - a > limit]
     assert [(gap.begin_ns, gap.end_ns) for gap in found] == sorted(want)
     assert query.counters.chunks_read == 0
+
+
+def test_a_mean_rate_of_some_messages(logs: Logs, blocks: None) -> None:
+    query = logs.store.topic("left/pose").where("on == true")
+    for row in query.rate().to_pylist():
+        times = [m.time for m in logs.of(row["recording"], "/left/pose") if m.fields["on"]]
+        assert (row["begin"].value, row["end"].value - 1) == (times[0], times[-1])
+        assert row["messages"] == len(times)
+
+
+def test_times_of_a_rare_topic_cost_no_payloads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its messages lie in chunks full of others': these are not read for times."""
+    settings = SegmentSettings(chunk_size=4096)
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("a", settings=settings) as recording:
+            for n in range(600):
+                topic = "/rare" if n % 20 == 0 else "/loud"
+                recording.write(Channel(topic, "json", None), b'"%0400d"' % n, log_time=BASE + n)
+        planner = Planner(store.session, store.topic("rare").question, Counters())
+        (part,) = planner.parts()
+        costs = [
+            engine(store.session, Counters()).cost(part, Need.OUTCOMES)
+            for engine in (TablesEngine, ChunkIndex, PayloadScan)
+        ]
+        assert None not in costs
+        assert costs == sorted(costs)  # type: ignore[type-var]
+        assert part.chunks == pytest.approx(30, rel=0.2)
+        query = store.topic("rare")
+        assert sum(row["messages"] for row in query.rate("10ns").to_pylist()) == 30
+        assert query.counters.chunks_read == 0
+
+        # Of very many messages, a share says what the usual period is.
+        sizes: list[int] = []
+        median = np.median
+        monkeypatch.setattr(np, "median", lambda steps: sizes.append(len(steps)) or median(steps))
+        monkeypatch.setattr(rates, "_SAMPLED", 20)
+        assert len(store.topic("loud").gaps(periods=1.5)) == 29
+        assert all(5 < size < 40 for size in sizes)
+        assert sizes
 
 
 def test_a_topic_that_fell_silent(tmp_path: Path) -> None:

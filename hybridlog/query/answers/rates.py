@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
+_KEPT = 1_000_000  # times that are kept for a second look
+_SAMPLED = 1_000_000  # times between messages whose median stands for that of all
 _Columns = dict[str, list["NDArray[Any]"]]
 
 
@@ -103,18 +107,16 @@ class Rates:
         if periods is not None and not 0 < periods < float("inf"):
             raise UsageError(f"A number of periods is more than 0, not {periods}.")
         found: list[tuple[str, NDArray[np.int64]]] = []
-        stretches = [(stretch, self._times(stretch)) for stretch in self._stretches()]
-        periods_of = _periods(stretches) if periods is not None else {}
+        stretches = [(one, _Times(partial(self._times, one))) for one in self._stretches()]
+        medians = _medians(stretches) if periods is not None else {}
         for stretch, times in stretches:
             limit = float(least)
             if periods is not None:
-                median = periods_of.get(stretch.summary.id)
+                median = medians.get(stretch.summary.id)
                 if median is None:
                     continue  # of one message nobody knows when the next one was due
                 limit = max(limit, periods * median)
-            edges = np.concatenate([[stretch.span[0]], times, [stretch.span[1]]])
-            rows = np.stack([edges[:-1], edges[1:], np.zeros(len(edges) - 1, np.int64)], axis=1)
-            found.append((stretch.summary.id, rows[(edges[1:] - edges[:-1]) > limit]))
+            found += [(stretch.summary.id, rows) for rows in _longer(times, stretch.span, limit)]
         return Intervals.of(found)
 
     def _stretches(self) -> Iterator[_Stretch]:
@@ -134,9 +136,11 @@ class Rates:
             first = min((s.first for s in stats if s.first is not None), default=0)
             last = max((s.last for s in stats if s.last is not None), default=0)
         else:
-            times = self._times(stretch)
-            count = len(times)
-            first, last = (int(times[0]), int(times[-1])) if count else (0, 0)
+            count = first = last = 0
+            for times in self._times(stretch):
+                first = first if count else int(times[0])
+                last = int(times[-1])
+                count += len(times)
         if not count:
             first, last = stretch.span[0], stretch.span[1] - 1
         rate = (count - 1) * 1e9 / (last - first) if count > 1 and last > first else np.nan
@@ -155,24 +159,84 @@ class Rates:
             )
         begin = np.arange(low, high, size, dtype=np.int64)
         end = np.append(begin[1:], high)
-        times = self._times(stretch)
-        places = np.searchsorted(times, np.append(begin, high))
-        messages = np.diff(places)
+        messages = np.zeros(len(begin), np.int64)
+        for times in self._times(stretch):
+            inside = times[(times >= low) & (times < high)]
+            if len(inside):
+                windows = (inside - low) // size
+                messages[windows[0] : windows[-1] + 1] += np.bincount(windows - windows[0])
         return begin, end, messages, messages * 1e9 / (end - begin)
 
-    def _times(self, stretch: _Stretch) -> NDArray[np.int64]:
-        """Log times of the matching messages, ns, ascending."""
-        found = [np.empty(0, np.int64)]
-        found += [one.log_time[one.holds] for one in self._planner.outcomes(stretch.part)]
-        times: NDArray[np.int64] = np.concatenate(found)
-        return times
+    def _times(self, stretch: _Stretch) -> Iterator[NDArray[np.int64]]:
+        """Log times of the matching messages, ns, ascending, some at a time."""
+        for one in self._planner.outcomes(stretch.part):
+            times = one.log_time[one.holds]
+            if len(times):
+                yield times
 
 
-def _periods(stretches: Sequence[tuple[_Stretch, NDArray[np.int64]]]) -> dict[str, float]:
-    """Median time from one message to the next in each recording, ns, where there are two."""
+class _Times:
+    """Times that are iterated over more than once; few are kept, many are read again.
+
+    Args:
+        read: Reads them.
+    """
+
+    def __init__(self, read: Callable[[], Iterator[NDArray[np.int64]]]) -> None:
+        self._read = read
+        self._kept: list[NDArray[np.int64]] | None = None
+
+    def __iter__(self) -> Iterator[NDArray[np.int64]]:
+        """int64 arrays, ns, ascending, none of them empty."""
+        if self._kept is not None:
+            yield from self._kept
+            return
+        kept: list[NDArray[np.int64]] = []
+        count = 0
+        for times in self._read():
+            count += len(times)
+            if count <= _KEPT:
+                kept.append(times)
+            else:
+                kept.clear()
+            yield times
+        self._kept = kept if count <= _KEPT else None
+
+
+def _longer(
+    times: Iterable[NDArray[np.int64]], span: Span, limit: float
+) -> Iterator[NDArray[np.int64]]:
+    """Times without messages in a span: int64[k, 3], begin, end and 0 messages.
+
+    Args:
+        times: Times of the messages, ns, ascending.
+        span: `[begin, end)`, ns.
+        limit: Only those that are longer, ns.
+    """
+    before = span[0]
+    for block in chain(times, [np.array([span[1]], np.int64)]):
+        edges = np.concatenate([[before], block])
+        rows = np.flatnonzero(np.diff(edges) > limit)
+        yield np.stack([edges[rows], edges[rows + 1], np.zeros(len(rows), np.int64)], axis=1)
+        before = int(block[-1])
+
+
+def _medians(stretches: Iterable[tuple[_Stretch, _Times]]) -> dict[str, float]:
+    """Median time from one message to the next in each recording, ns, where there are two.
+
+    Of very many, the median of a random share, so that memory does not grow with them.
+    """
     steps: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
     for stretch, times in stretches:
-        steps[stretch.summary.id].append(np.diff(times))
+        chance = min(1.0, _SAMPLED / max(stretch.part.messages, 1))
+        random = np.random.default_rng(0)
+        before: NDArray[np.int64] = np.empty(0, np.int64)
+        for block in times:
+            found = np.diff(np.concatenate([before, block]))
+            if chance < 1.0:
+                found = found[random.random(len(found)) < chance]
+            steps[stretch.summary.id].append(found)
+            before = block[-1:]
     joined = {name: np.concatenate(parts) for name, parts in steps.items()}
     return {name: float(np.median(found)) for name, found in joined.items() if len(found)}
 

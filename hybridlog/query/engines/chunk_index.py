@@ -54,13 +54,9 @@ class ChunkIndex:
             return None
         if part.recording.status == "open":
             return _OPEN_S
-        longest = max((stats.longest for stats in part.stats), default=0)
-        windows = part.log_windows
-        covered = float((windows[:, 1] - windows[:, 0]).sum()) * part.share
-        chunks = min(covered / max(longest, 1) + len(windows), part.recording.chunks)
         if need is Need.OUTCOMES:
-            return _READ_S * chunks + _TIME_S * part.messages * part.share
-        return _ENTRY_S * chunks
+            return _READ_S * part.chunks + _TIME_S * part.messages * part.share
+        return _ENTRY_S * part.chunks
 
     def count(self, parts: Sequence[Part]) -> int:
         """Number of messages in the windows of the parts.

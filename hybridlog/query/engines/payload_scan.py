@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _START_S = 1e-3  # seconds to start
+_CHUNK_S = 5e-4  # seconds to read a chunk with other topics in it
 _BYTE_S = 2e-9  # seconds to read and decompress a byte
 _ROW_S = 1.5e-6  # seconds to decode a message by columns
 _OBJECT_S = 20e-6  # seconds to make a Python object of a message
@@ -37,7 +38,7 @@ class PayloadScan:
         self._counters = counters
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
-        """By bytes and messages; None if only MongoDB understands the predicate."""
+        """By chunks, bytes and messages; None if only MongoDB understands the predicate."""
         if part.predicate is not None:
             from hybridlog.query.message_filter import can_decide
 
@@ -47,7 +48,7 @@ class PayloadScan:
         encodings = {channel.channel.message_encoding for channel in part.channels}
         message_s = _ROW_S if encodings <= _BY_COLUMNS else _OBJECT_S
         each = _BYTE_S * size + message_s * part.messages
-        return _START_S + part.share * each
+        return _START_S + _CHUNK_S * part.chunks + part.share * each
 
     def count(self, parts: Sequence[Part]) -> int:
         """Read the messages and count those that match."""

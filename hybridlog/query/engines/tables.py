@@ -75,8 +75,9 @@ class TablesEngine:
         self, part: Part, need: Need, fields: Collection[str] | None
     ) -> TopicTable | None:
         """The table of a part, if it can answer."""
-        if not part.is_by_log_time or (part.predicate is None and need is not Need.VALUES):
-            return None  # the chunk index knows the times
+        is_known = part.predicate is None and need not in {Need.OUTCOMES, Need.VALUES}
+        if is_known or not part.is_by_log_time:
+            return None  # known from the catalog and the chunk index
         if part.predicate is not None and not can_decide(part.predicate):
             return None
         asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
@@ -123,8 +124,9 @@ class TablesEngine:
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """The outcome for each row, in order."""
-        self.check(part)
-        self._tell_unreadable([part])
+        if part.predicate is not None:
+            self.check(part)
+            self._tell_unreadable([part])
         for rows, holds in self._rows(part):
             yield Outcomes(rows.t, rows.seq, holds)
 
