@@ -9,7 +9,7 @@ not earlier. The ring is taken to hold all of the time before.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -190,18 +190,52 @@ def _kept(
     rows = np.column_stack([spans, np.zeros(len(spans), np.int64)])
     windows = Intervals.of([(recording, rows)]).of_recording(recording)
     for part in parts:
-        depths = {c.channel_id: depth_of(c.channel) for c in part.channels}
-        is_latched = any(depths.values())
-        found = _sizes(session, counters, part, None if is_latched else windows)
-        total = np.concatenate([[0], np.cumsum(found.length)])
-        places = np.searchsorted(found.time, spans)
-        messages += places[:, 1] - places[:, 0]
-        size += total[places[:, 1]] - total[places[:, 0]]
-        for publisher in {publisher_of(c.channel) for c in part.channels if is_latched}:
+        count, length = _of_part(session, counters, part, spans, windows)
+        messages += count
+        size += length
+    return messages, size
+
+
+def _of_part(
+    session: Session,
+    counters: Counters,
+    part: Part,
+    spans: NDArray[np.int64],
+    windows: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Messages and payload bytes of one topic in snapshots; int64[k] each."""
+    depths = {c.channel_id: depth_of(c.channel) for c in part.channels}
+    near = None if any(depths.values()) else windows
+    if session.table(part.recording, part.topic) is not None:
+        try:
+            return _within(part, depths, _from_table(session, counters, part, near), spans)
+        except StoreError:
+            session.reject_table(part.recording, part.topic)
+    return _within(part, depths, _from_messages(session, counters, part, near), spans)
+
+
+def _within(
+    part: Part, depths: dict[int, int], blocks: Iterator[_Sizes], spans: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    messages = np.zeros(len(spans), np.int64)
+    size = np.zeros(len(spans), np.int64)
+    if any(depths.values()):
+        whole = _joined(blocks)
+        blocks = iter([whole])
+        for publisher in {publisher_of(c.channel) for c in part.channels}:
             own = [c for c in part.channels if publisher_of(c.channel) == publisher]
-            count, length = _in_force(found, own, depths, spans[:, 0])
+            count, length = _in_force(whole, own, depths, spans[:, 0])
             messages += count
             size += length
+    for block in blocks:
+        if not len(block.time):
+            continue
+        begin = np.searchsorted(spans[:, 1], block.time[0], "right")
+        end = np.searchsorted(spans[:, 0], block.time[-1], "right")
+        places = np.searchsorted(block.time, spans[begin:end])
+        total = np.concatenate([[0], np.cumsum(block.length)])
+        messages[begin:end] += places[:, 1] - places[:, 0]
+        size[begin:end] += total[places[:, 1]] - total[places[:, 0]]
     return messages, size
 
 
@@ -217,20 +251,7 @@ def _in_force(
     return end - begin, total[end] - total[begin]
 
 
-def _sizes(
-    session: Session, counters: Counters, part: Part, windows: NDArray[np.int64] | None
-) -> _Sizes:
-    """Times and payload bytes of the messages of a topic of a recording."""
-    blocks: list[_Sizes] = []
-    table = session.table(part.recording, part.topic)
-    try:
-        if table is not None:
-            blocks += _from_table(session, counters, part, windows)
-    except StoreError:
-        session.reject_table(part.recording, part.topic)
-        table, blocks = None, []
-    if table is None:
-        blocks += _from_messages(session, counters, part, windows)
+def _joined(blocks: Iterable[_Sizes]) -> _Sizes:
     none = np.empty(0, np.int64)
     columns = zip((none, none, none), *blocks, strict=True)
     return _Sizes(*(np.concatenate(column) for column in columns))

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.live import rehearsal
 from hybridlog.live.rehearsal import snapshot_spans
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger
 from hybridlog.losses import Ledger
@@ -112,6 +113,22 @@ def recorded(trigger: str, name: str, before_s: float, after_s: float) -> list[t
     return [one.stored for one in taken]
 
 
+@pytest.fixture(params=["whole", "in blocks"])
+def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sizes of messages come all at once, or a few at a time."""
+    if request.param == "whole":
+        return
+    from_table = rehearsal._from_table
+
+    def cut(*arguments: Any) -> Iterator[rehearsal._Sizes]:
+        for one in from_table(*arguments):
+            for begin in range(0, len(one.time), 3):
+                yield rehearsal._Sizes(*(column[begin : begin + 3] for column in one))
+
+    monkeypatch.setattr(rehearsal, "_from_table", cut)
+
+
+@pytest.mark.usefixtures("blocks")
 @pytest.mark.parametrize("trigger", ["/n: v >= 80", "/n: v == 7", "/map", "/n: v > 100"])
 @pytest.mark.parametrize(("before", "after"), [(1, 0.5), (0, 0), (5, 0), (0.05, 0.2), (0, 2)])
 def test_a_rehearsal_keeps_what_the_recorder_would(
