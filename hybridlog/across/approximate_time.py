@@ -12,6 +12,7 @@ has an end: there, the best set found so far is taken, where a robot would wait 
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,13 +36,14 @@ def approximate_sets(
         int64[k, n]: the row of each topic's message, set by set.
     """
     topics = range(len(times))
-    rows = [column.tolist() for column in times]
+    # Views give Python numbers one by one, and take no memory.
+    rows = [np.ascontiguousarray(column, np.int64).data for column in times]
     # `first` is the earliest message of a topic that may be in a set with the pivot, and the
     # candidate's, once there is one; `now` is the one that is looked at.
     first = [0] * len(rows)
     now = [0] * len(rows)
     counts = [len(column) for column in rows]
-    found: list[list[int]] = []
+    found = array("q")
     pivot, pivot_time = -1, 0  # the topic; -1 while there is no candidate
     begin = end = 0  # of the candidate
     while True:
@@ -68,7 +70,7 @@ def approximate_sets(
                 continue
         elif pivot < 0:
             break
-        found.append(first)
+        found.extend(first)
         first = [row + 1 for row in first]
         now = list(first)
         pivot = -1

@@ -182,15 +182,38 @@ class Synced(Sequence[tuple["Message", ...]]):
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Messages of a topic, by their time on the clock."""
+    """Messages of a topic that are in sets, as of `_Topic`, and their times on the clock."""
 
     time: NDArray[np.int64]
     log_time: NDArray[np.int64]
     number: NDArray[np.int64]
     is_alone: NDArray[np.bool_]
 
-    def take(self, rows: NDArray[np.int64]) -> _Found:
-        return _Found(self.time[rows], self.log_time[rows], self.number[rows], self.is_alone[rows])
+
+@dataclass(frozen=True, slots=True)
+class _Times:
+    """Times of the messages of a topic of a recording.
+
+    Attributes:
+        time: int64[n], ns on the clock, ascending.
+        log_time: int64[m], ns, ascending; m > n if some have no time on the clock.
+        rows: int64[n], place of each time in `log_time`; None for the same place.
+        is_whole: True if these are all messages of the topic.
+    """
+
+    time: NDArray[np.int64]
+    log_time: NDArray[np.int64]
+    rows: NDArray[np.int64] | None
+    is_whole: bool
+
+    def take(self, chosen: NDArray[np.int64]) -> _Found:
+        """The messages of some times."""
+        rows = chosen if self.rows is None else self.rows[chosen]
+        log_time = self.log_time[rows]
+        begin = np.searchsorted(self.log_time, log_time, "left")
+        end = np.searchsorted(self.log_time, log_time, "right")
+        is_alone = (end - begin == 1) & self.is_whole
+        return _Found(self.time[chosen], log_time, rows - begin, is_alone)
 
 
 def _joined(parts: Sequence[_Found]) -> _Found:
@@ -205,7 +228,7 @@ def _joined(parts: Sequence[_Found]) -> _Found:
     )
 
 
-def _times_of(session: Session, question: Question, clock: Clock, counters: Counters) -> _Found:
+def _times_of(session: Session, question: Question, clock: Clock, counters: Counters) -> _Times:
     """The messages of a question about one recording, ordered by their time on a clock.
 
     Raises:
@@ -229,22 +252,18 @@ def _times_of(session: Session, question: Question, clock: Clock, counters: Coun
     except TimeError:
         pass  # the range does not touch this recording
     log_time, time, known = np.concatenate(log_times), np.concatenate(times), np.concatenate(has)
-    rows = np.arange(len(log_time))
-    is_first = np.ones(len(rows), np.bool_)
-    is_first[1:] = log_time[1:] != log_time[:-1]
-    number = rows - np.maximum.accumulate(np.where(is_first, rows, 0))
-    is_last = np.append(is_first[1:], np.ones(min(len(rows), 1), np.bool_))
     is_whole = question.is_unbounded and question.predicate is None
-    is_alone = is_first & is_last if is_whole else np.zeros(len(rows), np.bool_)
+    if known.all() and not np.any(time[1:] < time[:-1]):
+        return _Times(time, log_time, None, is_whole)
     order = np.argsort(time, kind="stable")
     order = order[known[order]]
-    return _Found(time, log_time, number, is_alone).take(order)
+    return _Times(time[order], log_time, order, is_whole)
 
 
-_Times = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
+_Block = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
 
 
-def _read_times(planner: Planner, clock: Clock) -> Iterator[_Times]:
+def _read_times(planner: Planner, clock: Clock) -> Iterator[_Block]:
     """Log times, times on a clock, and whether these are known, in order."""
     if clock == "publish":
         for run in planner.runs():
