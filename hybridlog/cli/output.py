@@ -6,9 +6,9 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, is_dataclass
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from typing import TYPE_CHECKING, Literal
 
 from hybridlog_storage.errors import UsageError
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
+_ROWS_AT_ONCE = 10_000  # rows of a table that are laid out together
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 _SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
@@ -32,19 +33,26 @@ def console(*, error: bool = False) -> Console:
     return Console(file=sys.stderr if error else sys.stdout, highlight=False)
 
 
-def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under headings; on a terminal, cells that do not fit are folded.
+
+    A long table is printed some rows at a time: memory does not grow with it.
 
     Args:
         columns: Headings, and the side on which the cells stand.
         rows: Cells; control characters in them are shown, not obeyed.
     """
-    shown = [[printable(cell) for cell in row] for row in rows]
-    if sys.stdout.isatty():
-        _print_on_screen(columns, shown)
-    else:
-        for line in _lines_of([(printable(heading), side) for heading, side in columns], shown):
-            say(line)
+    shown = ([printable(cell) for cell in row] for row in rows)
+    named: Sequence[Column] = [(printable(heading), side) for heading, side in columns]
+    widths = [len(heading) for heading, _ in named]
+    block, is_first = list(islice(shown, _ROWS_AT_ONCE)), True
+    while block or is_first:
+        if sys.stdout.isatty():
+            _print_on_screen(named, block, headings=is_first)
+        else:
+            for line in _lines_of(named, block, widths, headings=is_first):
+                say(line)
+        block, is_first = list(islice(shown, _ROWS_AT_ONCE)), False
 
 
 def print_pages(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
@@ -55,17 +63,20 @@ def print_pages(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     import click
 
     shown = [[printable(cell) for cell in row] for row in rows]
-    click.echo_via_pager(f"{line}\n" for line in _lines_of(columns, shown))
+    widths = [len(heading) for heading, _ in columns]
+    click.echo_via_pager(f"{line}\n" for line in _lines_of(columns, shown, widths))
 
 
-def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+def _print_on_screen(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], *, headings: bool
+) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=headings)
     for heading, side in columns:
         table.add_column(
-            Text(printable(heading)),
+            Text(heading),
             justify="right" if side == "right" else "left",
             no_wrap=side != "left",
             overflow="fold",
@@ -75,11 +86,21 @@ def _print_on_screen(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -
     console().print(table)
 
 
-def _lines_of(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Headings and rows at full width: nothing is folded or left out."""
-    headings = [heading for heading, _ in columns]
-    widths = [max(map(len, cells)) for cells in zip(headings, *rows, strict=True)]
-    for row in (headings, *rows):
+def _lines_of(
+    columns: Sequence[Column],
+    rows: Sequence[Sequence[str]],
+    widths: list[int],
+    *,
+    headings: bool = True,
+) -> Iterator[str]:
+    """Headings and rows at full width: nothing is folded or left out.
+
+    `widths` are the least of the columns; they grow to those of the cells.
+    """
+    lines = [[heading for heading, _ in columns], *rows] if headings else rows
+    for n, cells in enumerate(zip(*lines, strict=True)):
+        widths[n] = max(widths[n], *map(len, cells))
+    for row in lines:
         line = "  ".join(
             cell.rjust(width) if side == "right" else cell.ljust(width)
             for cell, width, (_, side) in zip(row, widths, columns, strict=True)
@@ -143,7 +164,20 @@ def say(text: str = "") -> None:
 
 def print_json(value: object) -> None:
     """Print a value as JSON."""
-    print(json.dumps(value, default=_plain, indent=2, ensure_ascii=False))  # noqa: T201
+    print(_json(value))  # noqa: T201
+
+
+def print_json_list(values: Iterable[object]) -> None:
+    """Print values as a list in JSON, one at a time: memory does not grow with them."""
+    before = "["
+    for value in values:
+        print(before, _json(value).replace("\n", "\n  "), sep="\n  ", end="")  # noqa: T201
+        before = ","
+    print("[]" if before == "[" else "\n]")  # noqa: T201
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, default=_plain, indent=2, ensure_ascii=False)
 
 
 def print_json_line(value: object) -> None:

@@ -60,7 +60,7 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
         if choices.count:
             output.say(str(len(found)))
         elif choices.as_json:
-            output.print_json([_as_dict(row, labels) for row in found])
+            output.print_json_list(_as_dict(row, labels) for row in found)
         elif len(found):
             _print(found, labels)
         sys.stdout.flush()
@@ -98,16 +98,17 @@ def _print(found: Intervals, labels: Mapping[str, str]) -> None:
     ]
     if output.is_narrow():
         del columns[2]
-    rows = []
-    for row in found:
-        cells = [
+
+    def cells(row: Interval) -> list[str]:
+        shown = [
             labels[row.recording],
             format_time(row.begin_ns),
             format_time(row.end_ns),
             format_duration(row.duration_ns),
             str(row.messages),
         ]
-        if len(columns) < len(cells):
-            del cells[2]
-        rows.append(cells)
-    output.print_table(columns, rows)
+        if len(columns) < len(shown):
+            del shown[2]
+        return shown
+
+    output.print_table(columns, map(cells, found))

@@ -32,6 +32,7 @@ Span = tuple[int, int]
 
 MOST_PIECES = 10_000_000
 """Maximum number of intervals that `Intervals.cut` makes."""
+_AT_ONCE = 10_000  # intervals whose columns become Python numbers together
 _LAST = np.iinfo(np.int64).max
 
 
@@ -128,8 +129,10 @@ class Intervals:
     def __iter__(self) -> Iterator[Interval]:
         """The intervals, one by one."""
         columns = (self._recording, self._begin, self._end, self._messages)
-        for code, begin, end, count in zip(*(c.tolist() for c in columns), strict=True):
-            yield Interval(self._recordings[code], begin, end, count)
+        for start in range(0, len(self), _AT_ONCE):
+            rows = (column[start : start + _AT_ONCE].tolist() for column in columns)
+            for code, begin, end, count in zip(*rows, strict=True):
+                yield Interval(self._recordings[code], begin, end, count)
 
     def __getitem__(self, place: int) -> Interval:
         """The interval at an index; a negative index counts from the end."""

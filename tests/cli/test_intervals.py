@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hybridlog.cli import output
 from tests.independent import Seen, read_bag
 
 from .running import run
@@ -70,6 +73,35 @@ def test_intervals_as_a_table(store: Path) -> None:
     assert run(*asked, "--at-least", "1min", "--json", store=store).json == []
     assert run(*asked, "--between", "+1s", "+2s", "--json", store=store).json[0]["messages"] > 10
     assert len(run(*asked, "--max-gap", "1ms", "--json", store=store).json) > 100
+
+
+def test_long_answers_are_printed_some_rows_at_a_time(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(output, "_ROWS_AT_ONCE", 2)
+    printed: list[str] = []
+
+    def rows() -> Iterator[list[str]]:
+        for n in range(5):
+            printed.append(capsys.readouterr().out)
+            yield [str(10**n), "x" * (5 - n)]
+
+    output.print_table([("number", "right"), ("text", "left")], rows())
+    printed.append(capsys.readouterr().out)
+    assert [bool(text) for text in printed] == [False, False, True, False, True, True]
+    assert "".join(printed).splitlines() == [
+        "number  text",
+        "     1  xxxxx",
+        "    10  xxxx",
+        "   100  xxx",
+        "  1000  xx",
+        " 10000  x",
+    ]
+    output.print_table([("none", "left")], [])
+    assert capsys.readouterr().out == "none\n"
+    for values in ([], [{"a": "1\n2", "b": [1, {"c": None}]}, {}], [3]):
+        output.print_json_list(iter(values))
+        assert capsys.readouterr().out == json.dumps(values, indent=2) + "\n"
 
 
 def test_changes(store: Path, seen: list[Seen]) -> None:
