@@ -45,6 +45,17 @@ def test_ticks_count_each_match_once(drive: Drive) -> None:
     assert len(times) > 500
 
 
+def test_ticks_of_many_blocks(drive: Drive) -> None:
+    """Elements of long arrays are asked of the messages, a chunk at a time."""
+    query = drive.store.topic("drive").where("wide[3] > 0")
+    wanted = drive.times[drive.wide[:, 3] > 0].tolist()
+    assert len([*query.match_times()]) > 3
+    found = ticks(query, (BASE, wanted[-1] + 1), 3)
+    want = Counter((time - BASE) // found.width for time in wanted)
+    assert dict(zip(found.pixels.tolist(), found.counts.tolist(), strict=True)) == want
+    assert found.first[0] == wanted[0]
+
+
 def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     query = drive.store.topic("drive").where("linear.z > 0.5")
     span = BASE + 1234, int(drive.times[-1]) + 10 * MS
@@ -52,10 +63,11 @@ def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     assert len(exact) > 5
     assert bands(query, span, 5000).tolist() == [list(one) for one in exact]
     alternating = drive.store.topic("drive").where("on == true")
-    all_of_it = [(i.begin_ns, i.end_ns) for i in alternating.between(*span).intervals()]
-    for pixels in (1, 10, 300):
-        found = bands(alternating, span, pixels).tolist()
-        width = -(-(span[1] - span[0]) // pixels)
+    exact_width = int(drive.times[0]), int(drive.times[100])  # of 10 ms, as the bands' distance
+    for pixels, picture in ((1, span), (10, span), (300, span), (100, exact_width)):
+        all_of_it = [(i.begin_ns, i.end_ns) for i in alternating.between(*picture).intervals()]
+        found = bands(alternating, picture, pixels).tolist()
+        width = -(-(picture[1] - picture[0]) // pixels)
         want: list[list[int]] = []
         for begin, end in all_of_it:
             if want and begin - want[-1][1] < width:
