@@ -1,11 +1,14 @@
-"""The matches of a predicate over time: ticks and bands by pixel, and a few of them in order."""
+"""The matches of a predicate over time: ticks and bands by pixel, and a few of them in order.
+
+They come from `Matches`: read for each picture, or kept in memory (`match_cache`).
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -38,6 +41,61 @@ class Ticks:
     first: NDArray[np.int64]
 
 
+Rows = tuple["NDArray[np.int64]", "NDArray[np.int64]"]
+"""Log times, ns since the epoch, and arrival numbers of some messages, in order of both."""
+
+
+class Matches(Protocol):
+    """The messages of one topic of one recording that satisfy a predicate."""
+
+    def rows(self, begin: int | None, end: int | None) -> Iterator[Rows]:
+        """Those with `begin <= time < end`, ns since the epoch, some at a time, in order."""
+
+    def held(self, begin: int, end: int) -> Iterator[NDArray[np.int64]]:
+        """The intervals in which the predicate holds, cut to a span: int64[n, 2], in order."""
+
+    def count_until(self, end: int) -> int:
+        """The number of those before a time, ns since the epoch."""
+
+
+class AskedMatches:
+    """The matches of a query, which is asked anew each time.
+
+    Args:
+        query: About one topic of one recording, without a time range, `limit` and `every`.
+    """
+
+    def __init__(self, query: Query) -> None:
+        self._query = query
+
+    def rows(self, begin: int | None, end: int | None) -> Iterator[Rows]:
+        """See `Matches`."""
+        query = self._between(begin, end)
+        if query is not None:
+            yield from ((found.log_time, found.seq) for found in query.match_times())
+
+    def held(self, begin: int, end: int) -> Iterator[NDArray[np.int64]]:
+        """See `Matches`."""
+        query = self._between(begin, end)
+        if query is not None:
+            yield from (rows[:, :2] for _, rows in query.held())
+
+    def count_until(self, end: int) -> int:
+        """See `Matches`."""
+        query = self._between(None, end)
+        return 0 if query is None else query.count()
+
+    def _between(self, begin: int | None, end: int | None) -> Query | None:
+        """The query within a span; None if the recording has no time in it."""
+        low, high = max(begin or 0, 0), None if end is None else max(end, 0)
+        bounded = self._query.between(low, high)
+        try:
+            bounded.check_range()
+        except TimeError:
+            return None
+        return bounded
+
+
 class Match(NamedTuple):
     """A message that satisfies the predicate; matches are ordered as these tuples are.
 
@@ -50,21 +108,21 @@ class Match(NamedTuple):
     seq: int
 
 
-def ticks(query: Query, span: Span, pixels: int) -> Ticks:
-    """The matches of a query by pixel.
+def ticks(matches: Matches, span: Span, pixels: int) -> Ticks:
+    """Matches by pixel.
 
     Args:
-        query: About one recording, without a time range or with that of the picture.
+        matches: The matches.
         span: Log time `[begin, end)` of the picture, ns.
         pixels: Width of the picture.
 
     Raises:
-        UsageError: the query has `limit` or `every`, or there is no pixel.
+        UsageError: the span is empty, or there is no pixel.
     """
     width = pixel_width(span, pixels)
     counts = np.zeros(pixels, np.int64)
     first = np.full(pixels, np.iinfo(np.int64).max)
-    for found in _within(query, span):
+    for found, _ in matches.rows(*span):
         place, begins, count = np.unique(
             (found - span[0]) // width, return_index=True, return_counts=True
         )
@@ -74,11 +132,11 @@ def ticks(query: Query, span: Span, pixels: int) -> Ticks:
     return Ticks(width, used, counts[used], first[used])
 
 
-def bands(query: Query, span: Span, pixels: int) -> NDArray[np.int64]:
-    """The intervals in which the predicate of a query holds, joined where a picture cannot tell.
+def bands(matches: Matches, span: Span, pixels: int) -> NDArray[np.int64]:
+    """The intervals in which a predicate holds, joined where a picture cannot tell.
 
     Args:
-        query: About one topic of one recording, as for `ticks`.
+        matches: Its matches.
         span: Log time `[begin, end)` of the picture, ns.
         pixels: Width of the picture.
 
@@ -87,16 +145,12 @@ def bands(query: Query, span: Span, pixels: int) -> NDArray[np.int64]:
         Those less than a pixel apart are one.
 
     Raises:
-        UsageError: the query has several topics, `limit`, `every` or `reverse`, or there is no
-            pixel.
+        UsageError: the span is empty, or there is no pixel.
     """
     width = pixel_width(span, pixels)
-    bounded = _between(query, *span)
     found = np.empty((0, 2), np.int64)
-    if bounded is None:
-        return found
-    for _, rows in bounded.held():
-        found = np.concatenate([found, rows[:, :2]])
+    for rows in matches.held(*span):
+        found = np.concatenate([found, rows])
         if len(found):
             begins = np.concatenate([[True], found[1:, 0] - found[:-1, 1] >= width])
             ends = np.append(begins[1:], True)
@@ -116,17 +170,16 @@ def pixel_width(span: Span, pixels: int) -> int:
     return -(-(end - begin) // pixels)
 
 
-def matches_after(query: Query, place: Match, count: int) -> list[Match]:
+def matches_after(matches: Matches, place: Match, count: int) -> list[Match]:
     """The first matches behind a place, in order.
 
     Args:
-        query: About one topic of one recording, without a time range.
+        matches: The matches.
         place: A match, or a time with the arrival number -1; it is not among them.
         count: Greatest number.
     """
-    bounded = _between(query, place.time, None)
     found: list[Match] = []
-    for times, seqs in _rows(bounded):
+    for times, seqs in matches.rows(place.time, None):
         behind = (times > place.time) | ((times == place.time) & (seqs > place.seq))
         rows = np.flatnonzero(behind)[: count - len(found)]
         found += map(Match, times[rows].tolist(), seqs[rows].tolist())
@@ -135,13 +188,13 @@ def matches_after(query: Query, place: Match, count: int) -> list[Match]:
     return found
 
 
-def matches_before(query: Query, place: Match, count: int) -> list[Match]:
+def matches_before(matches: Matches, place: Match, count: int) -> list[Match]:
     """The last matches in front of a place, in order; see `matches_after`."""
     found: list[Match] = []
     end = place.time + 1
     for begin in _earlier(place.time):
         earlier: deque[Match] = deque(maxlen=count - len(found))
-        for times, seqs in _rows(_between(query, begin, end)):
+        for times, seqs in matches.rows(begin, end):
             in_front = (times < place.time) | ((times == place.time) & (seqs < place.seq))
             rows = np.flatnonzero(in_front)[-count:]
             earlier.extend(map(Match, times[rows].tolist(), seqs[rows].tolist()))
@@ -152,35 +205,12 @@ def matches_before(query: Query, place: Match, count: int) -> list[Match]:
     return found
 
 
-def count_before(query: Query, place: Match) -> int:
+def count_before(matches: Matches, place: Match) -> int:
     """Number of matches in front of a place; see `matches_after`."""
-    earlier = _between(query, None, place.time)
-    count = 0 if earlier is None else earlier.count()
-    for _, seqs in _rows(_between(query, place.time, place.time + 1)):
+    count = matches.count_until(place.time)
+    for _, seqs in matches.rows(place.time, place.time + 1):
         count += int(np.count_nonzero(seqs < place.seq))
     return count
-
-
-def _rows(query: Query | None) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Log times and arrival numbers of the matches."""
-    if query is not None:
-        yield from ((found.log_time, found.seq) for found in query.match_times())
-
-
-def _within(query: Query, span: Span) -> Iterator[NDArray[np.int64]]:
-    """Log times of the matches in a span."""
-    return (times for times, _ in _rows(_between(query, *span)))
-
-
-def _between(query: Query, begin: int | None, end: int | None) -> Query | None:
-    """The query within a span; None if the recording has no time in it."""
-    low, high = max(begin or 0, 0), None if end is None else max(end, 0)
-    bounded = query.between(low, high)
-    try:
-        bounded.check_range()
-    except TimeError:
-        return None
-    return bounded
 
 
 def _earlier(time: int) -> Iterator[int]:

@@ -16,6 +16,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hybridlog.drawing.density_cache import DensityCache
+from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.export.slice_cache import SliceCache
 from hybridlog.view.asked import Asked
 from hybridlog_storage.errors import HybridlogError, TopicError
@@ -55,6 +56,11 @@ class Context:
     def densities(self) -> DensityCache:
         """Counts of messages by pixel."""
         return DensityCache(self.store.session)
+
+    @cached_property
+    def matches(self) -> MatchCache:
+        """Matches of the last questions."""
+        return MatchCache()
 
     @cached_property
     def slices(self) -> SliceCache:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from hybridlog.drawing.matches import (
+    AskedMatches,
     Match,
     bands,
     count_before,
@@ -28,8 +29,10 @@ from hybridlog_storage.errors import ResourceError, TopicError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from hybridlog.drawing.matches import Matches
     from hybridlog.sql.engine import SqlAnswer
     from hybridlog.view.asked import Asked
+    from hybridlog.view.question import PageQuestion
 
 MAX_LISTED: Final = 200
 """Greatest number of matches that are listed at once."""
@@ -70,9 +73,9 @@ def matches(context: Context, asked: Asked) -> dict[str, Any]:
         raise UsageError("end is greater than begin.")
     pixels = asked.pixels()
     span = max(start + begin, 0), max(start + end, 1)
-    query = question.query()
-    found = ticks(query, span, pixels)
-    held = bands(query, span, pixels)
+    asked_for = _matches(context, question)
+    found = ticks(asked_for, span, pixels)
+    held = bands(asked_for, span, pixels)
     return {
         "begin": span[0] - start,
         "width": found.width,
@@ -91,12 +94,21 @@ def match_list(context: Context, asked: Asked) -> dict[str, Any]:
     place = Match(max(start + at, 0), seq)
     count = asked.integer("count", 1, MAX_LISTED, MAX_LISTED)
     find = {"later": matches_after, "earlier": matches_before}
-    query = question.query()
-    found = find[asked.word("direction", find, "later")](query, place, count)
+    asked_for = _matches(context, question)
+    found = find[asked.word("direction", find, "later")](asked_for, place, count)
     return {
         "rows": [[one.time - start, one.seq] for one in found],
-        "before": count_before(query, found[0]) if found else None,
+        "before": count_before(asked_for, found[0]) if found else None,
     }
+
+
+def _matches(context: Context, question: PageQuestion) -> Matches:
+    recording = question.recording
+    if recording.status == "open":
+        return AskedMatches(question.query())
+    asked = question.topics, question.where, question.within
+    key = recording.id, recording.status, recording.messages, recording.span, asked
+    return context.matches.matches(key, question.query)
 
 
 def completion(context: Context, asked: Asked) -> dict[str, Any]:

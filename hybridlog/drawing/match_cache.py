@@ -1,0 +1,119 @@
+"""Matches that are kept in memory, so that a picture of them at any zoom reads nothing."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from hybridlog.drawing.matches import AskedMatches, Matches, Rows
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.query import Query
+
+MOST_BYTES: Final = 96 << 20
+"""Memory of all matches that are kept: 16 bytes each, and 16 an interval."""
+_QUESTIONS: Final = 8
+
+
+class KeptMatches:
+    """All matches of a question; see `Matches`.
+
+    Args:
+        times: int64[n], log times, ns since the epoch, in order.
+        seqs: int64[n], arrival numbers.
+        held: int64[k, 2], the intervals in which the predicate holds, in order.
+    """
+
+    def __init__(
+        self, times: NDArray[np.int64], seqs: NDArray[np.int64], held: NDArray[np.int64]
+    ) -> None:
+        self._times = times
+        self._seqs = seqs
+        self._held = held
+
+    @classmethod
+    def of(cls, query: Query) -> KeptMatches | None:
+        """The matches of a query; None if they are too many to be kept."""
+        times, seqs = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        held = [np.empty((0, 2), np.int64)]
+        size = 0
+        for found in query.match_times():
+            size += found.log_time.nbytes + found.seq.nbytes
+            if size > MOST_BYTES:
+                return None
+            times.append(found.log_time)
+            seqs.append(found.seq)
+        for _, rows in query.held():
+            held.append(rows[:, :2].copy())
+            size += held[-1].nbytes
+            if size > MOST_BYTES:
+                return None
+        return cls(np.concatenate(times), np.concatenate(seqs), np.concatenate(held))
+
+    @property
+    def size(self) -> int:
+        """Its memory, bytes."""
+        return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
+
+    def rows(self, begin: int | None, end: int | None) -> Iterator[Rows]:
+        """See `Matches`."""
+        low = 0 if begin is None else int(np.searchsorted(self._times, begin))
+        high = len(self._times) if end is None else self.count_until(end)
+        yield self._times[low:high], self._seqs[low:high]
+
+    def held(self, begin: int, end: int) -> Iterator[NDArray[np.int64]]:
+        """See `Matches`."""
+        low = int(np.searchsorted(self._held[:, 1], begin, "right"))
+        high = int(np.searchsorted(self._held[:, 0], end))
+        yield np.clip(self._held[low:high], begin, end)
+
+    def count_until(self, end: int) -> int:
+        """See `Matches`."""
+        return int(np.searchsorted(self._times, end))
+
+
+_Answer = tuple[KeptMatches | None]
+"""The matches, or None if they are too many to be kept."""
+
+
+class MatchCache:
+    """Keeps the matches of the last questions. Thread safe."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[Hashable, _Answer] = OrderedDict()
+        self._lock = threading.Lock()
+        self._asking = threading.Lock()
+
+    def matches(self, key: Hashable, ask: Callable[[], Query]) -> Matches:
+        """The matches of a question.
+
+        Args:
+            key: The question, and all that its answer depends on.
+            ask: Makes the query, which has no time range.
+        """
+        found = self._known(key)
+        if found is None:
+            # A second client that asks the same waits, which takes no longer than to ask itself.
+            with self._asking:
+                found = self._known(key) or (KeptMatches.of(ask()),)
+                with self._lock:
+                    self._kept[key] = found
+                    while len(self._kept) > _QUESTIONS or self._size() > MOST_BYTES:
+                        self._kept.popitem(last=False)
+        (kept,) = found
+        return AskedMatches(ask()) if kept is None else kept
+
+    def _size(self) -> int:
+        return sum(kept.size for (kept,) in self._kept.values() if kept is not None)
+
+    def _known(self, key: Hashable) -> _Answer | None:
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+            return self._kept.get(key)
