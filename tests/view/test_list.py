@@ -103,6 +103,6 @@ def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
     page.get_by_label("With a message").fill("scan: ranges.min < 0.5")
     page.get_by_role("link", name="robot").click()
     page.wait_for_selector("text=18 topics")
-    assert page.url.endswith("#recording=robot")
+    assert "#recording=robot" in page.url
     page.go_back()
     page.wait_for_selector("text=1 recording:")

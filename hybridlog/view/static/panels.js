@@ -42,6 +42,15 @@ function firstPanels(topics) {
   return found;
 }
 
+/** A time early in a recording at which the panels that it is first shown with have a message. */
+export function firstTime({ info }) {
+  const shown = firstPanels(info.topics).filter(({ kind }) => kind !== log.kind);
+  const names = shown.map(({ topic }) => topic);
+  const soon = info.begin + (info.end - info.begin) / 10;
+  const times = info.topics.filter(({ topic, first }) => names.includes(topic) && first <= soon);
+  return Math.max(0, ...times.map(({ first }) => first));
+}
+
 /** Shows a panel of a topic: of the first kind that is made for it, unless it is shown already. */
 export function openPanel(recording, name) {
   const { topics } = recording.info;

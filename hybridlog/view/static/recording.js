@@ -4,7 +4,8 @@ import { ApiError, get } from "./api.js";
 import { mountAsk } from "./ask.js";
 import { element, fill } from "./dom.js";
 import { followLive } from "./live.js";
-import { mountPanels } from "./panels.js";
+import { firstTime, mountPanels } from "./panels.js";
+import * as state from "./state.js";
 import { mountTimeline } from "./timeline.js";
 import { count, duration, moment, size } from "./words.js";
 
@@ -36,6 +37,9 @@ export function mountRecording(main, label) {
       const info = await get("recording", { recording: label });
       if (isGone) return;
       const recording = made(info);
+      // Nothing was said of the cursor: at the very start most topics have no message yet.
+      const isFresh = state.get("at") === 0 && state.get("panels") === null;
+      if (isFresh && info.status !== "open") state.set({ at: firstTime(recording) });
       const drawHead = () => fill(head, summaryOf(recording));
       drawHead();
       ends.push(
