@@ -39,6 +39,8 @@ _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
 )
+_MAX_TREES: Final = 64  # syntax trees that are kept
+_MAX_TREE: Final = 1 << 20  # characters of one of them
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 _MAX_TRIES: Final = 10  # tables that may be damaged in one query
 _T = TypeVar("_T")
@@ -55,6 +57,7 @@ class SqlEngine:
         self.session = session
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
+        self._trees: dict[str, str] = {}
         self._lock = threading.RLock()
 
     def connect(self, memory: int | None = None, *, only_reads: bool = False) -> SqlConnection:
@@ -79,6 +82,23 @@ class SqlEngine:
         with self._lock:
             self._content = current_content(self.session, self._content)
             return self._content
+
+    def tree(self, cursor: Any, text: str) -> str:
+        """The syntax tree of a query as JSON; those of the last queries are kept.
+
+        Args:
+            cursor: A connection of DuckDB.
+            text: The query.
+        """
+        with self._lock:
+            found = self._trees.get(text)
+            if found is None:
+                ((found,),) = cursor.execute(_TREE, [text]).fetchall()
+                if len(found) <= _MAX_TREE:
+                    self._trees[text] = found
+                if len(self._trees) > _MAX_TREES:
+                    del self._trees[next(iter(self._trees))]
+            return found
 
     def reject(self, damaged: DamagedTableError) -> None:
         """Drop a damaged table; the next query makes it again."""
@@ -197,7 +217,7 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        ((tree,),) = self.cursor.execute(_TREE, [text]).fetchall()
+        tree = self.engine.tree(self.cursor, text)
         return usage_of(tree, {name.casefold() for name in self._names})
 
     def close(self) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import random
+import threading
 from collections import deque
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -209,13 +211,10 @@ def numbers(synced: Synced, place: int) -> list[int]:
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("way", ["fork", "spawn"])
-def test_workers_read_sets(logs: Logs, way: str) -> None:
+def test_workers_read_sets(logs: Logs) -> None:
     synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
     want = [numbers(synced, n) for n in range(16)]
-    context = multiprocessing.get_context(way)
-    with context.Pool(2) as pool:
-        # With fork the workers share what this process has opened; with spawn it is pickled.
+    with multiprocessing.get_context("fork").Pool(2) as pool:
         found = pool.starmap(numbers, [(synced, n) for n in range(16)], chunksize=4)
         assert found == want
     assert numbers(synced, 3) == want[3]
@@ -239,6 +238,58 @@ def test_a_set_is_read_after_a_fork_without_pickling(logs: Logs) -> None:
         worker.join()
     assert numbers(synced, 5) == want
     assert synced._session is logs.store.session
+
+
+def collated(sets: list[tuple[hl.Message, ...]]) -> np.ndarray:
+    """What a `collate_fn` makes of the sets of a batch."""
+    return np.array([[m.decode().header.seq for m in messages] for messages in sets])
+
+
+def load(synced: Synced, asked: Any, answers: Any) -> None:
+    """A worker of a data loader: batches of places come, arrays go back."""
+    for number, places in iter(asked.get, None):
+        answers.put((number, collated([synced[place] for place in places])))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("way", ["fork", "spawn"])
+def test_a_data_loader_reads_shuffled_batches(logs: Logs, way: str) -> None:
+    """As PyTorch's does: workers begin while this process reads, and serve several epochs."""
+    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
+    size = min(len(synced), 40)
+    want = collated(synced[:size])
+    context = multiprocessing.get_context(way)
+    is_over = threading.Event()
+
+    def read() -> None:
+        while not is_over.is_set():
+            assert len(synced[7]) == 2
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        queues = [context.Queue() for _ in range(2)]
+        answers = context.Queue()
+        workers = [context.Process(target=load, args=(synced, q, answers)) for q in queues]
+        for worker in workers:
+            worker.start()
+    finally:
+        is_over.set()
+        reader.join()
+    for epoch in range(2):
+        order = np.random.default_rng(epoch).permutation(size)
+        batches = np.array_split(order, 10)
+        for number, places in enumerate(batches):
+            queues[number % 2].put((number, places.tolist()))
+        for _ in batches:
+            number, found = answers.get(timeout=60)
+            np.testing.assert_array_equal(found, want[batches[number]])
+    for queue in queues:
+        queue.put(None)
+    for worker in workers:
+        worker.join(60)
+        assert worker.exitcode == 0
+    np.testing.assert_array_equal(collated(synced[:3]), want[:3])
 
 
 def test_a_pickled_set_outlives_the_store(logs: Logs) -> None:

@@ -12,11 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import duckdb
 import pyarrow as pa
 import pytest
 
 import hybridlog as hl
-from hybridlog.sql import duck
+from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
 from hybridlog.tables.parquet_file import ParquetFileReader
 from hybridlog_storage.errors import (
@@ -238,6 +239,25 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
     assert own.sql("select max(angle) from scan").rows() == [((SCANS - 1) / 2,)]
     with pytest.raises(SegmentError, match="damaged"):
         own.sql("select max(ranges[1]) from scan").rows()
+
+
+def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = "select count(*) from scan where angle < 3"
+    found = own.sql(query).rows()
+    trees = own.sql_engine._trees
+    assert len(trees) == 1
+    monkeypatch.setattr(engine, "_TREE", "select 1 / 'no number'")
+    assert own.sql(query).rows() == found
+    with pytest.raises(duckdb.Error):
+        own.sql(f"{query} and angle > 1")
+    monkeypatch.undo()
+    monkeypatch.setattr(engine, "_MAX_TREES", 2)
+    for limit in range(5):
+        assert len(own.sql(f"select angle from scan limit {limit}").rows()) == limit
+    assert list(trees) == [f"select angle from scan limit {limit}" for limit in (3, 4)]
+    monkeypatch.setattr(engine, "_MAX_TREE", 10)
+    own.sql("select t from scan").rows()
+    assert len(trees) == 2
 
 
 def test_compacted_recordings_answer_alike(own: hl.Store) -> None:
