@@ -70,7 +70,7 @@ def _chart(topic: str, group: Sequence[Line]) -> dict[str, Any]:
         lines = [*part]
         which = [recording] if several else []
         corners = [line.series.polyline() for line in lines]
-        times = _increasing(corners[0][0]) - start
+        times = increasing(corners[0][0]) - start
         tables.append(
             {
                 "times": _packed(times / 1e9),
@@ -86,7 +86,7 @@ def _chart(topic: str, group: Sequence[Line]) -> dict[str, Any]:
     return {"title": printable(topic), "tables": tables}
 
 
-def _increasing(times: NDArray[np.int64]) -> NDArray[np.int64]:
+def increasing(times: NDArray[np.int64]) -> NDArray[np.int64]:
     """The times, those that are the same 1 ns apart: charts join lines by their times."""
     steps = np.arange(len(times))
     found: NDArray[np.int64] = np.maximum.accumulate(times - steps) + steps

@@ -16,6 +16,7 @@ from hybridlog.cli.sparkline import bar, densities, sparkline
 from hybridlog.drawing.coverage import lost_parts
 from hybridlog.drawing.figure import figure
 from hybridlog.drawing.lines import MOST, Line, lines
+from hybridlog.drawing.page import increasing
 from hybridlog.drawing.series import Series
 from hybridlog.losses import Cause
 from hybridlog_storage.catalog import RecordingEntry
@@ -197,6 +198,10 @@ def test_corners_of_a_line() -> None:
     times_, values = Series("x", times, least, least + 1, False).polyline()
     assert times_.tolist() == [10, 10, 20, 20, 30, 30]
     assert np.array_equal(values, [0, 1, NAN, NAN, 2, 3], equal_nan=True)
+
+
+def test_times_of_a_page_are_different() -> None:
+    assert increasing(np.array([5, 5, 5, 6, 9, 20])).tolist() == [5, 6, 7, 8, 9, 20]
 
 
 def test_columns_of_text() -> None:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridlog.drawing.series import numbers_of, series
+from hybridlog.drawing.series import _Grid, numbers_of, series
 from hybridlog_storage.errors import TopicError, UsageError
 
 from .conftest import BASE, MS, Drive
 
 PAUSES = (1500, 4000)
+NAN = float("nan")
 
 
 def by_pixel(
@@ -214,3 +215,47 @@ def test_questions_without_a_picture(drive: Drive) -> None:
     with pytest.raises(UsageError, match="2 topics in 1 recordings"):
         series(drive.store.topic("drive", "loose"), ["y"], pixels=9)
     assert numbers_of(query) == ["linear.x", "linear.z", "y", "ticks", "on", "age"]
+
+
+def test_pixels_are_filled_block_by_block() -> None:
+    grid = _Grid(100, 10, 3)
+    grid.add(np.array([100, 105]), {"x": np.array([3.0, 1.0])})
+    grid.add(np.array([107, 112]), {"x": np.array([2.0, 9.0]), "y": np.array([5.0, NAN])})
+    grid.add(np.array([113, 999]), {"x": np.array([8.0, 4.0])})
+    x, y = grid.series(["x", "y"])
+    assert x.times.tolist() == y.times.tolist() == [100, 112, 999]
+    assert (x.least.tolist(), x.greatest.tolist()) == ([1, 8, 4], [3, 9, 4])
+    assert np.array_equal(y.least, [5, NAN, NAN], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("times", "gaps"),
+    [
+        ([0, 5, 10, 15, 32, 37], []),  # a pixel without a message is not yet a gap
+        ([0, 5, 10, 15, 45, 47], [30]),
+        ([*range(10), 19, *range(20, 30)], []),  # nobody would see it
+        ([*range(10), *range(50, 60)], [29]),
+    ],
+)
+def test_gaps_between_pixels(times: list[int], gaps: list[int]) -> None:
+    grid = _Grid(0, 10, 6)
+    at = np.array(times)
+    grid.add(at, {"x": np.ones(len(at))})
+    (x,) = grid.series(["x"])
+    assert x.times[np.isnan(x.least)].tolist() == gaps
+    firsts = {time // 10: time for time in reversed(times)}
+    assert x.times[~np.isnan(x.least)].tolist() == sorted(firsts.values())
+
+
+def test_spans_of_recordings(drive: Drive) -> None:
+    both = drive.store.topic("drive", "loose", "front")
+    spans = sorted(both.spans().values(), reverse=True)
+    end = int(drive.times[-1]) + 1
+    assert spans == [(BASE, end), (BASE, BASE + 3 * MS + 1)]
+    assert [*both.spans()] == [summary.id for summary in both.summaries()]
+    assert [*drive.store.topic("loose", "drive").between("+1s", None).spans().values()] == [
+        (BASE + 1000 * MS, end)
+    ]
+    later = drive.store.topic("rear/compressed", "broken")
+    assert [*later.spans().values()] == [(BASE, BASE + 3)]
+    assert drive.store.topic("loose").spans() != drive.store.topic("drive").spans()
