@@ -13,6 +13,8 @@ from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import TimeError, TopicError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch, Channel
@@ -46,6 +48,27 @@ class Block:
     channels: Sequence[int]
 
 
+class Covered:
+    """Log time that recordings cover, also together.
+
+    Args:
+        begin: int64[n], ns.
+        end: int64[n], ns; not covered any more.
+    """
+
+    def __init__(self, begin: NDArray[np.int64], end: NDArray[np.int64]) -> None:
+        order = begin.argsort()
+        self._begin = begin[order]
+        self._end = np.maximum.accumulate(end[order])
+
+    def next(self, position: int) -> int:
+        """The next log time that is covered, ns; the same one if it is, or if no more is."""
+        row = int(np.searchsorted(self._begin, position, "right"))
+        if not row or position < self._end[row - 1] or row == len(self._begin):
+            return position
+        return int(self._begin[row])
+
+
 class PlayedLog:
     """The messages of a query, as a log that is played.
 
@@ -57,6 +80,7 @@ class PlayedLog:
             pressure are not among them.
         begin: First log time, ns.
         end: Last log time, ns.
+        covered: The log time of its recordings.
 
     Raises:
         TimeError: The range is outside of all recordings, or these have no messages.
@@ -73,9 +97,7 @@ class PlayedLog:
         asked = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
         during = query.question.during
         self._during = asked if during is None else during.common(asked)
-        order = times[:, 0].argsort()
-        self._begins = times[order, 0]
-        self._ends = np.maximum.accumulate(times[order, 1])
+        self.covered = Covered(times[:, 0], times[:, 1])
         self._ids: dict[tuple[str, int], int] = {}
         self._latching: set[str] = set()
         self.channels = self._merge(query.channels())
@@ -96,13 +118,6 @@ class PlayedLog:
             publishers = tuple(dict.fromkeys(name for name in names if name))
             merged.append(PlayedChannel(number, group[0].channel, publishers))
         return merged
-
-    def next_span(self, position: int) -> int:
-        """The next log time that a recording covers, ns: the same one, mostly."""
-        row = int(np.searchsorted(self._begins, position, "right"))
-        if not row or position < self._ends[row - 1] or row == len(self._begins):
-            return position
-        return int(self._begins[row])
 
     def after(self, topics: Collection[str], position: int) -> Iterator[Block]:
         """All messages of some topics behind a log time, ns, in order."""

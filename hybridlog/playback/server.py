@@ -136,18 +136,16 @@ class _Reading:
     def take(self, until: int) -> tuple[Block, int]:
         """Messages until a log time, ns, about `_MAX_SENT` bytes; the log time of the last one.
 
-        At least one. Those of the same time in the same block are never taken apart. Call
-        `next_time` first.
+        At least one. Call `next_time` first.
         """
         assert self._block is not None
         batch, row = self._block.batch, self._row
         times = batch.log_time[row:]
         count = max(int(np.searchsorted(times, until, "right")), 1)
         sizes = np.cumsum(batch.length[row : row + count])
-        last = int(times[np.searchsorted(sizes[:-1], _MAX_SENT)])
-        count = int(np.searchsorted(times, last, "right"))
-        self._row += count
-        return Block(batch.take(slice(row, self._row)), self._block.channels), last
+        last = int(np.searchsorted(sizes[:-1], _MAX_SENT))
+        self._row += last + 1
+        return Block(batch.take(slice(row, self._row)), self._block.channels), int(times[last])
 
     def close(self) -> None:
         """Read no more."""
@@ -461,7 +459,7 @@ class PlaybackServer:
             await self._broadcast(time_now(self._log.end))
             await self._broadcast_state()
             return
-        then = self._log.next_span(self._sent)
+        then = self._log.covered.next(self._sent)
         if then > self._sent:
             self._sent = then - 1
             self._clock.set(then)

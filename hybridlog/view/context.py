@@ -153,6 +153,12 @@ def error_response(error: HybridlogError) -> Response:
 
 
 def broken_response(_: Request, error: Exception) -> Response:
-    """An error in hybridlog itself: its trace goes to standard error, not to the page."""
-    traceback.print_exception(error, file=sys.stderr)
+    """An error in hybridlog itself: its trace goes to standard error, not to the page.
+
+    An error that was raised on purpose comes here if the answer had begun: its text is enough.
+    """
+    if isinstance(error, HybridlogError):
+        print(f"hybridlog: {error}", file=sys.stderr, flush=True)  # noqa: T201
+    else:
+        traceback.print_exception(error, file=sys.stderr)
     return json_response({"error": "hybridlog failed; its terminal has the details."}, 500)

@@ -126,12 +126,18 @@ class Viewer:
         numbers = [self.number(topic) + 1000]
         self.connection.send(json.dumps({"op": "unsubscribe", "subscriptionIds": numbers}))
 
+    def ask(
+        self, *, plays: bool, speed: float = 1.0, seek: int | None = None, name: bytes = b"id"
+    ) -> None:
+        """Ask for playback."""
+        head = (3, int(not plays), speed, int(seek is not None), seek or 0, len(name))
+        self.connection.send(struct.pack("<BBfBQI", *head) + name)
+
     def control(
         self, *, plays: bool, speed: float = 1.0, seek: int | None = None, name: bytes = b"id"
     ) -> State:
         """Ask for playback, and wait for the answer."""
-        head = (3, int(not plays), speed, int(seek is not None), seek or 0, len(name))
-        self.connection.send(struct.pack("<BBfBQI", *head) + name)
+        self.ask(plays=plays, speed=speed, seek=seek, name=name)
         while (state := self.until(State)).request != name:
             pass
         return state
