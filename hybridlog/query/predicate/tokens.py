@@ -224,6 +224,8 @@ def _path(text: str, first: re.Match[str]) -> tuple[Token, int]:
         elif not of_any:
             parts.append(_index(text, end, match["index"]))
         end = match.end()
+    if text[end : end + 1] == "[" and not is_in:
+        raise error_at(text, end, "write an element as x[3], a slice as x[3:8]; both count from 0")
     if text[end : end + 1] == ".":
         raise error_at(text, end, "the field's name does not end")
     plain = end == first.end() and not first[0].startswith("`")
