@@ -76,7 +76,11 @@ LOOSE: Sequence[Any] = (
     },
     {"deep": deep(60), "n": 2},
     {"many": {f"key {n}": n for n in range(3000)}, "n": 3},
-    {"grid": [[[0] * 40] * 40] * 40, "n": 4},
+    {
+        "grid": [[[0] * 40] * 40] * 40,
+        "wide": {f"a{n}": {f"b{k}": k for k in range(60)} for n in range(60)},
+        "n": 4,
+    },
     ["a list", 5],
 )
 

@@ -338,13 +338,16 @@ def _exact(
     paths: Sequence[str],
 ) -> list[Series]:
     times = np.concatenate([times for times, _ in held])
+    # A late message may be flushed after later ones were sealed.
+    order = np.argsort(times, kind="stable")
+    times = times[order]
     steps = np.diff(times)
     gaps = np.flatnonzero(steps > GAP_PERIODS * usual_period(steps)) + 1
     middles = times[gaps - 1] + steps[gaps - 1] // 2
     found = []
     for path in paths:
         values = np.concatenate([c.get(path, np.full(len(t), np.nan)) for t, c in held])
-        values = np.insert(values, gaps, np.nan)
+        values = np.insert(values[order], gaps, np.nan)
         found.append(Series(path, np.insert(times, gaps, middles), values, values, True))
     return found
 

@@ -281,15 +281,25 @@ def test_play_never_queues_requests(page: Page, demo_url: str, demo_store: hl.St
             most = Math.max(most, (running += 1));
             try { return await real(...parts); } finally { running -= 1; }
           };
+          const place = document.querySelector(".picture");
+          let blank = 0;
+          const watch = new MutationObserver(() => {
+            const image = place.querySelector("img");
+            if (!image || !image.complete || !image.naturalWidth) blank += 1;
+          });
+          watch.observe(place, { childList: true });
           for (let step = 1; step <= 60; step += 1) {
             state.set({ at: step * 166e6 });
             await new Promise(requestAnimationFrame);
           }
           window.fetch = real;
-          return { most, asked };
+          watch.disconnect();
+          return { most, asked, blank };
         }"""
     )
     assert found["most"] <= len(topics)
+    assert found["asked"] > 2 * len(topics)
+    assert found["blank"] == 0  # a picture is decoded before it takes the place of another one
     (entry,) = demo_store.recordings()
     assert entry.span is not None
     at = entry.span[0] + 60 * 166 * MS
