@@ -135,7 +135,6 @@ class _Recorded:
         if self._chunks is None or not self._chunks.follow(recording):
             self._blocks.clear()
             self._bytes = 0
-            self._periods.clear()
             self._chunks = RecordedChunks(self._session, recording)
         return self._chunks
 

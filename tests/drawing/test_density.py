@@ -41,6 +41,7 @@ def _times() -> dict[str, list[int]]:
         "/late": [BASE + rng.randrange(LENGTH) for _ in range(300)],
         "/large": [BASE + n * 100 * MS for n in range(40)],
         "/one": [BASE + 5],
+        "/two": [BASE + 5, BASE + 7 * MS],  # in one chunk
     }
 
 
@@ -146,6 +147,17 @@ def test_a_small_cache_forgets_and_stays_right(
     assert 0 < recorded._bytes == held <= 20_000
 
 
+def test_what_is_added_to_an_estimate_is_one(store: hl.Store) -> None:
+    recorded = density_cache._Recorded(store.session)
+    key = 30, 0, "/steady"
+    ones = np.ones(4, np.int64)
+    recorded._add(key, ones, is_exact=False, parts=1)
+    recorded._add(key, 300 * ones, is_exact=True, parts=2)
+    block = recorded._blocks[key]
+    assert (block.counts.tolist(), block.exact, block.parts) == ([301] * 4, False, 2)
+    assert recorded._bytes == block.counts.nbytes
+
+
 class Reads:
     """Counts the chunks whose message indexes are read; nothing else may be read of a chunk."""
 
@@ -190,6 +202,15 @@ def test_chunks_within_a_pixel_are_not_read(
     reads = Reads(monkeypatch)
     found = density(store.session, store.entry("a"), (BASE - LENGTH, BASE + 2 * LENGTH), 1)
     assert (reads.chunks, found.counts.sum()) == (0, sum(map(len, TIMES.values())))
+
+
+def test_usual_periods(store: hl.Store) -> None:
+    """Of messages in chunks of many, and in chunks of their own."""
+    topics = ["/steady", "/large", "/one"]
+    span = BASE, BASE + LENGTH
+    steady, large, one = DensityCache(store.session).periods(store.entry("a"), span, topics)
+    assert 1.9 * MS < steady < 2.1 * MS
+    assert (large, one) == (100 * MS, 0)
 
 
 def test_too_many_messages_are_estimated(store: hl.Store) -> None:
@@ -287,6 +308,8 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert (ask() == found).all()
         sealed = store.entry("live").messages
         assert 0 < sealed == written - running()
+        chunks = RecordedChunks(store.session, store.entry("live"))
+        assert not set(map(str, chunks._open)) & store.entry("live").digests.keys()
         plain = density(store.session, store.entry("live"), span, 1000, ["/a", "/b"])
         assert (plain.counts == found).all()
         recording.close()
@@ -308,11 +331,14 @@ def test_indexes_of_open_segments_are_compared_with_their_chunks(
     assert {c: t.tolist() for c, t in whole.read_times(place).items()} == {
         c: t.tolist() for c, t in right.items()
     }
-    content = bytearray(path.read_bytes())
-    content[place.offset + place.length + 15 + 3] ^= 0x40  # the first log time in its indexes
-    (tmp_path / "000000.mcap.open").write_bytes(content)
-    with pytest.raises(SegmentError, match="damaged"):
-        OpenSegment(tmp_path / "000000.mcap.open", 0).read_times(place)
+    at = place.offset + place.length + 15  # the first log time in its indexes
+    for by in (-LENGTH, LENGTH):  # still in order, and not
+        content = bytearray(path.read_bytes())
+        wrong = int.from_bytes(content[at : at + 8], "little") + by
+        content[at : at + 8] = wrong.to_bytes(8, "little")
+        (tmp_path / "000000.mcap.open").write_bytes(content)
+        with pytest.raises(SegmentError, match="damaged"):
+            OpenSegment(tmp_path / "000000.mcap.open", 0).read_times(place)
     # A segment that grows is read on, not again.
     growing_path = tmp_path / "000001.mcap.open"
     growing_path.write_bytes(path.read_bytes()[: place.offset + 5])

@@ -116,8 +116,12 @@ def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store) -> 
     assert 9e6 < found.lanes[1].period < 11e6
     assert found.lanes[2].period == 0
     # Before and after the recording there is no gap.
-    around = picture(client, ["/imu/data"], -10 * end, 10 * end, 500)
+    around = picture(client, ["/imu/data", "/r_cart/command_pose"], -end, 2 * end, 500)
     assert len(around.lanes[0].gaps) == 0
+    origin, width = around.head["begin"], around.head["width"]
+    drawn = [origin + number * width for number in around.lanes[1].gaps.ravel().tolist()]
+    assert -width < drawn[0] <= 0
+    assert end <= drawn[-1] < end + width
 
 
 GOOD = {"recording": "robot", "begin": "0", "end": "1000", "pixels": "10", "topic": "/odom"}
