@@ -125,6 +125,8 @@ def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store) -
         ("sql", {"text": "selec 1"}, "LINE 1"),
         ("sql", {"text": "select * from '/etc/passwd'"}, "no view"),
         ("sql", {"text": "select * from read_text('/etc/passwd')"}, "files"),
+        ("sql", {"text": "select * from glob('/etc/*')"}, "files"),
+        ("sql", {"text": "select * from query('create table a as select 1')"}, "single SELECT"),
         ("sql", {"text": "copy (select 1) to '/tmp/x'"}, "Only queries"),
         ("sql", {"text": "set memory_limit='9GB'"}, "Only queries"),
         ("sql", {"text": "select " + "(" * 3000 + "1" + ")" * 3000}, ""),
@@ -389,9 +391,11 @@ def test_a_question_is_asked_and_its_matches_become_a_file(
     page.goto(f"{demo_url}#recording=robot")
     page.get_by_label("Topic of the question").select_option("/base/scan")
     page.locator("body").press("/")
-    page.keyboard.type("ranges.mi")
+    page.keyboard.type("ranges.m")
     page.get_by_role("option", name="ranges.min").wait_for()
-    page.keyboard.press("Tab")
+    page.keyboard.type("i")
+    page.keyboard.press("Tab")  # before the candidates are there
+    page.locator("[role=option][aria-selected=true]").wait_for(state="attached")
     page.keyboard.type(" <")
     page.keyboard.press("Enter")
     assert (

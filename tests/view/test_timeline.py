@@ -372,6 +372,7 @@ def test_keys_alone(page: Page, demo_url: str) -> None:
     page.keyboard.press("End")
     until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length - 0.001}")
     page.keyboard.press("Home")
+    until(page, "Number(document.querySelector('.density').ariaValueNow) === 0")
     page.keyboard.press("ArrowRight")
     until(page, "Number(document.querySelector('.density').ariaValueNow) > 0")
     assert cursor(page) == pytest.approx(length * SECOND / 50, rel=0.01)

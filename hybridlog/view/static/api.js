@@ -14,12 +14,12 @@ const running = new Map();
  *     an older one, which then throws an `AbortError`
  */
 export async function get(path, parameters = {}, options = {}) {
-  return (await request(path, parameters, options)).json();
+  return request(path, parameters, options, (response) => response.json());
 }
 
 /** An answer as bytes: an `ArrayBuffer`. */
 export async function bytes(path, parameters = {}, options = {}) {
-  return (await request(path, parameters, options)).arrayBuffer();
+  return request(path, parameters, options, (response) => response.arrayBuffer());
 }
 
 /** The address of an answer, for pictures and links. */
@@ -34,8 +34,8 @@ export function address(path, parameters = {}) {
   return text ? `${path}?${text}` : path;
 }
 
-/** The response itself; its status is 200. */
-export async function request(path, parameters = {}, { slot, signal } = {}) {
+/** What `read` makes of the response, whose status is 200; until then, it can be aborted. */
+export async function request(path, parameters = {}, { slot, signal } = {}, read = (all) => all) {
   const own = new AbortController();
   signal?.addEventListener("abort", () => own.abort());
   if (slot) {
@@ -44,7 +44,7 @@ export async function request(path, parameters = {}, { slot, signal } = {}) {
   }
   try {
     const response = await fetch(address(path, parameters), { signal: own.signal });
-    if (response.ok) return response;
+    if (response.ok) return await read(response);
     const text = await response.text();
     throw new ApiError(messageOf(text) || `The server answered ${response.status}.`);
   } catch (error) {

@@ -18,16 +18,24 @@ export function completed(input, context) {
   const list = element("ul", { class: "candidates", role: "listbox", id: "candidates", hidden: true });
   let found = null; // { begin, candidates, place, taken }
   let waiting = 0;
+  let turn = 0; // changes when the candidates are no longer wanted
+  let isLoading = false;
+  let takesFirst = false; // Tab came before the candidates
   input.setAttribute("aria-controls", "candidates");
   input.setAttribute("aria-expanded", "false");
   input.addEventListener("input", () => {
     clearTimeout(waiting);
     close();
+    isLoading = true;
     waiting = setTimeout(load, 120);
   });
   input.addEventListener("keydown", (event) => {
-    if (event.key !== "Tab" || !found?.candidates.length) return;
+    if (event.key !== "Tab" || !(isLoading || found?.candidates.length)) return;
     event.preventDefault();
+    if (isLoading) {
+      takesFirst = true;
+      return;
+    }
     const step = event.shiftKey ? found.candidates.length - 1 : 1;
     take((found.taken < 0 ? (event.shiftKey ? 0 : -1) : found.taken) + step);
   });
@@ -35,16 +43,22 @@ export function completed(input, context) {
   return { list, close };
 
   async function load() {
+    const mine = turn;
     const place = input.selectionStart;
+    let answer = null;
     try {
       const asked = { ...context(), text: input.value, place };
-      found = { ...(await get("complete", asked, { slot: "complete" })), place, taken: -1 };
+      answer = await get("complete", asked, { slot: "complete" });
     } catch (error) {
       if (isAborted(error)) return;
-      if (!(error instanceof ApiError)) throw error;
-      found = null; // what is wrong is said when it is asked
+      if (!(error instanceof ApiError)) throw error; // what is wrong is said when it is asked
     }
-    if (document.activeElement === input) draw();
+    if (mine !== turn) return;
+    isLoading = false;
+    found = answer && { ...answer, place, taken: -1 };
+    if (takesFirst && found?.candidates.length) take(0);
+    else draw();
+    takesFirst = false;
   }
 
   function draw() {
@@ -85,8 +99,10 @@ export function completed(input, context) {
 
   function close() {
     clearTimeout(waiting);
+    turn += 1;
     const wasOpen = !list.hidden;
     found = null;
+    isLoading = takesFirst = false;
     list.hidden = true;
     input.setAttribute("aria-expanded", "false");
     return wasOpen;
