@@ -60,7 +60,7 @@ def plot(axes: Axes, query: Asked, fields: Sequence[str]) -> None:
     """Draw fields of a query over time; see `Query.plot`."""
     with _matplotlib():
         width = max(1, round(axes.get_window_extent().width))
-        draw(axes, lines(query, fields, pixels=width))
+        draw(axes, lines(query, fields or query.question.fields or (), pixels=width))
 
 
 def figure(found: Sequence[Line], *, size: tuple[int, int], form: str) -> bytes:

@@ -772,7 +772,7 @@ class Query:
 
         Args:
             fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
-                (`twist.linear`).
+                (`twist.linear`); without, those of `fields`.
             ax: Where to draw; None for a new figure of pyplot.
 
         Returns:

@@ -151,6 +151,9 @@ def test_query_plot(drive: Drive) -> None:
         assert len(plt.get_fignums()) == 1
         with pytest.raises(UsageError, match="Name a field"):
             query.plot(ax=axes)
+        before = len(axes.get_lines())
+        query["y"].plot(ax=axes)
+        assert np.array_equal(axes.get_lines()[before].get_data()[1], np.arange(100, 200) / 4)
     finally:
         plt.close("all")
 
