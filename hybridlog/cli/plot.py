@@ -85,29 +85,29 @@ def command(
     """Draw fields over time."""
     form = _form(output, form)
     shape = None if size is None else _size(size)
-    is_file = output is not None and str(output) != "-"
-    if output is not None and is_file:
-        check_room(output, force=force)
+    path = None if output is None or str(output) == "-" else output
+    if path is not None:
+        check_room(path, force=force)
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         from hybridlog.drawing.lines import lines
 
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
         names = [] if fields is None else parse_fields(fields)
-        height = _HEIGHT * max(1, len(query.topics))
-        shape = shape or (_WIDTH, height)
-        pixels = {"": _MOST_LETTERS, "html": _PAGE_PIXELS}.get(form, shape[0])
+        width = _WIDTH if shape is None else shape[0]
+        pixels = {"": _MOST_LETTERS, "html": _PAGE_PIXELS}.get(form, width)
         found = lines(query, names, pixels=pixels)
         if not form:
             _print(found)
         else:
-            with if_stopped(partial(not_written, output) if output and is_file else ""):
-                _write(found, form, shape, output if is_file else None)
+            height = _HEIGHT * max(1, len({line.topic for line in found}))
+            with if_stopped(partial(not_written, path) if path else ""):
+                _write(found, form, shape or (width, height), path)
         sys.stdout.flush()
         if not quiet:
             print_cost(query.counters, time.monotonic() - started, count=True)
             print_left_out(query, query.counters)
-            print_remarks(query, topic, is_empty=not any(len(x.series.times) for x in found))
+            print_remarks(query, topic, is_empty=not found or not query.counters.messages)
             print_gaps(query, between)
 
 
@@ -164,6 +164,9 @@ def _print(found: Sequence[Line]) -> None:
         ("recording", [line.recording for line in found]),
     ]
     beside = [(name, cells) for name, cells in shared if len(set(cells)) > 1]
+    if not any(len(line.series.times) for line in found):
+        output.note("No message.")
+        return
     columns: list[output.Column] = [(name, "left") for name, _ in beside]
     columns += [("field", "left"), ("least", "right"), ("greatest", "right"), ("", "whole")]
     rows = [

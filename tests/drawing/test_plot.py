@@ -79,6 +79,11 @@ def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
         assert content.startswith({"pdf": b"%PDF", "html": b"<!doctype html>"}[form])
     plot(drive, *ask, code=2)
     assert path.read_bytes() == content
+    if form == "png":  # topics without such a field take no room
+        for names, height in (("y", 400), ("y,w", 800)):
+            plot(drive, "-t", "*", "--fields", names, "-o", tmp_path / f"{names}.png")
+            with Image.open(tmp_path / f"{names}.png") as picture:
+                assert picture.size == (1200, height)
     plot(drive, *ask, "--force", "--between", "+1s", "+2s")
     assert path.read_bytes() != content
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("speed")] == [path.name]
@@ -97,6 +102,9 @@ def test_standard_output_and_text(drive: Drive) -> None:
     drawn = rows[2][len(rows[2]) - 60 :]
     columns = [z[n * 5 : n * 5 + 5].mean() for n in range(60)]
     assert drawn == sparkline(np.array(columns))
+    done = plot(drive, "-t", "drive", "--fields", "y", "--where", "y > 1e9")
+    assert done.out == ""
+    assert "No message." in done.err
     done = plot(drive, "-t", "drive", "-t", "loose", "--fields", "w,y")
     assert done.lines[0].split() == ["topic", "field", "least", "greatest"]
 
