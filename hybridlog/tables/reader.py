@@ -180,12 +180,11 @@ class TopicTable:
         return any(not leaf.is_own for leaves in self._leaves.values() for leaf in leaves)
 
     def has(self, path: str) -> bool:
-        """True if the field exists."""
+        """True if every file has the field: an array is a summary in some, a list in others."""
         names = _names(path)
-        return any(
-            not leaf.is_own and leaf.names[: len(names)] == names
+        return all(
+            any(not leaf.is_own and leaf.names[: len(names)] == names for leaf in leaves)
             for leaves in self._leaves.values()
-            for leaf in leaves
         )
 
     def size(self, paths: Collection[str] | None = None, own: Collection[str] = ()) -> int:

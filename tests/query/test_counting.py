@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import bson
+import numpy as np
 import pymongo
 import pytest
 from hypothesis import given
@@ -18,6 +20,8 @@ from hybridlog.query.intervals import Intervals
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.index_documents import key_bound
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_writer import SegmentSettings
 from tests.query.test_intervals import (
     BASE,
     SECOND,
@@ -198,3 +202,29 @@ def test_containing_without_mongodb(plain: hl.Store) -> None:
     with hl.open(plain.directory.path, mongo=away) as alone:
         assert len(windows.containing(alone.topic("/state"))) == 5
         assert len(windows.containing(alone.topic("/other"))) == 0
+
+
+def test_statistics_of_arrays_that_are_summaries_in_some_files(tmp_path: Path) -> None:
+    """Arrays of the first segments are short, so their table has the elements."""
+    channel = Channel("/a", "ros1", Schema("t/A", "ros1msg", b"float32[] r\n"))
+    settings = SegmentSettings(segment_size=1 << 16, chunk_size=1 << 12)
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("x", settings=settings) as recording:
+            for n in range(6000):
+                size = 3 if n < 3000 else 40
+                numbers = np.arange(n, n + size, dtype=np.float32).tobytes()
+                recording.write(channel, size.to_bytes(4, "little") + numbers, log_time=BASE + n * 10**6)
+        table = store.session.table(store.recordings()[0], "/a")
+        assert table is not None
+        kinds = {str(file.schema.field("r").type)[:4] for file in table.files}
+        assert kinds == {"list", "stru"}
+        for where, count in {
+            "r.min < 10": 10,
+            "r.min >= 2990": 3010,
+            "r.n == 3": 3000,
+            "not r.max < 3100": 6000 - 3061,
+            "r.mean == 11": 1,
+        }.items():
+            query = store.topic("/a").where(where)
+            assert query.count() == count, where
+            assert query.counters.chunks_read == 0
