@@ -213,7 +213,9 @@ def test_statistics_of_arrays_that_are_summaries_in_some_files(tmp_path: Path) -
             for n in range(6000):
                 size = 3 if n < 3000 else 40
                 numbers = np.arange(n, n + size, dtype=np.float32).tobytes()
-                recording.write(channel, size.to_bytes(4, "little") + numbers, log_time=BASE + n * 10**6)
+                recording.write(
+                    channel, size.to_bytes(4, "little") + numbers, log_time=BASE + n * 10**6
+                )
         table = store.session.table(store.recordings()[0], "/a")
         assert table is not None
         kinds = {str(file.schema.field("r").type)[:4] for file in table.files}
@@ -228,3 +230,9 @@ def test_statistics_of_arrays_that_are_summaries_in_some_files(tmp_path: Path) -
             query = store.topic("/a").where(where)
             assert query.count() == count, where
             assert query.counters.chunks_read == 0
+        changes = {"r.n": [3000], "r.min": [*range(1, 6000)]}
+        for field, expected in changes.items():
+            found = store.topic("/a").changes(field, pause=0)
+            assert [(one.begin_ns - BASE) // 10**6 for one in found] == expected
+        late = store.topic("/a").between(BASE + 3000 * 10**6, None).changes("r.n", pause=0)
+        assert len(late) == 1  # compared with the message before the range

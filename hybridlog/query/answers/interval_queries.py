@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.counters import Counters
+    from hybridlog.query.engines.base import Values
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -230,19 +231,34 @@ class IntervalQueries:
         self, part: Part, span: Span, paths: Collection[str], tolerance: float, changing: Changing
     ) -> Iterator[NDArray[np.int64]]:
         carried = self._row_before(part, span, paths)
-        for found in self._planner.values(_bounded(part, span), paths):
+        for found in self._values(_bounded(part, span), paths):
             if not len(found.log_time):
                 continue
             differs, carried = _steps(carried, found.records, tolerance)
             yield changing.add(found.log_time[differs])
         yield changing.finish()
 
+    def _values(self, part: Part, paths: Collection[str]) -> Iterator[Values]:
+        """Fields of the matching messages; summaries of arrays (`ranges.min`) as fields."""
+        from hybridlog.frames.columns import flat, with_summaries
+        from hybridlog.frames.names import is_summary
+        from hybridlog.schema.arrow_columns import structs
+
+        known = part.field_types or {}
+        summaries = {path for path in paths if is_summary(path, known)}
+        read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
+        for found in self._planner.values(part, read):
+            if summaries:
+                leaves = with_summaries(flat(found.records), paths)
+                found = found._replace(records=structs(leaves, len(found.log_time)))  # noqa: PLW2901
+            yield found
+
     def _row_before(self, part: Part, span: Span, paths: Collection[str]) -> pa.StructArray | None:
         """The fields of the last matching message before a span."""
         for begin in _earlier(part, span):
             last = None
             earlier = _bounded(part, (begin, span[0]))
-            for found in self._beside(partial(self._planner.values, fields=paths), earlier):
+            for found in self._beside(partial(self._values, paths=paths), earlier):
                 if len(found.records):
                     last = found.records.slice(len(found.records) - 1)
             if last is not None:
