@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from hybridlog.drawing.series import GAP_PERIODS, usual_period
+from hybridlog.frames.names import FIELD
+from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.question import field_types
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.drawing.flushed import Flushed
     from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
 _RADIUS = 6_378_137.0  # m, semi-major axis of WGS 84
 _ECCENTRICITY = 6.694379990141317e-3  # squared
 _CHI = 5.991464547107979  # square of the radius that holds 95 % of a normal distribution in 2-D
+_STATUS: Final = "status.status"
 _KEPT = 6  # positions of a pixel at most
 
 
@@ -148,9 +153,12 @@ class Position:
         return f"{self.prefix}{names[0]}", f"{self.prefix}{names[1]}"
 
 
-def position_of(query: Query) -> Position | None:
-    """Where the messages have their position; None if they have none."""
-    known = query.field_types()
+def position_of(known: Mapping[str, str] | None) -> Position | None:
+    """Where messages have their position; None if they have none.
+
+    Args:
+        known: Types of their fields by path; None if no definition fixes them.
+    """
     if known is None:
         return Position("", is_geographic=True)
     for end, is_geographic in (("latitude", True), ("position.x", False)):
@@ -163,48 +171,87 @@ def position_of(query: Query) -> Position | None:
     return None
 
 
-def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
+def track(
+    query: Query | None,
+    *,
+    pixels: int,
+    span: Span | None = None,
+    flushed: Flushed | None = None,
+) -> Track:
     """The positions of a topic, such as NavSatFix or Odometry, over log time.
 
     A message has a fix if its position is one and its `status.status`, if there is one, is not
     negative. The counters of the query are set to the cost.
 
     Args:
-        query: About one topic of one recording.
+        query: About one topic of one recording; None for none but `flushed`.
         pixels: Steps of time. Up to six times as many messages are returned exactly.
         span: Log time `[begin, end)`, ns; None for that of the messages.
+        flushed: Later messages of the topic, of a recording that goes on.
 
     Raises:
         UsageError: several topics or recordings, no positions, `reverse`, or no pixel.
         TimeError: the range of the query is outside all recordings.
     """
-    position = position_of(query)
+    if pixels < 1:
+        raise UsageError("A track has at least one pixel.")
+    known: Mapping[str, str] | None = None
+    if query is not None:
+        known = query.field_types()
+    elif flushed is not None:
+        known = field_types(tuple(flushed.channels))
+    position = position_of(known)
     if position is None:
-        raise UsageError(f"{', '.join(query.topics)} has no latitude and longitude, and no pose.")
-    if pixels < 1 or query.question.reverse:
-        raise UsageError("A track goes forward in time, in at least one pixel.")
+        raise UsageError("These messages have no latitude and longitude, and no pose.")
+    paths = list(position.paths)
+    if position.is_geographic and (known is None or _STATUS in known):
+        paths.append(_STATUS)
+    parts: list[tuple[Span, Iterable[pa.Table]]] = []
+    counters, cost = Counters(), Counters()
+    if query is not None:
+        asked, extent = _asked(query, paths, span)
+        counters, cost = query.counters, asked.counters
+        parts.append((extent, asked.to_tables()))
+    if flushed is not None and flushed.span is not None:
+        extent = _common(flushed.span, span)
+        parts.append((extent, flushed.tables(paths, extent)))
+    parts = [(extent, tables) for extent, tables in parts if extent[0] < extent[1]]
+    begin = min((extent[0] for extent, _ in parts), default=0)
+    end = max((extent[1] for extent, _ in parts), default=0)
+    made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
+    with counters.timed():
+        for _, tables in parts:
+            for table in tables:
+                made.add(table, paths)
+        counters.add(cost)
+    return made.track()
+
+
+def _asked(query: Query, paths: Sequence[str], span: Span | None) -> tuple[Query, Span]:
+    """The query for some fields, and the part of the span that it covers.
+
+    Raises:
+        UsageError, TimeError: see `track`.
+    """
+    if query.question.reverse:
+        raise UsageError("A track goes forward in time: leave out reverse.")
     spans = query.spans()
     if len(query.topics) != 1 or len(spans) > 1:
         raise UsageError(
             f"A track is of one topic in one recording; these are {len(query.topics)} topics in "
             f"{len(spans)} recordings."
         )
-    paths = list(position.paths)
-    if position.is_geographic and "status.status" in (query.field_types() or {"status.status"}):
-        paths.append("status.status")
     asked = query.fields(*paths)
-    recording, (begin, end) = next(iter(spans.items()), ("", (0, 0)))
+    recording, whole = next(iter(spans.items()), ("", (0, 0)))
+    begin, end = _common(whole, span)
     if span is not None and recording:
-        begin, end = max(begin, span[0]), min(end, span[1])
         window = np.array([[begin, max(begin, end), 0]], np.int64)
         asked = asked.during(Intervals.of([(recording, window)]))
-    made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
-    if begin < end:
-        with query.counters.timed():
-            for table in asked.to_tables():
-                made.add(table, paths)
-            query.counters.add(asked.counters)
-    return made.track()
+    return asked, (begin, end)
+
+
+def _common(whole: Span, span: Span | None) -> Span:
+    return whole if span is None else (max(whole[0], span[0]), min(whole[1], span[1]))
 
 
 class _Builder:
@@ -243,8 +290,12 @@ class _Builder:
         xy = np.full((len(has_fix), 2), np.nan)
         xy[has_fix] = self._metres(first[has_fix], second[has_fix])
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
+        is_sorted = not len(self._times) or not len(times) or times[0] >= self._times[-1]
         self._times = np.concatenate([self._times, times])
         self._xy = np.concatenate([self._xy, xy])
+        if not is_sorted:  # what is flushed may begin before the last message of a query
+            order = np.argsort(self._times, kind="stable")
+            self._times, self._xy = self._times[order], self._xy[order]
         if len(self._times) > self._limit:
             self._thin()
 
@@ -314,13 +365,15 @@ def _numbers(table: pa.Table, path: str) -> NDArray[np.float64]:
     """
     import pyarrow as pa
 
-    if path not in table.column_names:
-        return np.full(table.num_rows, np.nan)
-    kind = table.schema.field(path).type
-    if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)):
-        raise UsageError(f"{path} is no number but {kind}: only numbers can be drawn.")
-    values: NDArray[np.float64] = table[path].cast(pa.float64(), safe=False).to_numpy()
-    return values
+    for field, column in zip(table.schema, table.columns, strict=True):
+        if (field.metadata or {}).get(FIELD, field.name.encode()).decode() != path:
+            continue
+        kind = field.type
+        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)):
+            raise UsageError(f"{path} is no number but {kind}: only numbers can be drawn.")
+        values: NDArray[np.float64] = column.cast(pa.float64(), safe=False).to_numpy()
+        return values
+    return np.full(table.num_rows, np.nan)
 
 
 def fix_of(message: Message, prefix: str = "") -> Fix:

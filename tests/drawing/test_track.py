@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,12 @@ from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
+from hybridlog.drawing.flushed import FlushedMessages
 from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
 from hybridlog.query.topics import TopicMatcher
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
 from tests.ros_values import ROS1
 from tests.test_arrays import decoded
@@ -164,6 +167,40 @@ def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
     assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [20]
 
 
+def test_a_recording_that_goes_on(tmp_path: Path) -> None:
+    """Its track is that of all that is flushed, and in its end that of a query."""
+    path = tmp_path / "store"
+    count = 60
+    with hl.open(path, create=True) as writing, hl.open(path) as store:
+        settings = SegmentSettings(chunk_size=1024, segment_size=4096, compression="none")
+        with writing.start("live", settings=settings, flush_interval_s=0.05) as recorder:
+            for at in range(count):
+                place = payload(48 + at / 1000, 11.0, -1 if at == 50 else 0)
+                recorder.write(channel("/fix"), place, log_time=BASE + at * MS)
+            following, until = FlushedMessages(store.session), monotonic() + 60
+            found = 0
+            while found < count:
+                assert monotonic() < until
+                sleep(0.02)
+                store.refresh()
+                entry = store.entry("live")
+                flushed = following.of(entry, "/fix")
+                found = entry.messages + flushed.count
+            query = store.query(["/fix"], [entry.id]) if entry.messages else None
+            assert flushed.count
+            got = track(query, pixels=1000, flushed=flushed)
+            part = track(query, pixels=1000, flushed=flushed, span=(BASE + 40 * MS, BASE + 55 * MS))
+        store.refresh()
+        whole = track(store.topic("fix"), pixels=1000)
+    assert (got.messages, got.fixes, got.exact) == (count, count - 1, True)
+    assert got.times.tolist() == whole.times.tolist() == [BASE + at * MS for at in range(count)]
+    assert np.array_equal(got.xy, whole.xy, equal_nan=True)
+    assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [50]
+    assert part.times.tolist() == whole.times[40:55].tolist()
+    nothing = track(None, pixels=5)
+    assert (nothing.messages, nothing.grid) == (0, None)
+
+
 def test_json_without_a_definition(store: hl.Store) -> None:
     got = track(store.topic("json"), pixels=10)
     assert got.fixes == 5
@@ -206,7 +243,7 @@ def test_one_fix(tmp_path: Path) -> None:
                 values = {"latitude": 48.0, "longitude": 11.0, **one}
                 recorder.write(fix, payload(**values), log_time=BASE + at)
         fixes = [fix_of(message) for message in store.topic("fix")]
-        assert position_of(store.topic("fix")) == Position("", is_geographic=True)
+        assert position_of(store.topic("fix").field_types()) == Position("", is_geographic=True)
     assert fixes[0].ellipse == pytest.approx((2 * 2.4477, 2.4477, math.pi / 2), abs=1e-3)
     assert fixes[0].altitude == 12.5
     assert fixes[0].time == BASE
@@ -222,7 +259,7 @@ def test_one_fix(tmp_path: Path) -> None:
 def test_topics_without_positions(store: hl.Store) -> None:
     with pytest.raises(UsageError, match="2 topics in 1 recordings"):
         track(store.topic("fix", "other"), pixels=10)
-    with pytest.raises(UsageError, match="forward"):
+    with pytest.raises(UsageError, match="forward in time"):
         track(store.topic("fix").reverse(), pixels=10)
     with pytest.raises(UsageError, match="at least one pixel"):
         track(store.topic("fix"), pixels=0)
@@ -256,7 +293,9 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         store.record(bag)
         query = store.topic("odom")
-        assert position_of(query) == Position("pose.pose.position.", is_geographic=False)
+        assert position_of(query.field_types()) == Position(
+            "pose.pose.position.", is_geographic=False
+        )
         got = track(query, pixels=len(read))
         assert (got.is_geographic, got.grid, got.exact) == (False, None, True)
         assert got.times.tolist() == [time for time, _ in read]
@@ -272,7 +311,7 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
         turned = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
         assert found.heading is not None
         assert math.cos(found.heading - turned) == pytest.approx(1)
-        assert position_of(store.topic("r_cart/command_pose")) == Position(
+        assert position_of(store.topic("r_cart/command_pose").field_types()) == Position(
             "pose.position.", is_geographic=False
         )
         with pytest.raises(UsageError, match="has no position"):

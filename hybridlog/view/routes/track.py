@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
-from hybridlog.view.context import route, start_of
+from hybridlog.view.context import route
 from hybridlog.view.current import current
 from hybridlog.view.packed import packed_response
+from hybridlog.view.topic import Topic
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,13 +27,12 @@ def track_of(context: Context, asked: Asked) -> Response:
 
     Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time.
     """
-    recording = context.recording(asked)
-    start = start_of(recording)
+    topic = Topic(context, asked)
+    start = topic.start
     span = None
     if asked.has("begin") or asked.has("end"):
         span = start + asked.offset("begin"), start + asked.offset("end")
-    query = context.query(recording, asked.text("topic"))
-    found = track(query, pixels=asked.pixels(), span=span)
+    found = track(topic.query, pixels=asked.pixels(), span=span, flushed=topic.flushed)
     header = {
         "grid": None if found.grid is None else asdict(found.grid),
         "is_geographic": found.is_geographic,
@@ -56,8 +56,8 @@ def fix_at(context: Context, asked: Asked) -> dict[str, Any]:
     answer: dict[str, Any] = {"time": shown.time, "until": shown.until}
     if shown.message is None:
         return answer
-    query = context.query(context.recording(asked), shown.message.topic)
-    position = position_of(query) or Position("", is_geographic=True)
+    known = Topic(context, asked).field_types()
+    position = position_of(known) or Position("", is_geographic=True)
     if position.is_geographic:
         found = asdict(fix_of(shown.message, position.prefix))
     else:

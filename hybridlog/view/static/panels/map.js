@@ -9,7 +9,7 @@ import { follow } from "./follow.js";
 import { opening } from "./python.js";
 
 const PIXELS = 2000; // steps of time of a track
-const REST = 10; // times as long as the last track took
+const REST = 4; // times as long as the last track took
 const NEAR = 12; // pixels within which a click means the track
 const TYPES = new Set([
   "sensor_msgs/NavSatFix",
