@@ -106,7 +106,9 @@ class Context:
         known = {channel.topic for channel in recording.channels}
         for topic in topics:
             if topic not in known:
-                raise TopicError(f"{recording.label} has no topic {topic!r}.")
+                is_open = recording.status == "open"
+                yet = " yet: it is being recorded, so ask again soon" if is_open else ""
+                raise TopicError(f"{recording.label} has no topic {topic!r}{yet}.")
         return self.store.query(topics, [recording.id])
 
 

@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import shlex
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ import hybridlog as hl
 from hybridlog.cli import fetch
 from hybridlog.view.app import make_app
 from hybridlog.view.routes import ask, export
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
 
 from .conftest import PORT, TOKEN
@@ -311,6 +313,27 @@ def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]
     assert client.get("export-command", params=asked).json()["told"] == want
     answer = client.get("sql", params={**asked, "text": "select count(*) from large"}).json()
     assert any("are lost; the table losses" in line for line in answer["remarks"])
+
+
+def test_a_running_recording(odd: hl.Store, asking: Callable[[hl.Store], TestClient]) -> None:
+    client = asking(odd)
+    text = "select count(*) from fresh where n % 2 = 0"
+    fresh = Channel("/fresh", "json", None, {})
+    with odd.start("runs", settings=SegmentSettings(chunk_size=1024)) as recording:
+        asked = {"recording": "runs", "topic": "/fresh", "where": "n < 90"}
+        for n in range(100):
+            payload = json.dumps({"n": n, "pad": "-" * 200}).encode()
+            recording.write(fresh, payload, log_time=n * S)
+        for _ in range(3000):  # until the first chunk is flushed
+            answer = client.get("sql", params={**asked, "text": text})
+            if answer.status_code == 200:
+                break
+            time.sleep(0.02)
+        assert answer.json()["remarks"] == []
+        problem = client.get("ask", params=asked).json()["error"]
+        assert problem == "runs has no topic '/fresh' yet: it is being recorded, so ask again soon."
+    odd.refresh()
+    assert client.get("ask", params=asked).json()["told"] == "90"
 
 
 def test_observed_fields_are_offered(

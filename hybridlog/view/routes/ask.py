@@ -55,10 +55,15 @@ def ask(context: Context, asked: Asked) -> dict[str, Any]:
     query = question.query()
     count = query.count()
     lost = query.lost()
+    remarks = query.remarks(*query.topics)
+    if question.recording.status == "open":
+        remarks.append(
+            f"{question.recording.label} is being recorded; the latest messages may be missing."
+        )
     return {
         "count": count,
         "told": lost.describe(count) if lost else str(count),
-        "remarks": query.remarks(*query.topics),
+        "remarks": remarks,
         "python": question.python(),
         "command": question.command(),
     }
@@ -214,8 +219,11 @@ def _remarks(context: Context, answer: SqlAnswer) -> list[str]:
             f"Fields of {count} {state} messages of {topic} are null."
             for topic, count in counts.items()
         ]
-    if remarks.topics and remarks.recordings:
-        lost = context.store.query(sorted(remarks.topics), [*remarks.recordings]).lost()
+    # Topics of a running recording that are in no sealed segment yet have no losses either.
+    entries = remarks.recordings.values()
+    topics = remarks.topics & {one.topic for entry in entries for one in entry.channels}
+    if topics:
+        lost = context.store.query(sorted(topics), [*remarks.recordings]).lost()
         if lost:
             found.append(f"Of what was read, {lost.told}; the table losses says where.")
     return found
