@@ -67,7 +67,16 @@ def test_conditions_on_topics(text: str, want: Condition) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["x > 1", "x == ': y'", "`a: b` > 1", 't == t"08:00: 1"', "a:b > 1", "a[3: 8] > 1"]
+    "text",
+    [
+        "x > 1",
+        "x == ': y'",
+        "`a: b` > 1",
+        't == t"08:00: 1"',
+        "a:b > 1",
+        "a[3: 8] > 1",
+        "a[ 3: 8 ] > 1",
+    ],
 )
 def test_predicates_without_topics(text: str) -> None:
     assert not names_topics(text)
