@@ -140,9 +140,10 @@ class PlayedLog:
             latched = self._whole.with_topic(*self._latching.intersection(topics))
             for batch, channels in latched.between(position + 1, None).latched(original_times=True):
                 yield self._block(batch, channels)
-        for topic in topics:
-            if topic not in self._latching:
-                yield from self._last(topic, position)
+        if position >= self.begin:
+            for topic in topics:
+                if topic not in self._latching:
+                    yield from self._last(topic, position)
 
     def _last(self, topic: str, position: int) -> Iterator[Block]:
         """The last message of a topic until a log time, ns, if the range has one."""

@@ -233,6 +233,23 @@ def test_messages_of_the_same_time_stay_together(
     assert [int(m.payload) for m in found] == list(range(3000))
 
 
+def test_time_may_begin_at_zero(tmp_path: Path) -> None:
+    with (tmp_path / "zero.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/n", "json", 0)
+        for n in range(3):
+            writer.add_message(channel, n * S, b"%d" % n, 0)
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True) as opened:
+        opened.record(tmp_path / "zero.mcap")
+        with served(PlayedLog(opened.all_topics())) as url, Viewer(url) as viewer:
+            viewer.subscribe()
+            assert [m.time for m in viewer.until_end()] == [0, S, 2 * S]
+            viewer.control(plays=False, seek=0)
+            assert [m.time for m in data(viewer.quiet())] == [0]
+
+
 def test_a_late_subscriber_gets_what_is_current(one: PlayedLog) -> None:
     with served(one, is_paused=True) as url, Viewer(url) as viewer:
         viewer.control(plays=False, seek=BEGIN + S)
