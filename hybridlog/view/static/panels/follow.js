@@ -4,7 +4,7 @@ import { ApiError } from "../api.js";
 
 const MOST_KEPT = 64;
 const MOST_BYTES = 64 << 20;
-const STILL_PLAYING = 250; // ms between two steps of a cursor that plays
+const STILL_PLAYING = 160; // ms between two steps of a cursor that plays
 
 /**
  * An answer about one message.
