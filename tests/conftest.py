@@ -152,6 +152,7 @@ SLOW = frozenset(
         "test_style.py",
         "view/test_guard.py",
         "view/test_mcap.py",
+        "view/test_panels.py",
         "view/test_spatial.py",
     )
 )
