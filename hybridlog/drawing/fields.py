@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
+from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,7 +48,9 @@ def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> l
 
 
 def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
-    first = next(messages, None)
+    first = None
+    with suppress(SegmentError):  # damage hides how long arrays are, and no field
+        first = next(messages, None)
     values = {} if first is None else first.fields
     for path, kind in known.items():
         if "[" in path:

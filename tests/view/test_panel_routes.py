@@ -31,7 +31,8 @@ from tests.every_image import (
     SAMPLES,
     WIDTH,
 )
-from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time
+from tests.odd_messages import HOSTILE, LOGS, LONG, MS, START, log_time, write_odd
+from tests.view.conftest import Asking
 
 S = 10**9
 
@@ -285,3 +286,27 @@ def test_a_later_chunk_may_have_the_earlier_time() -> None:
     assert next_time(session, recording, "/a", 5 * S) == 60 * S
     assert next_time(session, recording, "/a", 70 * S) == 90 * S
     assert next_time(session, recording, "/a", 91 * S) is None
+
+
+def test_a_damaged_chunk_is_told(tmp_path: Path, asking: Asking) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        write_odd(store)
+    (segment,) = (tmp_path / "store").rglob("*.mcap")
+    data = bytearray(segment.read_bytes())
+    data[2000 : len(data) * 3 // 4 : 300] = bytes(len(data[2000 : len(data) * 3 // 4 : 300]))
+    segment.chmod(0o644)
+    segment.write_bytes(data)
+    with hl.open(tmp_path / "store") as store:
+        client = asking(store)
+        for page, topic, asked in (
+            ("message", "/own", {"at": S}),
+            ("image", "/own", {"at": S}),
+            ("series", "/own", {"field": "id", "begin": 0, "end": 6 * S, "pixels": 10}),
+            ("log", "/rosout", {"at": S, "before": 5}),
+            ("log", "/rosout", {"at": S, "after": 5, "text": "line"}),
+        ):
+            answer = client.get(page, params={"recording": "odd", "topic": topic, **asked})
+            assert answer.status_code == 400, page
+            assert "damaged" in answer.json()["error"]
+        paths = [field["path"] for field in got(client, "fields", "/own")["fields"]]
+        assert paths[:5] == ["ok", "id", "ratio", "at", "took"]
