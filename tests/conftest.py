@@ -66,6 +66,7 @@ for number, handler in (
 SLOW = frozenset(
     (
         "across/test_align.py",
+        "across/test_bins.py",
         "across/test_lost.py",
         "across/test_near.py",
         "across/test_rates.py",
@@ -77,6 +78,7 @@ SLOW = frozenset(
         "benchmarks/test_throughput.py",
         "payloads/test_compact.py",
         "payloads/test_drop.py",
+        "payloads/test_format.py",
         "cli/test_coverage.py",
         "cli/test_export.py",
         "cli/test_fetch.py",
