@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.drawing.lines import Line, lines
+from hybridlog.drawing.lines import Line, drawable, lines, printable
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import MissingDependencyError
 
@@ -39,8 +39,8 @@ def _matplotlib() -> Iterator[None]:
             "does not"
         ) from error
     with warnings.catch_warnings():
-        # Names in logs may have letters that the font lacks: they are shown as boxes.
-        warnings.filterwarnings("ignore", "Glyph")
+        # Letters that the font lacks are boxes; in a picture that is too small, names overlap.
+        warnings.filterwarnings("ignore", "Glyph|constrained_layout")
         yield
 
 
@@ -104,10 +104,10 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
     for line, colour in zip(found, colours, strict=True):
         times, values = line.series.polyline()
         at = (times - line.start) / (1e9 * step)
-        (curve,) = axes.plot(at, values, color=colour, linewidth=1.2, solid_joinstyle="round")
+        (curve,) = axes.plot(at, drawable(values), color=colour, linewidth=1.2)
         is_marked = line.series.alone() if len(line.series.times) > FEW else slice(None)
         marks = (line.series.times[is_marked] - line.start) / (1e9 * step)
-        axes.plot(marks, line.series.least[is_marked], ".", color=colour, markersize=4)
+        axes.plot(marks, drawable(line.series.least[is_marked]), ".", color=colour, markersize=4)
         drawn.append(curve)
     recordings = {(line.recording, line.start) for line in found}
     since = "the beginning of each recording"
@@ -166,6 +166,4 @@ def _colours(count: int) -> list[object]:
 def _label(text: Text, words: str) -> None:
     """Set a text that is shown as it is: names in logs are no formulas."""
     text.set_parse_math(False)
-    text.set_text(
-        "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in words)
-    )
+    text.set_text(printable(words))

@@ -6,15 +6,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from hybridlog.drawing.series import Series, numbers_of, series
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from hybridlog.drawing.asked import Asked
 
 MOST: Final = 50
 """Lines that can be told apart, with good will."""
+_GREATEST: Final = 1e300
 _SHOWN = 8  # names in a message
 
 
@@ -107,6 +112,13 @@ def _groups(
 
 def _by_topic(query: Asked) -> Iterator[Asked]:
     return (query.with_topic(topic) for topic in query.topics)
+
+
+def drawable(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values for an axis: NaN for infinite ones, and none so great that a range overflows."""
+    found: NDArray[np.float64] = np.clip(values, -_GREATEST, _GREATEST)
+    found[np.isinf(values)] = np.nan
+    return found
 
 
 def printable(text: str) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog import __version__
-from hybridlog.drawing.lines import Line, printable
+from hybridlog.drawing.lines import Line, drawable, printable
 from hybridlog.query.times import format_time
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _chart(topic: str, group: Sequence[Line]) -> dict[str, Any]:
                 "lines": [
                     {
                         "name": printable(" ".join([line.series.field, *which])),
-                        "values": _packed(values),
+                        "values": _packed(drawable(values)),
                     }
                     for line, (_, values) in zip(lines, corners, strict=True)
                 ],

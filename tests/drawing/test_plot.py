@@ -194,6 +194,9 @@ def test_odd_lines() -> None:
     assert "svg" in curves_of([])
     assert "svg" in curves_of([made([], [])])
     assert "svg" in curves_of([made([0, 1], [NAN, NAN]), made([0], [np.inf])])
+    # DBL_MAX is how some drivers say that they do not know.
+    assert "svg" in curves_of([made([0, 1, 2], [1.7e308, -1.7e308, 0])])
+    assert figure([made([0, 1], [0, 1], "f" * 300)], size=(300, 100), form="png")
     # Above ten lines, colours are those of a map.
     many = [made([0, 1], [n, n], f"f{n}") for n in range(12)]
     assert len({*re.findall(r"stroke: (#[0-9a-f]{6}); stroke-width: 1\.2", curves_of(many))}) == 12

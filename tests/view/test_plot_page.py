@@ -33,7 +33,7 @@ def test_a_page_without_a_server(page: Page, tmp_path: Path) -> None:
         line("/odom", "a", "speed", times, [0.25, 0.5, 0.75, nan, 1.0, nan]),
         line("/odom", "a", HOSTILE, times, [1, 2, 3, 4, float("inf"), 6]),
         line("/odom", "b", "speed", [0.5, 9.5], [3, 4]),
-        line(HOSTILE, "a", "y", [1.0, 2.0], [1e12, 2e12]),
+        line(HOSTILE, "a", "y", [1.0, 2.0, 3.0], [1e12, 1.7e308, -1.7e308]),
     ]
     path = tmp_path / "page.html"
     path.write_bytes(page_of(found, HOSTILE))
