@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +15,6 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written
 from hybridlog.cli.query_options import asked
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.write_answer import write_answer
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -53,7 +50,8 @@ _VIEWERS: Final = {
 @click.argument(
     "viewer",
     type=click.Choice(sorted(_VIEWERS)),
-    help="The program: foxglove is Foxglove, or Lichtblick where only that is installed.",
+    metavar="VIEWER",
+    help="foxglove, lichtblick or rerun. Where only Lichtblick is installed, foxglove is that.",
 )
 @options.only_recordings
 @options.only_topics
@@ -87,10 +85,14 @@ def command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Open a slice in Foxglove, Lichtblick or Rerun, where that is installed.
+    """Open a slice in Foxglove, Lichtblick or Rerun.
 
-    The slice is written as an MCAP file first. The command ends when the program does.
+    The program has to be installed. The slice is written as an MCAP file first. The command
+    ends when the program does.
     """
+    import subprocess
+
+    from hybridlog.cli.write_answer import write_answer
     from hybridlog.export.slice_cache import SliceCache
 
     program = _find(viewer)
@@ -98,7 +100,10 @@ def command(
         check_room(path, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
-        write = partial(_write, quiet=quiet)
+
+        def write(query: Query, path: Path) -> None:
+            write_answer(query, "mcap", path, extras=query.extras(), quiet=quiet)
+
         if path is None:
             ids = query.recordings
             name = opened.entry(ids[0]).label if len(ids) == 1 else "slice"
@@ -123,6 +128,8 @@ def _find(viewer: str) -> str:
     Raises:
         MissingDependencyError: It is not installed.
     """
+    import shutil
+
     programs, _, cure = _VIEWERS[viewer]
     for name in programs:
         found = shutil.which(name)
@@ -130,7 +137,3 @@ def _find(viewer: str) -> str:
             return found
     names = " or ".join(programs)
     raise MissingDependencyError(f"There is no program {names} on the PATH: {cure}.")
-
-
-def _write(query: Query, path: Path, *, quiet: bool) -> None:
-    write_answer(query, "mcap", path, extras=query.extras(), quiet=quiet)

@@ -58,7 +58,7 @@ def command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Show topics at regular times, or what they say from each to the next.
+    """Show topics at regular times, or what they say between these.
 
     The times begin with each recording, or with the range of --between.
     """

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import quote
 
 import click
 
@@ -88,6 +85,8 @@ def command(
         raise MissingDependencyError(
             "serve needs websockets: pip install 'hybridlog[foxglove]'"
         ) from error
+    import asyncio
+
     from hybridlog.playback.played import PlayedLog
 
     with opened_store(store, mongo, quiet=quiet) as opened:
@@ -104,6 +103,9 @@ def command(
 
 async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
     """Serve until a signal comes; a second one ends the process at once."""
+    import asyncio
+    import signal
+
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     before = {number: signal.getsignal(number) for number in SIGNALS}
@@ -121,6 +123,8 @@ async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
 
 
 def _print_address(port: int, *, quiet: bool) -> None:
+    from urllib.parse import quote
+
     address = f"ws://127.0.0.1:{port}"
     output.say(address)
     if not quiet:
