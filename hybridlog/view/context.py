@@ -34,6 +34,8 @@ MAX_WORKING: Final = 4
 
 REFRESH_S: Final = 2.0
 """Least time between two looks for new recordings."""
+REFRESH_SHARE: Final = 0.1
+"""Greatest share of the time that is spent on these looks, in stores of many recordings."""
 
 
 class Context:
@@ -49,7 +51,7 @@ class Context:
     def __init__(self, store: Store) -> None:
         self.store = store
         self._refreshing = threading.Lock()
-        self._refreshed = time.monotonic()
+        self._next_look = time.monotonic() + REFRESH_S
         self._working = threading.BoundedSemaphore(MAX_WORKING)
 
     @cached_property
@@ -81,12 +83,14 @@ class Context:
             yield
 
     def refresh(self) -> None:
-        """See what other processes have recorded since; at most every other second."""
+        """See what other processes have recorded since, unless the last look was just now."""
         with self._refreshing:
-            now = time.monotonic()
-            if now - self._refreshed >= REFRESH_S:
+            begun = time.monotonic()
+            if begun >= self._next_look:
                 self.store.refresh()
-                self._refreshed = now
+                self.store.session.snapshot()
+                ended = time.monotonic()
+                self._next_look = ended + max(REFRESH_S, (ended - begun) / REFRESH_SHARE)
 
     def recording(self, asked: Asked) -> RecordingEntry:
         """The recording that the parameter `recording` names by its label or id.

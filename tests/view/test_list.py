@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import hybridlog as hl
+from hybridlog.view import context
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -85,6 +86,25 @@ def test_a_recording_says_what_the_store_says(client: TestClient, demo_store: hl
         assert (row["first"], row["last"]) == (times[0] - entry.span[0], times[-1] - entry.span[0])
 
 
+def test_looking_for_new_recordings_is_bounded(
+    demo_store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes a tenth of the time at most, and new recordings are seen after two seconds."""
+    now, looks = [100.0], []
+
+    def look() -> None:
+        looks.append(now[0])
+        now[0] += 1.5  # it takes that long
+
+    monkeypatch.setattr(context.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(demo_store, "refresh", look)
+    shown = context.Context(demo_store)
+    for _ in range(100):
+        shown.refresh()
+        now[0] += 0.5
+    assert looks == [102.0, 118.5, 135.0, 151.5]
+
+
 def test_an_unknown_recording_is_not_found(client: TestClient) -> None:
     answer = client.get("recording", params={"recording": "<img>"})
     assert answer.status_code == 404
@@ -99,8 +119,10 @@ def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
     page.wait_for_selector("text=0 of 1 recording:")
     page.get_by_label("Topic").fill("")
     page.get_by_label("With a message").fill("scan: ranges.min <")
+    page.keyboard.press("Enter")
     assert "^" in page.get_by_role("alert").inner_text()
     page.get_by_label("With a message").fill("scan: ranges.min < 0.5")
+    page.keyboard.press("Enter")
     page.get_by_role("link", name="robot").click()
     page.wait_for_selector("text=18 topics")
     assert "#recording=robot" in page.url

@@ -25,7 +25,7 @@ const FILTERS = [
   { name: "type", title: "Type", hint: "sensor_msgs/Imu", isList: true },
   { name: "begin", title: "From", hint: "2026-11-27 10:00" },
   { name: "end", title: "To", hint: "2026-11-27 12:00" },
-  { name: "where", title: "With a message", hint: "scan: ranges.min < 0.5", isWide: true },
+  { name: "where", title: "With a message", hint: "scan: ranges.min < 0.5", isWide: true, isPredicate: true },
 ];
 
 /** Shows the list in an element. Returns a function that takes it away. */
@@ -58,14 +58,15 @@ export function mountList(main) {
     more,
   );
 
-  function filter({ name, title, hint, isWide }) {
+  function filter({ name, title, hint, isWide, isPredicate }) {
     const input = element("input", {
       name,
       placeholder: hint,
       autocomplete: "off",
       spellcheck: "false",
       type: "search",
-      oninput: () => {
+      // A predicate may take long, and makes no sense before it is finished.
+      [isPredicate ? "onchange" : "oninput"]: () => {
         clearTimeout(timer);
         timer = setTimeout(() => load(false), 200);
       },
@@ -109,6 +110,8 @@ export function mountList(main) {
   async function load(isMore) {
     drawHead();
     const first = isMore ? shown : 0;
+    more.hidden = !isMore;
+    if (!isMore) summary.textContent = "…";
     const asked = { ...conditions(), order: order.key, direction: order.direction };
     try {
       const answer = await get("recordings", { ...asked, first, count: ROWS }, { slot: "list" });
