@@ -78,7 +78,8 @@ class ViewServer:
 
 
 def _listen(port: int) -> socket.socket:
-    listening = socket.socket()
+    # With the protocol named, asyncio sends answers at once and not with the next acknowledgement.
+    listening = socket.socket(proto=socket.IPPROTO_TCP)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(("127.0.0.1", port))
