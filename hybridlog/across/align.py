@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _DISTANCE = "distance"
+_PIECE_BYTES = 32 << 20  # of the other topics, in rows that are made together
 
 
 class Base(Protocol):
@@ -133,7 +134,10 @@ class Aligned:
                 partner.enter(recording, _end_of(resolved, self._clock))
             for times, table in self._base.tables(recording):
                 label = resolved.summary.label if several else None
-                yield _side_by_side(table, label, [p.rows(times) for p in partners])
+                for rows in _pieces(times, partners):
+                    beside = [partner.rows(times[rows]) for partner in partners]
+                    own = table.slice(rows.start, rows.stop - rows.start)
+                    yield _side_by_side(own, label, beside)
                 given = given or bool(table.num_rows)
         if not given:
             empty = self._base.empty()
@@ -248,14 +252,30 @@ class _Partner:
         self._last = None
         self._is_last = False
 
+    def row_bytes(self, times: NDArray[np.int64]) -> int:
+        """Mean bytes of the messages that are read next.
+
+        Args:
+            times: As for `rows`.
+        """
+        self._start(times)
+        size, rows = int(self._table.nbytes), int(self._table.num_rows)
+        return size // max(rows, 1)
+
+    def _start(self, times: NDArray[np.int64]) -> None:
+        """Read the first block."""
+        if self._blocks is None and not self._is_last and len(times):
+            self._open(times)
+            if not self._is_last:
+                self._advance()
+
     def rows(self, times: NDArray[np.int64]) -> pa.Table:
         """The columns of the messages that belong to some times, with their distance.
 
         Args:
             times: int64[n], ns; by the log clock ascending, not before those of the last call.
         """
-        if self._blocks is None and not self._is_last and len(times):
-            self._open(times)
+        self._start(times)
         parts = []
         begin = 0
         while True:
@@ -348,6 +368,17 @@ class _Partner:
             else numbers(found.distance, "duration")
         )
         return self._reader.named(rows, self._reader.prefix + _DISTANCE, distance)
+
+
+def _pieces(times: NDArray[np.int64], partners: Sequence[_Partner | Bins]) -> Iterator[slice]:
+    """Rows in pieces that stay small where many rows have the same large message."""
+    begin = 0
+    while begin < len(times):
+        rest = times[begin:]
+        row = sum(one.row_bytes(rest) for one in partners if isinstance(one, _Partner))
+        end = min(begin + max(_PIECE_BYTES // max(row, 1), 1), len(times))
+        yield slice(begin, end)
+        begin = end
 
 
 def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:

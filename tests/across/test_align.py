@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.across import topic_reader
+from hybridlog.across import align, topic_reader
 from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import UNKNOWN, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
@@ -28,8 +28,12 @@ TOLERANCE_MS = 7
 
 @pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
 def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Topics are read in blocks of so many rows, also with messages of one time in two of them."""
+    """Topics are read in blocks of so many rows, also with messages of one time in two of them.
+
+    Rows that would be large are made a few at a time, too.
+    """
     read, size = topic_reader.TopicReader.tables, request.param
+    monkeypatch.setattr(align, "_PIECE_BYTES", size * 400)
 
     def tables(reader: topic_reader.TopicReader, *arguments: Any) -> Iterator[Any]:
         for times, table in read(reader, *arguments):
@@ -308,6 +312,21 @@ def test_only_what_belongs_to_the_range_is_read(logs: Logs) -> None:
             assert table.num_rows > 5
             assert str(table.to_pylist()) == str(part.to_pylist())
             assert found.counters.bytes_read < whole.counters.bytes_read / 2
+
+
+def test_rows_with_large_messages_are_made_a_few_at_a_time(
+    logs: Logs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A message that is in many rows is copied into each of them."""
+    aligned = logs.store.align(logs.store.topic("left/pose").in_recording("b"), ["right/pose"])
+    whole, tables = aligned.to_arrow(), list(aligned.to_tables())
+    monkeypatch.setattr(align, "_PIECE_BYTES", 1000)
+    pieces = list(aligned.to_tables())
+    found = pa.concat_tables(pieces, promote_options="default")
+    pd.testing.assert_frame_equal(found.to_pandas(), whole.to_pandas())
+    assert len(pieces) > len(tables)
+    beside = [n for n in whole.column_names if n.startswith("right/pose.")]
+    assert max(piece.select(beside).nbytes for piece in pieces) < 2000
 
 
 def test_batches_and_other_frames(logs: Logs) -> None:
