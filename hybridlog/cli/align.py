@@ -97,7 +97,9 @@ def command(
     named by topic and field; `distance` is the time of a topic's message minus that of the
     row. What is not near enough is empty.
     """
-    choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
+    choices = TableChoices(
+        form=form, output=output, force=force, limit=limit, quiet=quiet
+    ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         queries = _queries(opened, [base, *topic], choice)

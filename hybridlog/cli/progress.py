@@ -21,20 +21,21 @@ class Bar(Protocol):
 
 
 @contextmanager
-def progress_bar(label: str, total: int, *, quiet: bool) -> Iterator[Bar]:
+def progress_bar(label: str, total: int | None, *, quiet: bool) -> Iterator[Bar]:
     """A bar with rate and remaining time on a terminal; nothing elsewhere.
 
     Args:
         label: Name of the work.
-        total: Approximate number of bytes.
+        total: Approximate number of bytes; None if unknown.
         quiet: No bar.
     """
     if quiet or not sys.stderr.isatty():
         yield _nothing
         return
-    bar = _make()
+    bar = _make(has_end=total is not None)
     with bar:
-        task = bar.add_task(_short(printable(label)), total=max(total, 1), note="")
+        end = None if total is None else max(total, 1)
+        task = bar.add_task(_short(printable(label)), total=end, note="")
         yield _Updater(bar, task)
 
 
@@ -106,7 +107,7 @@ def _nothing(done: int, note: str = "") -> None:
     """No bar."""
 
 
-def _make() -> Progress:
+def _make(*, has_end: bool = True) -> Progress:
     from rich.progress import (
         BarColumn,
         Progress,
@@ -120,10 +121,9 @@ def _make() -> Progress:
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=None),
-        TaskProgressColumn(),
+        *((TaskProgressColumn(),) if has_end else ()),
         TransferSpeedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(compact=True),
+        *((TextColumn("ETA"), TimeRemainingColumn(compact=True)) if has_end else ()),
         TextColumn("{task.fields[note]}", markup=False),
         console=console(error=True),
         transient=True,

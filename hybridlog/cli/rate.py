@@ -44,7 +44,9 @@ def command(
     quiet: bool,
 ) -> None:
     """Show how many messages came in a second."""
-    choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
+    choices = TableChoices(
+        form=form, output=output, force=force, limit=limit, quiet=quiet
+    ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)

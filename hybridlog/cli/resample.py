@@ -62,7 +62,9 @@ def command(
 
     The times begin with each recording, or with the range of --between.
     """
-    choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
+    choices = TableChoices(
+        form=form, output=output, force=force, limit=limit, quiet=quiet
+    ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = asked(

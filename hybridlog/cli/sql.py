@@ -49,7 +49,9 @@ def command(
     """
     from hybridlog.query.times import parse_duration
 
-    choices = TableChoices(form=form, output=output, force=force, limit=limit).checked()
+    choices = TableChoices(
+        form=form, output=output, force=force, limit=limit, quiet=quiet
+    ).checked()
     most = None if memory is None else parse_size(memory)
     seconds = None if timeout is None else parse_duration(timeout) / 1e9
     is_prompt = query is None and sys.stdin.isatty()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -13,6 +13,7 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.output_path import check_room, not_written, replacing
+from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
+    from hybridlog.cli.progress import Bar
     from hybridlog.export.base import Target
 
 _FORMATS = ("table", "jsonl", "csv", "parquet", "arrow")
@@ -73,12 +75,14 @@ class TableChoices:
         output: The file; None for standard output.
         force: Overwrite it.
         limit: Maximum number of rows; None for all.
+        quiet: No progress bar.
     """
 
     form: str | None
     output: Path | None
     force: bool
     limit: int | None
+    quiet: bool = False
 
     def checked(self) -> TableChoices:
         """The same with a format; refuses what cannot be written before a store is opened.
@@ -105,7 +109,7 @@ class TableChoices:
             raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
         else:
             check_room(path, force=self.force)
-        return TableChoices(form=form, output=path, force=self.force, limit=self.limit)
+        return replace(self, form=form, output=path)
 
 
 def write_tables(
@@ -130,8 +134,19 @@ def write_tables(
     with (
         if_stopped(partial(not_written, choices.output)),
         replacing(choices.output, force=choices.force),
+        progress_bar(form, None, quiet=choices.quiet) as bar,
     ):
-        return _write(limited, schema, form, choices.output)
+        return _write(_shown(limited, bar), schema, form, choices.output)
+
+
+def _shown(tables: Iterable[pa.Table], bar: Bar) -> Iterator[pa.Table]:
+    """The same tables, while the bar counts their rows."""
+    done = rows = 0
+    for table in tables:
+        yield table
+        done += table.nbytes
+        rows += table.num_rows
+        bar(done, output.counted(rows, "row"))
 
 
 def _write(

@@ -89,6 +89,14 @@ def test_a_bar_with_rate_and_remaining_time_and_then_the_table(logs: Path, tmp_p
     assert re.search(r"messages indexed\s+\d+", last)
 
 
+def test_a_bar_counts_rows_of_unknown_number(store: Path, tmp_path: Path) -> None:
+    rows = ("sql", "select * from odom", "--store", store, "-o")
+    code, shown = on_terminal(*rows, tmp_path / "a.csv", width=120)
+    assert code == 0
+    assert re.search(r"csv ━+ +\S* *\S* +\d+ rows", plain(shown))
+    assert "rows" not in on_terminal(*rows, tmp_path / "b.csv", "--quiet")[1]
+
+
 def test_no_bar_elsewhere_or_when_quiet(logs: Path, tmp_path: Path) -> None:
     code, shown = on_terminal("record", logs / "small.bag", "-q", "--store", tmp_path / "s")
     assert (code, shown) == (0, "")
