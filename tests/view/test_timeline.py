@@ -364,6 +364,33 @@ def hash_of(page: Page) -> dict[str, int]:
     return {key: int(pairs[key]) for key in ("begin", "end", "at") if key in pairs}
 
 
+TICKS = """async () => {
+  const { labelOf, stepOf, ticksOf } = await import('./axis.js');
+  return [[0, 5e17], [-3e9, 9e9], [3.6e12, 3.6e12 + 1e6], [1.7e18, 1.7e18 + 1e6]].map(
+    ([begin, end]) => {
+      const step = stepOf((end - begin) / 10);
+      const ticks = ticksOf(begin, end, step);
+      return [begin, end, step, ticks, labelOf(ticks[1], step, BigInt)];
+    });
+}"""
+
+
+@pytest.mark.peer("browser")
+def test_axis_from_years_to_milliseconds(page: Page, demo_url: str) -> None:
+    page.goto(demo_url)
+    found = page.evaluate(TICKS)
+    assert [label for *_, label in found] == [
+        "1972-09-27",
+        "0:00",
+        "3600.0001 s",
+        "1700000000.0001 s",
+    ]
+    for begin, end, step, ticks, _ in found:
+        assert 5 <= len(ticks) <= 11
+        assert begin <= ticks[0] < ticks[-1] <= end
+        assert ticks == [pytest.approx(ticks[0] + n * step, abs=256) for n in range(len(ticks))]
+
+
 @pytest.mark.peer("browser")
 def test_keys_alone(page: Page, demo_url: str) -> None:
     page.goto(f"{demo_url}#recording=robot&panels=[]")

@@ -3,6 +3,7 @@
 const SECOND = 1e9;
 const DAY = 86400 * SECOND;
 const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200];
+const MOST_TICKS = 1000;
 
 /** The step between ticks that are at least so far apart, ns. */
 export function stepOf(least) {
@@ -18,10 +19,12 @@ function round(least) {
   return factor * power;
 }
 
-/** Times of ticks, ns since the start. */
+/** Times of ticks, ns since the start: multiples of the step. */
 export function ticksOf(begin, end, step) {
   const found = [];
-  for (let n = Math.ceil(begin / step); n * step <= end; n++) found.push(n * step);
+  const first = Math.ceil(begin / step) * step;
+  // Counted from the first one: far from the start, numbers are too coarse to count steps.
+  for (let n = 0; first + n * step <= end && n < MOST_TICKS; n++) found.push(first + n * step);
   return found;
 }
 

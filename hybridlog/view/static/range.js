@@ -3,19 +3,28 @@
 import * as state from "./state.js";
 
 const SHORTEST = 1000; // ns
+const STEPS = 4096; // that numbers tell apart in the shortest range
+
+/** The shortest range, ns: far from the start, numbers are too coarse for nanoseconds. */
+function shortest({ info }) {
+  const farthest = Math.max(Math.abs(info.begin), Math.abs(info.end));
+  return Math.max(SHORTEST, farthest * Number.EPSILON * STEPS);
+}
 
 /** The visible range, ns since the start. */
-export function visible({ info }) {
+export function visible(recording) {
+  const { info } = recording;
   const begin = state.get("begin") ?? info.begin;
   const end = state.get("end") ?? info.end;
-  return { begin, end: Math.max(end, begin + SHORTEST) };
+  return { begin, end: Math.max(end, begin + shortest(recording)) };
 }
 
 /** Shows a range, or as much of it as the recording has. */
 export function show(recording, begin, end) {
   const { info } = recording;
-  const whole = Math.max(info.end - info.begin, SHORTEST);
-  const span = Math.min(Math.max(end - begin, SHORTEST), whole);
+  const least = shortest(recording);
+  const whole = Math.max(info.end - info.begin, least);
+  const span = Math.min(Math.max(end - begin, least), whole);
   if (span >= whole) return state.set({ begin: null, end: null });
   const low = Math.min(Math.max(begin, info.begin), info.end - span);
   state.set({ begin: Math.round(low), end: Math.round(low + span) });
@@ -24,7 +33,7 @@ export function show(recording, begin, end) {
 /** Makes the range shorter or longer by a factor, around a time that stays where it is. */
 export function zoom(recording, factor, around) {
   const { begin, end } = visible(recording);
-  const span = Math.max((end - begin) * factor, SHORTEST);
+  const span = Math.max((end - begin) * factor, shortest(recording));
   const share = (Math.min(Math.max(around, begin), end) - begin) / (end - begin);
   show(recording, around - share * span, around + (1 - share) * span);
 }

@@ -97,7 +97,7 @@ function textOf(state) {
 
 function fromAddress() {
   const pairs = new URLSearchParams(location.hash.slice(1));
-  const whole = (key) => (/^-?\d{1,16}$/.test(pairs.get(key) ?? "") ? Number(pairs.get(key)) : null);
+  const whole = (key) => (/^-?\d{1,19}$/.test(pairs.get(key) ?? "") ? Number(pairs.get(key)) : null);
   const [begin, end] = [whole("begin"), whole("end")];
   const isRange = begin !== null && end !== null && begin < end;
   return {
