@@ -1067,7 +1067,7 @@ def test_the_specification_names_what_there_is() -> None:
     for name in ("ARRIVAL_OPCODE", "PADDING_OPCODE", "CHUNK_TABLE_OPCODE"):
         assert f"opcode, {getattr(segment_format, name):#x}" in text
     assert FORMAT == segment_format.FORMAT_VERSION
-    assert f"Format {FORMAT}." in text
+    assert f"Format {FORMAT}, which is final:" in text
     assert f"up to {ARRAY_LIMIT} elements" in text
     for thing in (ChannelStats, RecordingEntry, StoreSettings):
         assert all(f"`{f.name}`" in text for f in fields(thing))

@@ -9,6 +9,7 @@ import json
 import shlex
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
@@ -194,10 +195,17 @@ def test_sql_is_bounded(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> 
     assert "stopped after 0.2 s" in answer.json()["error"]
 
 
-async def asked_for(
+def asked_for(
     app: Any, path: str, params: dict[str, Any], *, leaves_after: float
 ) -> list[dict[str, Any]]:
     """What the application says to a client that leaves, after seconds or a number of parts."""
+    with ThreadPoolExecutor(1) as pool:  # playwright has a loop in this thread
+        return pool.submit(asyncio.run, _asked_for(app, path, params, leaves_after)).result()
+
+
+async def _asked_for(
+    app: Any, path: str, params: dict[str, Any], leaves_after: float
+) -> list[dict[str, Any]]:
     scope = {
         "type": "http",
         "method": "GET",
@@ -228,13 +236,10 @@ def test_sql_stops_when_the_client_goes(demo_store: hl.Store) -> None:
     """The server's answer ends although the query would not, and the next one is answered."""
     app = make_app(demo_store, TOKEN, PORT)
     for _ in range(3):  # more than are answered at once
-        said = asyncio.run(
-            asked_for(app, "sql", {"recording": "robot", "text": ENDLESS}, leaves_after=0.1)
-        )
+        said = asked_for(app, "sql", {"recording": "robot", "text": ENDLESS}, leaves_after=0.1)
         assert b"The query was stopped" in said[1]["body"]
-    said = asyncio.run(
-        asked_for(app, "sql", {"recording": "robot", "text": "select 1 as one"}, leaves_after=9.0)
-    )
+    asked = {"recording": "robot", "text": "select 1 as one"}
+    said = asked_for(app, "sql", asked, leaves_after=9.0)
     assert json.loads(said[1]["body"])["rows"] == [["1"]]
 
 
@@ -361,11 +366,11 @@ def test_a_file_is_made_while_it_is_sent(odd: hl.Store, monkeypatch: pytest.Monk
     monkeypatch.setattr(export, "pieces_of", counted)
     app = make_app(odd, TOKEN, PORT)
     asked = {"recording": "x-1"}
-    said = asyncio.run(asked_for(app, "export", asked, leaves_after=9.0))
+    said = asked_for(app, "export", asked, leaves_after=9.0)
     whole = len(made)
     assert sum(made) == sum(len(message.get("body", b"")) for message in said)
     made.clear()
-    asyncio.run(asked_for(app, "export", asked, leaves_after=2))
+    asked_for(app, "export", asked, leaves_after=2)
     assert 1 <= len(made) <= 4 < whole
     assert ended == [True, True]
 
