@@ -24,8 +24,10 @@ class Cost:
         statements: SQL statements that the catalog got.
         opened: Files and folders opened or listed, below the store.
         bytes_read: Bytes read from files of the store.
+        root: The store.
     """
 
+    root: str
     commands: list[str] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
     opened: list[str] = field(default_factory=list)
@@ -44,15 +46,13 @@ class Cost:
 _heard: list[Cost] = []
 
 
-_PYTHON = (".py", ".pyc", ".so", "__pycache__")
-"""Endings of files that Python opens for itself."""
-
-
 def _hear(event: str, arguments: tuple[Any, ...]) -> None:
     if _heard and event in {"open", "os.listdir", "os.scandir"}:
-        path = str(arguments[0])
-        if not path.endswith(_PYTHON) and "site-packages" not in path:
-            _heard[-1].opened.append(path)
+        path, cost = str(arguments[0]), _heard[-1]
+        # A path without a folder is relative to one of the store's. Python's own files and the
+        # socket and log of mongod, which is polled while it starts, are no cost of the work.
+        if not path.startswith("/") or path.startswith(cost.root):
+            cost.opened.append(path)
 
 
 sys.addaudithook(_hear)
@@ -78,7 +78,7 @@ def _counted(read: Callable[..., Any], cost: Cost) -> Callable[..., Any]:
 
 def cost_of(store: hl.Store, work: Callable[[], object]) -> Cost:
     """The cost of some work on an open store whose index is connected with `commands` heard."""
-    cost = Cost()
+    cost = Cost(str(store.directory.path))
     with commands() as sent:
         store.catalog._db.set_trace_callback(cost.statements.append)
         _heard.append(cost)
