@@ -242,5 +242,7 @@ class _Recorded:
 
 def _edges(level: int, begin: int, end: int) -> NDArray[np.int64]:
     """Edges of bins by their numbers, ns; those after all times are the latest time."""
-    numbers = np.arange(begin, end + 1, dtype=np.int64)
-    return np.where(numbers > _LATEST >> level, _LATEST, numbers << level)
+    first = begin << level
+    rest = _LATEST - first
+    numbers = np.arange(end - begin + 1)
+    return first + np.where(numbers > rest >> level, rest, numbers << level)

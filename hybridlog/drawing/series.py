@@ -13,6 +13,7 @@ import numpy as np
 from hybridlog.frames.names import FIELD
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
@@ -29,7 +30,6 @@ GAP_PERIODS: Final = 5
 """A time without messages is a gap if it is longer than so many usual periods."""
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
 _NUMBER = re.compile(r"bool|byte|char|time|duration|float(32|64)|u?int(8|16|32|64)")
-_FAR = 1 << 61  # ns; differences of such times are int64
 _SHOWN = 8  # names of fields in a message
 
 
@@ -373,7 +373,7 @@ class _Grid:
     @classmethod
     def over(cls, span: Span, pixels: int) -> _Grid:
         """A grid of a span of log time, ns."""
-        begin, end = max(span[0], -_FAR), min(span[1], _FAR)
+        begin, end = max(span[0], 0), min(span[1], TIME_LIMIT)
         return cls(begin, max(1, -(-(end - begin) // pixels)), pixels)
 
     def add(self, times: NDArray[np.int64], columns: Mapping[str, NDArray[np.float64]]) -> None:

@@ -6,12 +6,13 @@ import re
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Final, NoReturn
 
+from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from starlette.datastructures import QueryParams
 
-MAX_OFFSET: Final = 1 << 62
+MAX_OFFSET: Final = TIME_LIMIT - 1
 """Greatest time since the start of a recording, ns."""
 MAX_PIXELS: Final = 8192
 """Greatest width that is drawn."""
@@ -114,6 +115,32 @@ class Asked:
             UsageError: It is missing, no whole number, or out of bounds.
         """
         return self.integer(name, -MAX_OFFSET, MAX_OFFSET, default)
+
+    def moment(self, start: int) -> int:
+        """The time `at`, ns since 1970, cut to what is a time.
+
+        Args:
+            start: The time that offsets count from.
+
+        Raises:
+            UsageError: It is missing, no whole number, or out of bounds.
+        """
+        return min(max(start + self.offset("at"), 0), TIME_LIMIT - 1)
+
+    def span(self, start: int) -> tuple[int, int]:
+        """The range from `begin` to `end`, ns since 1970, cut to what is a time; never empty.
+
+        Args:
+            start: The time that offsets count from.
+
+        Raises:
+            UsageError: A bound is missing, no whole number or out of bounds, or it is empty.
+        """
+        begin, end = self.offset("begin"), self.offset("end")
+        if end <= begin:
+            raise UsageError("end is greater than begin.")
+        last = TIME_LIMIT - 1
+        return min(max(start + begin, 0), last - 1), min(max(start + end, 1), last)
 
     def _one(self, name: str) -> str | None:
         found = self._parameters.getlist(name)

@@ -49,7 +49,7 @@ def current(context: Context, asked: Asked) -> Current:
         UsageError: A parameter is missing or out of bounds.
     """
     topic = Topic(context, asked)
-    moment = max(topic.start + asked.offset("at"), 0)
+    moment = asked.moment(topic.start)
     message = topic.at(moment)
     # Of messages with the same time, the last one is current: the next one is later.
     later = moment if message is None else message.log_time_ns + 1

@@ -70,7 +70,7 @@ class PageQuestion:
         Raises:
             UsageError: The predicate has conditions on other topics already, or there is none.
         """
-        if not self.where or names_topics(self.where):
+        if len(self.topics) != 1 or not self.where or names_topics(self.where):
             raise UsageError(
                 "Messages around matches need a predicate on one topic: without other topics."
             )

@@ -44,6 +44,10 @@ class Picture(NamedTuple):
 
 def picture(client: TestClient, topics: list[str], begin: int, end: int, pixels: int) -> Picture:
     asked = {"recording": "robot", "begin": begin, "end": end, "pixels": pixels, "topic": topics}
+    return picture_of(client, asked)
+
+
+def picture_of(client: TestClient, asked: dict[str, Any]) -> Picture:
     answer = client.get("timeline", params=asked)
     assert answer.status_code == 200, answer.text
     content = answer.content

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -337,18 +338,21 @@ class Mongo:
         if not parts:
             return []
         order = sorted(range(len(parts)), key=spans.__getitem__)
-        times = np.array([spans[i] for i in order], np.int64)
-        low, high = np.maximum.accumulate(times[:-1, 1]), times[1:, 0]
+        # The end of the last nanosecond is no int64; nothing begins there.
+        ends = np.array([min(spans[i][1], TIME_LIMIT - 1) for i in order[:-1]], np.int64)
+        low = np.maximum.accumulate(ends)
+        high = np.array([spans[i][0] for i in order[1:]], np.int64)
         is_apart = low < high
         if int(is_apart.sum()) >= (_MOST_APART if most is None else most):
             first, end = self._session.snapshot().others({part.recording.id for part in parts})
             before = np.searchsorted(np.sort(first), high, "left")
             is_apart &= before > np.searchsorted(np.sort(end), low, "right")
-        groups = np.split(np.arange(len(order)), np.flatnonzero(is_apart) + 1)
+        steps = [0, *(np.flatnonzero(is_apart) + 1).tolist(), len(order)]
+        groups = [order[begin:end] for begin, end in pairwise(steps)]
         return [
             (
-                (int(times[group[0], 0]), int(times[group, 1].max())),
-                [parts[order[i]] for i in group.tolist()],
+                (spans[group[0]][0], max(spans[i][1] for i in group)),
+                [parts[i] for i in group],
             )
             for group in groups
         ]

@@ -24,7 +24,7 @@ from hybridlog.view.asked import MAX_OFFSET
 from hybridlog.view.context import Context, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog.view.stopping import stoppable_route
-from hybridlog_storage.errors import ResourceError, TopicError, UsageError
+from hybridlog_storage.errors import ResourceError, TopicError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -73,11 +73,7 @@ def matches(context: Context, asked: Asked) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
     question = question_of(context, asked)
     start = start_of(question.recording)
-    begin, end = asked.offset("begin"), asked.offset("end")
-    if end <= begin:
-        raise UsageError("end is greater than begin.")
-    pixels = asked.pixels()
-    span = max(start + begin, 0), max(start + end, 1)
+    span, pixels = asked.span(start), asked.pixels()
     asked_for = _matches(context, question)
     found = ticks(asked_for, span, pixels)
     held = bands(asked_for, span, pixels)
@@ -95,8 +91,7 @@ def match_list(context: Context, asked: Asked) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
     question = question_of(context, asked)
     start = start_of(question.recording)
-    at, seq = asked.offset("at"), asked.integer("seq", -1, MAX_OFFSET, -1)
-    place = Match(max(start + at, 0), seq)
+    place = Match(asked.moment(start), asked.integer("seq", -1, MAX_OFFSET, -1))
     count = asked.integer("count", 1, MAX_LISTED, MAX_LISTED)
     find = {"later": matches_after, "earlier": matches_before}
     asked_for = _matches(context, question)

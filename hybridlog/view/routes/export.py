@@ -8,7 +8,6 @@ from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.view.context import Context, route, start_of
 from hybridlog.view.question import PageQuestion
 from hybridlog.view.stopping import Pieces, file_response
-from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from starlette.responses import Response
@@ -69,11 +68,7 @@ def _question(context: Context, asked: Asked) -> PageQuestion:
     context.query(recording, *topics)
     span = None
     if asked.has("begin") or asked.has("end"):
-        start = start_of(recording)
-        begin, end = asked.offset("begin"), asked.offset("end")
-        if end <= begin:
-            raise UsageError("end is greater than begin.")
-        span = max(start + begin, 0), max(start + end, 1)
+        span = asked.span(start_of(recording))
     where = asked.text("where", "", longest=MAX_TEXT).strip()
     within = asked.text("within", "", longest=64)
     question = PageQuestion(context.store, recording, topics, where, within, span)

@@ -23,7 +23,7 @@ def log(context: Context, asked: Asked) -> dict[str, Any]:
     after = asked.integer("after", 0, _MAX_LINES, 0)
     topic = Topic(context, asked)
     lines = _log(topic, asked)
-    time = max(topic.start + asked.offset("at"), 0)
+    time = asked.moment(topic.start)
     # A line at the time itself is before the cursor, as it is current there.
     seq = asked.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
     found = lines.before(time, seq, before)

@@ -34,15 +34,12 @@ def series(context: Context, asked: Asked) -> dict[str, Any]:
     """Least and greatest values by pixel, or each value if there are few."""
     topic = Topic(context, asked)
     start = topic.start
-    begin, end = asked.offset("begin"), asked.offset("end")
-    if end <= begin:
-        raise UsageError("end must be behind begin.")
     wanted = asked.texts("field", most=MAX_FIELDS)
     found = read_series(
         topic.query,
         wanted,
         pixels=asked.pixels(),
-        span=(start + begin, start + end),
+        span=asked.span(start),
         flushed=topic.flushed,
     )
     if len(found) > MAX_FIELDS:

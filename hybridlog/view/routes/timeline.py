@@ -11,7 +11,6 @@ from starlette.responses import Response
 from hybridlog.drawing.silence import gaps
 from hybridlog.losses import extent_of
 from hybridlog.marks import MARKS
-from hybridlog.query.times import TIME_LIMIT
 from hybridlog.view.context import Context, route, start_of
 from hybridlog_storage.errors import UsageError
 
@@ -54,7 +53,7 @@ def timeline(context: Context, asked: Asked) -> Response:
     if len(topics) * pixels > MAX_BINS:
         raise UsageError(f"At most {MAX_BINS // max(len(topics), 1)} pixels for as many topics.")
     start = start_of(recording)
-    span = _span(asked, start)
+    span = asked.span(start)
     found = context.densities.density(recording, span, pixels, topics)
     extent = _extent(context, recording)
     periods = context.densities.periods(recording, span, topics)
@@ -112,7 +111,7 @@ def marks(context: Context, asked: Asked) -> dict[str, Any]:
     start = start_of(recording)
     if MARKS not in {channel.topic for channel in recording.channels}:
         return {"marks": [], "more": 0}
-    begin, end = _span(asked, start)
+    begin, end = asked.span(start)
     first, last = recording.span or (start, start)
     if begin > last or end <= first:
         return {"marks": [], "more": 0}  # a query refuses such a range
@@ -122,19 +121,6 @@ def marks(context: Context, asked: Asked) -> dict[str, Any]:
         for message in query.limit(MAX_MARKS)
     ]
     return {"marks": found, "more": query.count() - len(found)}
-
-
-def _span(asked: Asked, start: int) -> tuple[int, int]:
-    """The range `[begin, end)` that is asked about, ns since 1970.
-
-    Raises:
-        UsageError: It is empty, or no time at all.
-    """
-    begin, end = max(start + asked.offset("begin"), 0), start + asked.offset("end")
-    end = min(end, TIME_LIMIT - 1)
-    if begin >= end:
-        raise UsageError("end is greater than begin.")
-    return begin, end
 
 
 def _extent(context: Context, recording: RecordingEntry) -> tuple[int, int]:

@@ -31,7 +31,7 @@ def track_of(context: Context, asked: Asked) -> Response:
     start = topic.start
     span = None
     if asked.has("begin") or asked.has("end"):
-        span = start + asked.offset("begin"), start + asked.offset("end")
+        span = asked.span(start)
     found = track(topic.query, pixels=asked.pixels(), span=span, flushed=topic.flushed)
     header = {
         "grid": None if found.grid is None else asdict(found.grid),
