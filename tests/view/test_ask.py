@@ -140,6 +140,7 @@ def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store) -
         ("export-command", {"around": "much"}, "duration"),
         ("export-command", {"around": "1s", "where": "a > 1) or (b > 1"}, "expected"),
         ("export-command", {"around": "1s", "where": ""}, "need a predicate"),
+        ("export-command", {"around": "1s", "topic": []}, "need a predicate"),
     ],
 )
 def test_what_is_refused(
