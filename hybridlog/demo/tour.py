@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import subprocess
 import sys
+from pathlib import PurePath
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog_storage.errors import UsageError
@@ -121,9 +123,17 @@ def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEF
             return code
     _print(
         f"\nAll files remain in {directory}; continue with --store {directory / STORE}, or look "
-        "at it: hybridlog view\n"
+        f"at it: {_program()} view\n"
     )
     return 0
+
+
+def _program() -> str:
+    """What to type for this program: its path if the environment is not activated."""
+    if shutil.which("hybridlog"):
+        return "hybridlog"
+    started = sys.argv[0]
+    return started if PurePath(started).name == "hybridlog" else "python -m hybridlog"
 
 
 def _take(step: Step, directory: Path) -> tuple[int, str]:

@@ -88,6 +88,29 @@ def test_a_kept_tour_leaves_everything(tmp_path: Path, monkeypatch: pytest.Monke
         tour.run(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("started", "on_path", "typed"),
+    [
+        (".venv/bin/hybridlog", False, ".venv/bin/hybridlog"),
+        ("/x/hybridlog/__main__.py", False, "python -m hybridlog"),
+        (".venv/bin/hybridlog", True, "hybridlog"),
+    ],
+)
+def test_the_last_line_can_be_typed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    started: str,
+    on_path: bool,
+    typed: str,
+) -> None:
+    pretend(monkeypatch)
+    monkeypatch.setattr("sys.argv", [started])
+    monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}" if on_path else None)
+    assert tour.run(tmp_path) == 0
+    assert capfd.readouterr().out.endswith(f"look at it: {typed} view\n")
+
+
 def test_a_failing_command_ends_the_tour_with_its_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

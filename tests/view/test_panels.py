@@ -90,6 +90,28 @@ def test_a_message_as_a_tree(page: Page, odd_url: str) -> None:
     tree.get_by_text("No message at or before the cursor").wait_for()
 
 
+def test_a_recording_is_first_shown_with_something(page: Page, demo_url: str) -> None:
+    page.goto(f"{demo_url}#recording=robot")
+    page.locator(".timeline .topic").first.wait_for()
+    # Types make room for the names of topics.
+    cut = """names => names
+        .filter(one => one.scrollWidth > one.clientWidth && one.nextSibling.clientWidth > 2)
+        .map(one => one.title)"""
+    assert page.locator(".timeline .topic").evaluate_all(cut) == []
+    first = """async times => {
+        const types = ["sensor_msgs/Image", "sensor_msgs/LaserScan"];
+        const of = (first, at) => ({ topic: `/${at}`, type: types[at], messages: 1, first });
+        const info = { begin: 0, end: 100, topics: times.map(of) };
+        return (await import("./panels.js")).firstTime({ info });
+    }"""
+    assert [page.evaluate(first, times) for times in ([3, 8], [3, 60], [70, 60], [])] == [
+        8,
+        3,
+        60,
+        0,
+    ]
+
+
 def test_hostile_names_and_values_are_text(page: Page, odd_url: str) -> None:
     kinds = [("message", "/loose", {}), ("message", HOSTILE, {}), ("log", HOSTILE, {})]
     opened(page, odd_url, "odd", *kinds, ("plot", HOSTILE, {}), at=0)

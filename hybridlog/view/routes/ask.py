@@ -62,7 +62,7 @@ def ask(context: Context, asked: Asked) -> dict[str, Any]:
         )
     return {
         "count": count,
-        "told": lost.describe(count) if lost else str(count),
+        "lost": lost.describe(count) if lost else None,
         "remarks": remarks,
         "python": question.python(),
         "command": question.command(),

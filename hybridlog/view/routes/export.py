@@ -31,8 +31,9 @@ def command(context: Context, asked: Asked) -> dict[str, Any]:
     return {
         "command": question.command(),
         "python": question.python(),
+        "count": count,
         "name": question.file_name(),
-        "told": lost.describe(count) if lost else str(count),
+        "lost": lost.describe(count) if lost else None,
     }
 
 

@@ -8,6 +8,7 @@ import { matchList } from "./match_list.js";
 import { drawMatches, predicate } from "./matches.js";
 import { sqlTable } from "./sql_table.js";
 import * as state from "./state.js";
+import { counted } from "./words.js";
 
 /** Shows the bar. Returns a function that takes it away. */
 export function mountAsk(main, recording) {
@@ -178,8 +179,7 @@ export function mountAsk(main, recording) {
 
   function tell(found) {
     python = found.python;
-    const are = found.count === 1 ? "match" : "matches";
-    told.textContent = found.told === String(found.count) ? `${found.told} ${are}` : found.told;
+    told.textContent = found.lost ?? counted(found.count, "match", "matches");
     fill(body, ...found.remarks.map((line) => element("p", { class: "summary" }, line)));
     steps.hidden = !found.count;
   }

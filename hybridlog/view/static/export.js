@@ -4,6 +4,7 @@ import { ApiError, address, get, isAborted } from "./api.js";
 import { element, fill, notice } from "./dom.js";
 import { predicate } from "./matches.js";
 import * as state from "./state.js";
+import { counted } from "./words.js";
 
 /** What can be exported, and what the server has to know for it. */
 const PARTS = {
@@ -85,7 +86,7 @@ export function exportForm(recording) {
     try {
       const found = await get("export-command", asked, { slot: "export" });
       if (mine !== newest) return;
-      told.textContent = `${found.told} messages`;
+      told.textContent = found.lost ?? counted(found.count, "message");
       command.textContent = found.command;
       python = found.python;
       download.href = address("export", asked);

@@ -3,7 +3,7 @@
 import { ApiError, get, isAborted } from "./api.js";
 import { element, fill } from "./dom.js";
 import * as state from "./state.js";
-import { count, duration, moment, size } from "./words.js";
+import { count, counted, duration, moment, size } from "./words.js";
 
 const ROWS = 100;
 
@@ -139,7 +139,7 @@ export function mountList(main) {
 function summaryOf(answer) {
   if (!answer.all) return "The store is empty: hybridlog record FILE fills it.";
   const which = answer.found === answer.all ? "" : ` of ${count(answer.all)}`;
-  const content = `${count(answer.messages)} messages, ${size(answer.bytes)}`;
+  const content = `${counted(answer.messages, "message")}, ${size(answer.bytes)}`;
   const noun = answer.all === 1 ? "recording" : "recordings";
   return `${count(answer.found)}${which} ${noun}: ${content}.`;
 }

@@ -42,13 +42,20 @@ function firstPanels(topics) {
   return found;
 }
 
-/** A time early in a recording at which the panels that it is first shown with have a message. */
+/**
+ * A time early in a recording at which the panels that it is first shown with have a message. If
+ * all begin late, it is the first message of any.
+ */
 export function firstTime({ info }) {
   const shown = firstPanels(info.topics).filter(({ kind }) => kind !== log.kind);
   const names = shown.map(({ topic }) => topic);
   const soon = info.begin + (info.end - info.begin) / 10;
-  const times = info.topics.filter(({ topic, first }) => names.includes(topic) && first <= soon);
-  return Math.max(0, ...times.map(({ first }) => first));
+  const times = info.topics
+    .filter(({ topic }) => names.includes(topic))
+    .map(({ first }) => first);
+  if (!times.length) return 0;
+  const earliest = Math.min(...times);
+  return Math.max(0, earliest, ...times.filter((first) => first <= soon));
 }
 
 /** Shows a panel of a topic: of the first kind that is made for it, unless it is shown already. */

@@ -7,7 +7,7 @@ import { followLive } from "./live.js";
 import { firstTime, mountPanels } from "./panels.js";
 import * as state from "./state.js";
 import { mountTimeline } from "./timeline.js";
-import { count, duration, moment, size } from "./words.js";
+import { count, counted, duration, moment, size } from "./words.js";
 
 /**
  * @typedef {Object} Recording
@@ -77,8 +77,8 @@ function summaryOf({ info, start }) {
   const parts = [
     moment(start, 0),
     duration(info.end - info.begin),
-    `${count(info.topics.length)} topics`,
-    `${count(info.messages)} messages`,
+    counted(info.topics.length, "topic"),
+    counted(info.messages, "message"),
     size(info.bytes),
     info.status === "open" ? "being recorded" : null,
     info.losses.length ? `${lost ? count(lost) : "messages"} lost` : null,

@@ -2,7 +2,7 @@
 
 import { element } from "./dom.js";
 import * as state from "./state.js";
-import { count } from "./words.js";
+import { count, counted } from "./words.js";
 
 const TIMES = ["t", "log_time"];
 
@@ -51,7 +51,7 @@ function heading([name, isNumber]) {
 }
 
 function summaryOf({ rows, more, columns_left_out: leftOut, remarks }) {
-  const words = rows.length === 1 ? "1 row" : `${count(rows.length)} rows`;
+  const words = counted(rows.length, "row");
   return [
     more ? `The first ${words}; the answer has more. \`hybridlog sql\` gives all` : words,
     leftOut ? `${count(leftOut)} further columns are left out` : null,

@@ -10,7 +10,7 @@ import { openPanel } from "./panels.js";
 import { mountPlayer } from "./player.js";
 import { seek, show, visible, zoom } from "./range.js";
 import * as state from "./state.js";
-import { count, duration, moment, offset } from "./words.js";
+import { count, counted, duration, moment, offset } from "./words.js";
 import { groupOf, shortType } from "./topic_groups.js";
 
 const AXIS = 30;
@@ -155,7 +155,7 @@ export function mountTimeline(parent, recording) {
     fill(
       names,
       ...shown.map(({ topic, type, messages }, place) => {
-        const said = `${topic}, ${type || "unknown type"}, ${count(messages)} messages`;
+        const said = `${topic}, ${type || "unknown type"}, ${counted(messages, "message")}`;
         const open = () => openPanel(recording, topic);
         const name = { type: "button", class: "plain topic", title: said, onclick: open };
         const row = element(

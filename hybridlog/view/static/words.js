@@ -7,6 +7,11 @@ export function count(number) {
   return number.toLocaleString("en-US");
 }
 
+/** `1 fix` or `12,345 fixes`. */
+export function counted(number, one, more = `${one}s`) {
+  return `${count(number)} ${number === 1 ? one : more}`;
+}
+
 /** `1.2 MB`. */
 export function size(bytes) {
   let place = 0;

@@ -73,7 +73,7 @@ function mount(body, panel) {
 
   function problem(text, isProblem = true) {
     facts.textContent = " ";
-    fill(place, element("pre", isProblem ? { class: "problem", role: "alert" } : {}, text));
+    fill(place, element("pre", isProblem ? { class: "problem", role: "alert" } : { class: "note" }, text));
   }
 
   following.want(panel.cursor());

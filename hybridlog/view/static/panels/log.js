@@ -2,7 +2,7 @@
 
 import { ApiError, get, isAborted } from "../api.js";
 import { element, fill } from "../dom.js";
-import { count, offset } from "../words.js";
+import { counted, offset } from "../words.js";
 import { literal, moment, opening } from "./python.js";
 
 const TYPES = new Set([
@@ -63,7 +63,7 @@ function mount(body, panel) {
   let at = null;
   let isGone = false;
   let typing = 0;
-  let counted = {}; // the recording when it was asked
+  let known = {}; // the recording when it was asked
 
   const level = element(
     "select",
@@ -108,7 +108,7 @@ function mount(body, panel) {
   /** Lines around the cursor, in the place of all others. */
   async function load() {
     at = panel.cursor();
-    counted = { ...panel.recording.info, start: panel.recording.start };
+    known = { ...panel.recording.info, start: panel.recording.start };
     isLoading = true;
     const parameters = { ...asked, ...chosen(), at, before: PAGE / 2, after: PAGE / 2 };
     await answered(get("log", parameters, { slot }), (found) => {
@@ -129,7 +129,7 @@ function mount(body, panel) {
     tallied = now;
     number.textContent = "…";
     await answered(get("log/count", { ...asked, ...chosen() }, { slot: `${slot} count` }), (found) => {
-      number.textContent = found.count === null ? "" : `${count(found.count)} lines`;
+      number.textContent = found.count === null ? "" : counted(found.count, "line");
     });
   }
 
@@ -187,8 +187,8 @@ function mount(body, panel) {
       return load();
     }
     const { info, start } = panel.recording;
-    if (start !== counted.start) return load();
-    if (info.messages !== counted.messages) grown();
+    if (start !== known.start) return load();
+    if (info.messages !== known.messages) grown();
     if (panel.cursor() === at) return undefined;
     at = panel.cursor();
     const isThere =
@@ -200,7 +200,7 @@ function mount(body, panel) {
 
   /** Lines may have come at the end of a recording that goes on. */
   function grown() {
-    counted = { ...panel.recording.info, start: panel.recording.start };
+    known = { ...panel.recording.info, start: panel.recording.start };
     tallied = "";
     if (!lines.length) load();
     else if (isLast) more(false);

@@ -4,7 +4,7 @@ import { ApiError, bytes, get } from "../api.js";
 import { element } from "../dom.js";
 import { unpack } from "../spatial/packed.js";
 import { metres, plane } from "../spatial/plane.js";
-import { count, offset } from "../words.js";
+import { counted, offset } from "../words.js";
 import { follow } from "./follow.js";
 import { opening } from "./python.js";
 
@@ -199,8 +199,10 @@ function mount(body, panel) {
     if (track) {
       const without = track.messages - track.fixes;
       sum.textContent = [
-        `${count(track.fixes)} ${track.is_geographic ? "fixes" : "positions"}`,
-        without ? `${count(without)} messages without one` : null,
+        track.is_geographic
+          ? counted(track.fixes, "fix", "fixes")
+          : counted(track.fixes, "position"),
+        without ? `${counted(without, "message")} without one` : null,
         track.grid ? `grid from ${degrees(track.grid)}` : null,
       ]
         .filter(Boolean)

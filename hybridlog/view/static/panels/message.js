@@ -53,7 +53,7 @@ function mount(body, panel) {
   function problem(text, isProblem = true, facts = " ") {
     top = null;
     fill(head, facts);
-    fill(place, element("pre", isProblem ? { class: "problem", role: "alert" } : {}, text));
+    fill(place, element("pre", isProblem ? { class: "problem", role: "alert" } : { class: "note" }, text));
   }
 
   const view = {
