@@ -56,7 +56,7 @@ def test_pictures_at_the_ends_of_time(client: TestClient, label: str) -> None:
             found = client.get("matches", params={**rest, "where": where})
             assert sum(found.json()["counts"]) == len(inside) - 10
         found = client.get("export-command", params={**span, "recording": label})
-        assert found.json()["told"] == str(len(inside))
+        assert found.json()["count"] == len(inside)
 
 
 def test_pixels_of_late_years(client: TestClient) -> None:
