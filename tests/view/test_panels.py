@@ -404,14 +404,19 @@ def test_panels_of_a_recording_that_goes_on(page: Page, tmp_path: Path) -> None:
 
     with (
         hl.open(tmp_path / "store", create=True) as writing,
+        writing.start("ended") as ended,
         writing.start("live", flush_interval_s=0.05) as recording,
         hl.open(tmp_path / "store") as store,
     ):
+        ended.write(said, b"{}", log_time=S)
+        ended.close()
         write(range(10))
         kinds = [("message", "/said", {}), ("log", "/said", {}), ("plot", "/said", {})]
         with served(store) as url:
             page.goto(url)
-            page.get_by_role("link", name="live").wait_for()
+            # The newest first, although none of its messages is sealed.
+            page.get_by_role("link", name="ended").wait_for()
+            assert "live" in page.locator("tbody tr").first.inner_text()
             opened(page, url, "live", *kinds)
             panel(page, "log").get_by_text("10 lines").wait_for()
             write(range(10, 30))

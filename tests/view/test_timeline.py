@@ -220,6 +220,10 @@ def test_a_recording_that_goes_on_is_followed(
         assert found["status"] == "open"
         page.wait_for_selector("text=1,100 messages")
         row.filter(has_text="/b").filter(has_text="50").wait_for()
+        topic = page.get_by_label("Topic of the question")
+        topic.locator("option", has_text="/b").wait_for(state="attached")
+        assert topic.evaluate("menu => [...menu.options].map(one => one.value)") == ["/a", "/b"]
+        assert topic.input_value() == "/a"
         # The cursor was at the end, and stays there.
         until(page, "document.querySelector('.readout').textContent.length > 0")
         at = json.loads(page.locator(".density").get_attribute("aria-valuenow") or "null")

@@ -22,8 +22,14 @@ _MAX_CONDITIONS: Final = 16
 _MAX_PARTS: Final = 64
 """Parts of a coverage bar that are told apart."""
 
+
+def _start(summary: RecordingSummary) -> int:
+    """Log time of the beginning, ns; until a message is sealed, when it was made."""
+    return summary.extent[0] if summary.span else summary.created
+
+
 _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
-    "start": lambda one: one.extent[0],
+    "start": _start,
     "name": lambda one: one.label,
     "duration": lambda one: one.extent[1] - one.extent[0],
     "topics": lambda one: one.topic_count,
@@ -106,7 +112,7 @@ def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
         "name": summary.name,
         "tags": summary.tags,
         "status": summary.status,
-        "start": str(begin if summary.span else summary.created),
+        "start": str(_start(summary)),
         "duration": end - begin,
         "topics": summary.topic_count,
         "messages": summary.messages,

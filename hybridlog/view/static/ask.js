@@ -12,18 +12,13 @@ import { counted } from "./words.js";
 
 /** Shows the bar. Returns a function that takes it away. */
 export function mountAsk(main, recording) {
-  const topics = recording.info.topics.filter(({ messages }) => messages);
   const kind = element(
     "select",
     { "aria-label": "Language", onchange: adapt },
     element("option", { value: "predicate" }, "Where"),
     element("option", { value: "sql" }, "SQL"),
   );
-  const topic = element(
-    "select",
-    { "aria-label": "Topic of the question" },
-    ...topics.map((one) => element("option", { value: one.topic }, one.topic)),
-  );
+  const topic = element("select", { "aria-label": "Topic of the question" });
   const text = element("input", {
     class: "question",
     type: "text",
@@ -84,7 +79,13 @@ export function mountAsk(main, recording) {
   );
   main.append(place, list.side);
   document.addEventListener("keydown", key);
-  const ends = [state.on(["ask"], answer), recording.on(update), drawMatches(recording)];
+  offer();
+  const ends = [
+    state.on(["ask"], answer),
+    recording.on(offer), // topics may have come
+    recording.on(update),
+    drawMatches(recording),
+  ];
   answer();
   return () => {
     ends.forEach((end) => end());
@@ -107,7 +108,7 @@ export function mountAsk(main, recording) {
 
   function write(question) {
     kind.value = question.kind === "sql" ? "sql" : "predicate";
-    if (topics.some((one) => one.topic === question.topic)) topic.value = question.topic;
+    if (topics().some((one) => one.topic === question.topic)) topic.value = question.topic;
     text.value = question.text;
     within.value = typeof question.within === "string" ? question.within : "";
     adapt();
@@ -191,8 +192,21 @@ export function mountAsk(main, recording) {
     fill(body, sqlTable(recording, found));
   }
 
+  function topics() {
+    return recording.info.topics.filter(({ messages }) => messages);
+  }
+
+  /** Fills the menu of topics; the one that is chosen stays. */
+  function offer() {
+    const names = topics().map((one) => one.topic);
+    if (names.length === topic.options.length) return;
+    const chosen = topic.value || firstTopic();
+    fill(topic, ...names.map((name) => element("option", { value: name }, name)));
+    topic.value = names.includes(chosen) ? chosen : (names[0] ?? "");
+  }
+
   function firstTopic() {
-    return state.get("panels")?.[0]?.topic ?? topics[0]?.topic;
+    return state.get("panels")?.[0]?.topic ?? topics()[0]?.topic;
   }
 
   async function copyPython() {
