@@ -127,12 +127,12 @@ def _print_address(port: int, *, quiet: bool) -> None:
 
     address = f"ws://127.0.0.1:{port}"
     output.say(address)
+    sys.stdout.flush()
     if not quiet:
         url = f"https://app.foxglove.dev/?ds=foxglove-websocket&ds.url={quote(address, safe='')}"
         output.note(f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}")
         output.note(f"In a browser: {url}")
         output.note("Ctrl-C ends it.")
-    sys.stdout.flush()
 
 
 def _print_undefined(log: PlayedLog) -> None:
