@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import psutil
 
@@ -39,7 +39,7 @@ class Page:
 
     def __init__(self, address: str) -> None:
         self.content = b""
-        self._client = httpx.Client(base_url=address, timeout=120)
+        self._client = httpx2.Client(base_url=address, timeout=120)
 
     def get(self, path: str, **parameters: Any) -> tuple[float, int]:
         """Time of an answer, ms, and its bytes; `content` has it."""

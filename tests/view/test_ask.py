@@ -28,7 +28,7 @@ from hybridlog_storage.segment_writer import SegmentSettings
 from .conftest import PORT, TOKEN
 
 if TYPE_CHECKING:
-    from httpx import Response
+    from httpx2 import Response
     from playwright.sync_api import Page
     from starlette.testclient import TestClient
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import urlencode
 
-import httpx
+import httpx2
 import pytest
 from mcap.reader import NonSeekingReader, SeekingReader
 from starlette.testclient import TestClient
@@ -58,7 +58,7 @@ class Ranges(io.RawIOBase):
     def __init__(self, url: str) -> None:
         self._url, self._at = url, 0
         self.taken = 0
-        head = httpx.head(url)
+        head = httpx2.head(url)
         assert head.headers["accept-ranges"] == "bytes"
         self.length, self.etag = int(head.headers["content-length"]), head.headers["etag"]
 
@@ -79,7 +79,7 @@ class Ranges(io.RawIOBase):
         end = min(self._at + len(buffer), self.length) - 1
         if end < self._at:
             return 0
-        got = httpx.get(self._url, headers={"Range": f"bytes={self._at}-{end}"})
+        got = httpx2.get(self._url, headers={"Range": f"bytes={self._at}-{end}"})
         assert got.status_code == 206
         assert got.headers["content-range"] == f"bytes {self._at}-{end}/{self.length}"
         assert got.headers["etag"] == self.etag

@@ -167,7 +167,9 @@ def test_a_track(asked: TestClient, store: hl.Store) -> None:
     parameters |= {"begin": 3 * S, "end": 8 * S, "pixels": 1}
     found, arrays = unpacked(asked.get("track", params=parameters).content)
     assert arrays["times"].tolist() == [n * S for n in range(3, 8)]
-    found, arrays = unpacked(asked.get("track", params={**parameters, "begin": 50 * S}).content)
+    found, arrays = unpacked(
+        asked.get("track", params={**parameters, "begin": 50 * S, "end": 51 * S}).content
+    )
     assert (found["grid"], len(arrays["xy"])) == (None, 0)
 
 
