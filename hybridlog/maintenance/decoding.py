@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -62,7 +62,7 @@ def _decoded(
     before = 0
     for number, summary in inventory.summaries.items():
         if catalog.stamps(entry, number, summary.table) is None:
-            stats: dict[int, dict[int, ChannelStats]] = {}
+            stats: dict[int, Mapping[int, ChannelStats]] = {}
             path = directory.recording(entry.label) / inventory.listing.sealed[number]
             with open_segment(path, number) as reader:
                 for place in summary.chunks:

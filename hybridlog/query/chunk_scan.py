@@ -156,7 +156,7 @@ class ScanPlan:
             for chunk in scan.chunks:
                 span = chunk.span(scan.channels)
                 if span is not None and scan.touches(*span):
-                    count = sum(s.messages for c, s in chunk.stats.items() if c in scan.channels)
+                    count = sum(stats.messages for stats in chunk.stats_of(scan.channels))
                     found.append(ChunkTask(scan, chunk, *span, count))
         if self.reverse:
             return sorted(found, key=lambda t: (-t.last, t.key))

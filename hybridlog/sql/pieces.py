@@ -184,7 +184,7 @@ class TopicOfRecording:
         if self.entry.status == "open":
             messages: dict[int, int] = {}
             for chunk in chunks:
-                count = sum(s.messages for c, s in chunk.stats.items() if c in self.channels)
+                count = sum(stats.messages for stats in chunk.stats_of(self.channels))
                 messages[chunk.segment] = messages.get(chunk.segment, 0) + count
             made = self.session.tables.of_sealed(self.entry, self.topic, messages)
             if made is not None:

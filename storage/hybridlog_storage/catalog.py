@@ -322,7 +322,14 @@ class ChunkEntry:
     trailer_crc: int | None
     first: int
     last: int
-    stats: dict[int, ChannelStats]
+    stats: Mapping[int, ChannelStats]
+
+    def stats_of(self, channels: Collection[int]) -> Iterator[ChannelStats]:
+        """Statistics of those of some channels that have messages in it."""
+        stats = self.stats
+        if len(channels) > len(stats):
+            return (stats[channel] for channel in stats if channel in channels)
+        return (stats[channel] for channel in channels if channel in stats)
 
     @property
     def place(self) -> ChunkPlace:
@@ -344,9 +351,9 @@ class ChunkEntry:
         """Number of its messages."""
         return sum(stats.messages for stats in self.stats.values())
 
-    def span(self, channels: Container[int]) -> tuple[int, int] | None:
+    def span(self, channels: Collection[int]) -> tuple[int, int] | None:
         """First and last log time of some channels in it; None without messages of them."""
-        stats = [s for c, s in self.stats.items() if c in channels]
+        stats = list(self.stats_of(channels))
         firsts = [s.first for s in stats if s.first is not None]
         lasts = [s.last for s in stats if s.last is not None]
         return (min(firsts), max(lasts)) if firsts and lasts else None
@@ -1081,13 +1088,8 @@ def chunk_entries(
     found = []
     for number in distinct(chunk_of[wanted]).tolist():
         chunk = table.chunks[number]
-        rows = range(edges[number], edges[number + 1])
-        stats = {
-            int(parts["channel"][row]): _stats(
-                parts[row], stamps[row] if stamps is not None else None, silent
-            )
-            for row in rows
-        }
+        rows = slice(edges[number], edges[number + 1])
+        stats = _PartStats(parts[rows], None if stamps is None else stamps[rows], silent)
         found.append(
             ChunkEntry(
                 entry.id,
@@ -1125,6 +1127,42 @@ def _in_bounds(
         timed = [c.id for c in entry.channels if c.has_publish_time]
         inside &= np.isin(parts["channel"], np.array(timed, np.int64))
     return np.asarray(inside)
+
+
+class _PartStats(Mapping[int, ChannelStats]):
+    """Statistics of the channels of a chunk, each made when it is asked for.
+
+    A question is about few of the channels, which may be thousands.
+
+    Args:
+        parts: The chunk's rows of the chunk table.
+        stamps: Its rows of stamps; None if they are unknown.
+        silent: Ids of channels without publish times.
+    """
+
+    __slots__ = ("_parts", "_rows", "_silent", "_stamps")
+
+    def __init__(
+        self, parts: NDArray[np.void], stamps: NDArray[np.void] | None, silent: Container[int]
+    ) -> None:
+        self._parts = parts
+        self._stamps = stamps
+        self._silent = silent
+        self._rows = {channel: row for row, channel in enumerate(parts["channel"].tolist())}
+
+    def __getitem__(self, channel: int) -> ChannelStats:
+        row = self._rows[channel]
+        stamp = None if self._stamps is None else self._stamps[row]
+        return _stats(self._parts[row], stamp, self._silent)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __contains__(self, channel: object) -> bool:
+        return channel in self._rows
 
 
 def _stats(part: np.void, stamp: np.void | None, silent: Container[int]) -> ChannelStats:

@@ -57,8 +57,8 @@ def _in_chunk(
 ) -> int | None:
     spans = [
         (stats.first, stats.last)
-        for number, stats in entry.stats.items()
-        if number in channels and stats.first is not None and stats.last is not None
+        for stats in entry.stats_of(channels)
+        if stats.first is not None and stats.last is not None
     ]
     later = [first for first, last in spans if last >= moment]
     if not later or min(later) >= moment:

@@ -134,8 +134,8 @@ def count_in_chunks(
     held = [
         (number, channel, stats.first, stats.last, stats.messages)
         for number, chunk in enumerate(chunks)
-        for channel, stats in chunk.stats.items()
-        if channel in channels and stats.first is not None
+        for channel in channels
+        if (stats := chunk.stats.get(channel)) is not None and stats.first is not None
     ]
     if not held or not len(windows):
         return 0
