@@ -283,6 +283,28 @@ def test_a_chunk_says_where_it_lies_and_when(catalog: Catalog, model: Model) -> 
         assert got.span(set(CHANNELS)) == (want.first, want.last)
 
 
+def test_only_the_statistics_that_are_asked_for_are_made(
+    catalog: Catalog, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A chunk may have thousands of channels, and a question is about few of them."""
+    model.put(catalog)
+    one = max(catalog.chunks(model.entry), key=lambda chunk: len(chunk.stats))
+    first, _, third, *_ = one.stats
+    made: list[int] = []
+    stats_of = module._stats
+
+    def counted(part: np.void, stamp: np.void | None, silent: set[int]) -> ChannelStats:
+        made.append(int(part["channel"]))
+        return stats_of(part, stamp, silent)
+
+    monkeypatch.setattr(module, "_stats", counted)
+    assert one.span([third]) is not None
+    assert len(list(one.stats_of({first, 1 << 40}))) == 1
+    assert made == [third, first]
+    assert len(list(one.stats_of(range(1 << 10)))) == len(one.stats)
+    assert made[2:] == list(one.stats)
+
+
 def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
     other = Model(2, "other", segments=0)
     for one in (model, other):
