@@ -17,7 +17,7 @@ import hybridlog as hl
 from hybridlog.drawing.series import series
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.answers.next_time import next_time
-from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -270,10 +270,9 @@ def test_the_next_time_is_found_in_any_chunk(tmp_path: Path) -> None:
 def test_a_later_chunk_may_have_the_earlier_time() -> None:
     """Of chunks that overlap a span, one may begin with another topic's messages."""
 
-    def chunk(first: int, own: int) -> Any:
-        return SimpleNamespace(
-            first=first, last=own, stats={1: ChannelStats(1, first=own, last=own)}
-        )
+    def chunk(first: int, own: int) -> ChunkEntry:
+        stats = {1: ChannelStats(1, first=own, last=own)}
+        return ChunkEntry("", 0, 0, 0, 0, 0, None, None, first, own, stats)
 
     chunks = [chunk(0, 90 * S), chunk(50 * S, 60 * S)]
 
