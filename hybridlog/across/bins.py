@@ -14,6 +14,7 @@ from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import FieldTypes
+from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ class _Rows:
             table: Their fields.
             row: int64[n], ascending, the bin of each.
         """
-        begins = _begins(row)
+        begins = run_starts(row)
         bins, counts = row[begins], np.diff(np.append(begins, len(row)))
         if self._how in _OF_NUMBERS:
             for name, column in zip(table.column_names, table.columns, strict=True):
@@ -242,7 +243,7 @@ class _Column:
         chosen, row = values[is_value], row[is_value]
         if not len(row):
             return
-        begins = _begins(row)
+        begins = run_starts(row)
         bins = row[begins]
         if self._how == "mean":
             with np.errstate(over="ignore"):
@@ -260,13 +261,6 @@ class _Column:
         if self._how == "mean":
             return pa.array(self._value / np.maximum(self._count, 1), mask=missing)
         return pa.array(self._value, mask=missing).cast(self._kind)
-
-
-def _begins(row: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Where another number begins."""
-    return (
-        np.flatnonzero(np.append(True, row[1:] != row[:-1])) if len(row) else np.empty(0, np.intp)
-    )
 
 
 def _values_of(column: Any) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:

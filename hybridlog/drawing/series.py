@@ -16,6 +16,7 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.wording import listed
+from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -382,7 +383,7 @@ class _Grid:
             return
         # Messages of a running recording may be later than its known end.
         pixel = np.minimum((times - self._begin) // self._width, self.pixels - 1)
-        begins = np.concatenate(([0], np.flatnonzero(np.diff(pixel)) + 1))
+        begins = run_starts(pixel)
         ends = np.append(begins[1:], len(times))
         used = pixel[begins]
         new = self._count[used] == 0

@@ -14,6 +14,7 @@ from hybridlog.frames.names import FIELD
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.question import field_types
+from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -318,7 +319,7 @@ class _Builder:
         places = np.flatnonzero(has_fix)
         kept[_first_of_each(pixel, places)] = True
         if len(places):
-            begins = np.flatnonzero(np.diff(pixel[places], prepend=pixel[places[0]] - 1))
+            begins = run_starts(pixel[places])
             counts = np.diff(begins, append=len(places))
             for values in self._xy[places].T:
                 for extreme in (np.minimum, np.maximum):
@@ -345,10 +346,7 @@ class _Builder:
 
 def _first_of_each(pixel: NDArray[np.int64], places: NDArray[np.intp]) -> NDArray[np.intp]:
     """The first place of each pixel; places ascend."""
-    if not len(places):
-        return places
-    chosen = pixel[places]
-    return places[np.flatnonzero(np.diff(chosen, prepend=chosen[0] - 1))]
+    return places[run_starts(pixel[places])]
 
 
 def _is_position(

@@ -20,6 +20,7 @@ from hybridlog.query.times import (
     parse_duration,
 )
 from hybridlog.schema.column import ranges
+from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -458,7 +459,7 @@ class Holding:
         """Complete intervals of some log times, the open one first."""
         if not len(time):
             return np.empty((0, 3), np.int64)
-        first = np.flatnonzero(np.concatenate([[True], time[1:] != time[:-1]]))
+        first = run_starts(time)
         last = np.append(first[1:], len(time)) - 1
         begin = time[first]
         end = np.append(begin[1:], following)

@@ -30,7 +30,7 @@ import numpy as np
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import ChunkTable
-from hybridlog_storage.distinct import distinct
+from hybridlog_storage.distinct import distinct, run_starts
 from hybridlog_storage.errors import (
     CatalogError,
     DiskFullError,
@@ -400,8 +400,7 @@ def channel_totals(
     found: dict[int, ChannelStats] = {}
     order = np.argsort(parts["channel"], kind="stable")
     ids = parts["channel"][order]
-    begins = np.flatnonzero(np.diff(ids, prepend=-1)) if len(ids) else np.empty(0, np.intp)
-    for begin, end in pairwise([*begins.tolist(), len(ids)]):
+    for begin, end in pairwise([*run_starts(ids).tolist(), len(ids)]):
         rows = parts[order[begin:end]]
         channel = int(ids[begin])
         stats = found[channel] = ChannelStats(

@@ -1,8 +1,8 @@
-"""Distinct values of an array."""
+"""Distinct values of an array, and its runs of equal values."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,11 @@ def distinct(values: NDArray[T]) -> NDArray[T]:
     15 milliseconds during its first messages.
     """
     ordered = np.sort(values)
-    is_first = np.ones(len(ordered), np.bool_)
-    np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
-    return ordered[is_first]
+    return ordered[run_starts(ordered)]
+
+
+def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
+    """Places at which a run of equal values begins, ascending; of an empty array none."""
+    is_first = np.ones(len(values), np.bool_)
+    np.not_equal(values[1:], values[:-1], out=is_first[1:])
+    return np.flatnonzero(is_first)
