@@ -5,21 +5,22 @@ import { element, fill } from "../dom.js";
 import { offset, size } from "../words.js";
 import { follow } from "./follow.js";
 import { moment, opening } from "./python.js";
+import { ofTypes } from "./types.js";
 
-const TYPES = new Set([
+const accepts = ofTypes(
   "sensor_msgs/Image",
   "sensor_msgs/CompressedImage",
   "foxglove_msgs/CompressedImage",
   "foxglove_msgs/RawImage",
   "foxglove.CompressedImage",
   "foxglove.RawImage",
-]);
+);
 
 export default {
   kind: "image",
   title: "Image",
   isFirst: () => true,
-  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  accepts,
   mount,
   python: (panel) =>
     [

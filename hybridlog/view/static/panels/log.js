@@ -4,14 +4,15 @@ import { ApiError, get, isAborted } from "../api.js";
 import { element, fill } from "../dom.js";
 import { counted, offset } from "../words.js";
 import { literal, moment, opening } from "./python.js";
+import { ofTypes } from "./types.js";
 
-const TYPES = new Set([
+const accepts = ofTypes(
   "rosgraph_msgs/Log",
   "rcl_interfaces/Log",
   "foxglove_msgs/Log",
   "foxglove.Log",
   "std_msgs/String",
-]);
+);
 const LEVELS = ["debug", "info", "warning", "error", "fatal"];
 const ROW = 22; // pixels; the style sheet says the same
 const PAGE = 200; // lines of a request
@@ -25,7 +26,7 @@ export default {
   kind: "log",
   title: "Log",
   isFirst: () => true,
-  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  accepts,
   mount,
   python: (panel) => {
     const { level, text } = filtersOf(panel.options);

@@ -7,11 +7,12 @@ import { metres, plane } from "../spatial/plane.js";
 import { counted, offset } from "../words.js";
 import { follow } from "./follow.js";
 import { opening } from "./python.js";
+import { ofTypes } from "./types.js";
 
 const PIXELS = 2000; // steps of time of a track
 const REST = 4; // times as long as the last track took
 const NEAR = 12; // pixels within which a click means the track
-const TYPES = new Set([
+const accepts = ofTypes(
   "sensor_msgs/NavSatFix",
   "gps_common/GPSFix",
   "gps_msgs/GPSFix",
@@ -25,14 +26,14 @@ const TYPES = new Set([
   "geometry_msgs/Pose",
   "foxglove.PoseInFrame",
   "foxglove_msgs/PoseInFrame",
-]);
+);
 const FIRST = /Fix|Odometry/; // what a recording is first shown with
 
 export default {
   kind: "map",
   title: "Map",
   isFirst: ({ type }) => FIRST.test(type),
-  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  accepts,
   mount,
   python: (panel) =>
     [

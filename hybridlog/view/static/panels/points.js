@@ -9,8 +9,9 @@ import { metres, plane } from "../spatial/plane.js";
 import { count, offset } from "../words.js";
 import { follow } from "./follow.js";
 import { moment, opening } from "./python.js";
+import { ofTypes } from "./types.js";
 
-const TYPES = new Set([
+const accepts = ofTypes(
   "sensor_msgs/LaserScan",
   "sensor_msgs/MultiEchoLaserScan",
   "sensor_msgs/PointCloud2",
@@ -19,7 +20,7 @@ const TYPES = new Set([
   "foxglove.PointCloud",
   "foxglove_msgs/LaserScan",
   "foxglove_msgs/PointCloud",
-]);
+);
 const AXES = ["x", "y", "z"];
 const COLOUR = "rgb";
 const PLAIN = "one colour";
@@ -30,7 +31,7 @@ export default {
   kind: "points",
   title: "Points",
   isFirst: () => true,
-  accepts: ({ type }) => TYPES.has(type.replace("/msg/", "/")),
+  accepts,
   mount,
   python: (panel) =>
     [
