@@ -166,7 +166,7 @@ def losses_of(entry: RecordingEntry) -> list[dict[str, Any]]:
 
 
 def _uncounted(cause: str, reason: str) -> dict[str, Any]:
-    """A loss of nobody knows how many messages."""
+    """A loss of an unknown number of messages."""
     row: dict[str, Any] = {"cause": cause, "file": "", "offset": None, "reason": reason}
     return row | {"count": None, "topic": None}
 

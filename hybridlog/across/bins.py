@@ -1,4 +1,4 @@
-"""What the messages of a topic say in each of some equal times: least, greatest, mean, last."""
+"""Aggregates of a topic's messages in bins of equal length: count, first, last, min, max, mean."""
 
 from __future__ import annotations
 

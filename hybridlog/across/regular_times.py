@@ -53,7 +53,7 @@ class RegularTimes:
             raise UsageError(f"There would be {rows} rows; use a longer step or a time range.")
 
     def end(self, recording: str, time: int) -> int:
-        """When what begins at a time ends: at the next time, or with the range."""
+        """End of the bin that begins at a time: the next time, or the end of the range."""
         spans = self._spans[recording]
         return min(time + self.step, next(end for begin, end in spans if begin <= time < end))
 

@@ -129,7 +129,7 @@ def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEF
 
 
 def _program() -> str:
-    """What to type for this program: its path if the environment is not activated."""
+    """The command for this program: its path if the environment is not activated."""
     if shutil.which("hybridlog"):
         return "hybridlog"
     started = sys.argv[0]

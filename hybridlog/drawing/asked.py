@@ -1,4 +1,4 @@
-"""What drawing needs of a query: `Query` draws, so modules here cannot import it."""
+"""The part of `Query` that drawing uses. `Query` imports drawing, not the other way."""
 
 from __future__ import annotations
 

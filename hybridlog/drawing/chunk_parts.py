@@ -1,4 +1,4 @@
-"""What chunk tables say about the messages of a recording, also of one that goes on."""
+"""Counts and times of the messages in each chunk, from chunk tables; also of running recordings."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ class RecordedChunks:
         return self._session.segment(self._recording.id, segment).read_times(places[chunk])
 
     def running(self) -> dict[str, RunningTopic]:
-        """What is flushed and not in the recording's entry yet, by topic."""
+        """Flushed messages that the recording's entry does not count yet, by topic."""
         found: dict[str, RunningTopic] = {}
         numbers = [n for n in self._open if str(n) not in self._recording.digests]
         for number in numbers:

@@ -1,4 +1,4 @@
-"""Where a recording is whole, and where messages were lost."""
+"""Parts of a recording in which messages were lost."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def count(
 
 
 def reading_work(chunks: RecordedChunks, topics: Sequence[str], edges: NDArray[np.int64]) -> int:
-    """What `count` has to read: messages whose times are read, and a little for each chunk."""
+    """Cost of `count`: the messages whose times it reads, and `_CHUNK_WORK` for each chunk."""
     placed = _Placed.of(chunks.parts((int(edges[0]), int(edges[-1])), topics), edges)
     return _work(placed.parts.take(placed.is_cut))
 

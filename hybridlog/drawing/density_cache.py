@@ -105,7 +105,7 @@ class DensityCache:
             return [recorded.period(recording, span, topic) for topic in topics]
 
     def running(self, recording: RecordingEntry) -> dict[str, RunningTopic]:
-        """What is flushed and not in the recording's entry yet, by topic."""
+        """Flushed messages that the recording's entry does not count yet, by topic."""
         recorded = self._of(recording)
         with recorded.lock:
             return recorded.follow(recording).running()

@@ -119,7 +119,7 @@ def _as_it_came(message: Any, *, raw: bool) -> Picture | None:
 
 
 def _check_size(data: bytes) -> None:
-    """Refuse a small file that would fill the memory of whoever shows it.
+    """Refuse a small file that would fill the memory of the program that shows it.
 
     Raises:
         PayloadError: it has more than `MAX_SHOWN` pixels.

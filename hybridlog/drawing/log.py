@@ -27,7 +27,7 @@ _MAX_NAME: Final = 200
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Where a type of message has what a line shows.
+    """Fields of a message type that a log line shows.
 
     Attributes:
         text: Field with the text.
@@ -75,7 +75,7 @@ class Line:
 
 
 def kind_of(type_name: str) -> Kind:
-    """Where messages of a type have their text.
+    """The fields of a type's messages that a log line shows.
 
     Raises:
         UsageError: they are no lines of a log.

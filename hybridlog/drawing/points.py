@@ -208,7 +208,7 @@ def _posed(axes: list[NDArray[Any]], pose: Any) -> list[NDArray[Any]]:
 
 
 def _origin(axis: NDArray[Any]) -> float:
-    """What to subtract, so that float32 keeps millimetres; 0 if it does."""
+    """Offset to subtract so that float32 keeps millimetres; 0 where it does anyway."""
     if axis.dtype.itemsize <= 4 and axis.dtype.kind == "f":
         return 0.0
     finite = axis[np.isfinite(axis)]

@@ -137,7 +137,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where the messages of a topic have their position.
+    """Place of the position in the messages of a topic.
 
     Attributes:
         prefix: Path in front of both values: `""`, `pose.pose.position.`.
@@ -155,7 +155,7 @@ class Position:
 
 
 def position_of(known: Mapping[str, str] | None) -> Position | None:
-    """Where messages have their position; None if they have none.
+    """The place of the position in the messages; None if they have none.
 
     Args:
         known: Types of their fields by path; None if no definition fixes them.
@@ -328,7 +328,7 @@ class _Builder:
         self._times, self._xy = self._times[kept], self._xy[kept]
 
     def track(self) -> Track:
-        """What was collected."""
+        """The track of the messages that were added."""
         steps = np.diff(self._times)
         usual = usual_period(steps) if self._exact else float(self._width)
         gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1

@@ -30,7 +30,7 @@ class RequestError(Exception):
 
 
 class Status(IntEnum):
-    """What a playback does."""
+    """State of a playback."""
 
     PLAYING = 0
     PAUSED = 1
@@ -145,10 +145,10 @@ def time_now(position: int) -> bytes:
 def playback_state(
     status: Status, position: int, speed: float, *, did_seek: bool, request: bytes
 ) -> bytes:
-    """What the playback does now.
+    """A message with the state of the playback.
 
     Args:
-        status: What it does.
+        status: Its state.
         position: Log time, ns.
         speed: Seconds of log time a second.
         did_seek: The log time was set: what clients have shown no longer holds.

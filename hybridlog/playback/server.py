@@ -1,6 +1,6 @@
 """A Foxglove WebSocket server that plays a log to its clients.
 
-All clients share one playback, as the protocol has it: whoever pauses or seeks does it for all.
+All clients share one playback, as the protocol has it: a pause or a seek of one is for all.
 One task plays. It obeys the requests of clients one after the other, and between two of them it
 sends what is due. It waits for the slowest client: the log time then runs slower, and no
 message is dropped. Only subscribed topics are read.
@@ -70,7 +70,7 @@ _VIEWERS: Final = ".foxglove.dev"
 
 @dataclass(frozen=True, slots=True)
 class PlaybackOptions:
-    """How a log is played.
+    """Options of a playback.
 
     Attributes:
         port: TCP port on the loopback interface; 0 for a free one.
@@ -300,7 +300,7 @@ class PlaybackServer:
         await asyncio.gather(*(client.send_state(state) for client in self._clients))
 
     def _state(self, *, seek: int | None = None, request: bytes = b"") -> bytes:
-        """What the playback does, perhaps after a seek to a log time."""
+        """A message with the state of the playback, perhaps after a seek to a log time."""
         doing = Status.PLAYING if self._clock.is_running else Status.PAUSED
         if self._has_ended:
             doing = Status.ENDED

@@ -1,4 +1,4 @@
-"""What a query reads, and counts of it."""
+"""Counters of what a query reads."""
 
 from __future__ import annotations
 

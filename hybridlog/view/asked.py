@@ -36,7 +36,7 @@ class Asked:
         self.tag = tag
 
     def has(self, name: str) -> bool:
-        """Whether a parameter is given."""
+        """True if a parameter is given."""
         return name in self._parameters
 
     def text(self, name: str, default: str | None = None, *, longest: int = 1024) -> str:

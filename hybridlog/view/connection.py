@@ -11,7 +11,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 class BoundedConnection(H11Protocol):
     """A connection whose requests arrive whole within a time, and in bounded memory.
 
-    Else whoever reaches the port could hold all connections with requests that never end.
+    Otherwise any local user could hold all connections with requests that never end.
 
     Attributes:
         patience_s: Time for a request to arrive, from the connection or the last answer on.

@@ -1,4 +1,4 @@
-"""What the routes of the view have in common: the store, bounds, and answers."""
+"""The context of the view's routes: the open store, bounds on the work, JSON answers."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Context:
 
     @cached_property
     def flushed(self) -> FlushedMessages:
-        """What running recordings have flushed."""
+        """Flushed messages of running recordings."""
         from hybridlog.drawing.flushed import FlushedMessages
 
         return FlushedMessages(self.store.session)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Current:
-    """What is current at a time.
+    """The message that is current at a time.
 
     Attributes:
         message: The last message not after that time; None if there is none.

@@ -1,4 +1,4 @@
-"""Answers that stop when nobody waits for them any more."""
+"""Answers that stop when their client has gone."""
 
 from __future__ import annotations
 

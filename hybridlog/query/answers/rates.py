@@ -114,7 +114,7 @@ class Rates:
             if periods is not None:
                 median = medians.get(stretch.summary.id)
                 if median is None:
-                    continue  # of one message nobody knows when the next one was due
+                    continue  # one message does not tell when the next one was due
                 limit = max(limit, periods * median)
             found += [(stretch.summary.id, rows) for rows in _longer(times, stretch.span, limit)]
         return Intervals.of(found)

@@ -57,7 +57,7 @@ class Completion:
 def complete(
     text: str, place: int, topics: Collection[str], fields: Fields, *, most: int = 50
 ) -> Completion:
-    """What may be written at a place of a predicate.
+    """Candidates for completing a predicate at a place.
 
     Args:
         text: The predicate.

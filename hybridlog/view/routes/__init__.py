@@ -1,1 +1,1 @@
-"""What the page asks the server for, a module a subject; each has `routes`."""
+"""HTTP routes of the view, a module a subject; each module has `routes`."""

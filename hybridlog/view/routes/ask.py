@@ -50,7 +50,7 @@ _sql_turns = threading.BoundedSemaphore(2)
 
 
 def ask(context: Context, asked: Asked) -> dict[str, Any]:
-    """How many messages satisfy a predicate, and what that number may lack."""
+    """The number of messages that satisfy a predicate, with losses and remarks."""
     question = question_of(context, asked)
     query = question.query()
     count = query.count()
@@ -112,7 +112,7 @@ def _matches(context: Context, question: PageQuestion) -> Matches:
 
 
 def completion(context: Context, asked: Asked) -> dict[str, Any]:
-    """What may be written at a place of a predicate or of SQL."""
+    """Candidates for completing a predicate or SQL at a place."""
     text = asked.text("text", "", longest=MAX_TEXT)
     place = min(asked.integer("place", 0, MAX_TEXT), len(text))
     if asked.word("language", ("predicate", "sql"), "predicate") == "sql":
@@ -204,7 +204,7 @@ def _sql_turn(stopped: threading.Event) -> Iterator[None]:
 
 
 def _remarks(context: Context, answer: SqlAnswer) -> list[str]:
-    """What an answer may lack."""
+    """Remarks about values that an answer lacks."""
     remarks = answer.remarks
     found = [
         f"{topic} has no columns of fields: {why}." for topic, why in remarks.undefined.items()

@@ -43,7 +43,7 @@ def slice_file(context: Context, asked: Asked) -> Response:
 
 
 def manifest(context: Context, asked: Asked) -> dict[str, Any]:
-    """What a selection holds, and where its data is: the manifest of a remote data loader."""
+    """The manifest of a remote data loader: topics, times and data URL of a selection."""
     query = _query(context, asked)
     spans = query.spans().values()
     if not spans:

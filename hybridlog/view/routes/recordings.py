@@ -36,7 +36,7 @@ _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
     "messages": lambda one: one.messages,
     "size": lambda one: one.stored_bytes,
 }
-"""What recordings can be ordered by."""
+"""Keys to order recordings by."""
 
 
 def recordings(context: Context, asked: Asked) -> dict[str, Any]:

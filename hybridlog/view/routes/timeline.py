@@ -79,7 +79,7 @@ def timeline(context: Context, asked: Asked) -> Response:
 
 
 def live(context: Context, asked: Asked) -> dict[str, Any]:
-    """How far a recording is: what is flushed counts."""
+    """Status, span and counts of a running recording, with what it has flushed."""
     recording = context.recording(asked)
     if recording.status == "open":
         listing = context.store.directory.listing(recording.label)
