@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
-_ROWS_AT_ONCE = 10_000  # rows of a table that are laid out together
+ROWS_AT_ONCE = 10_000
+"""Rows of a table that are laid out together."""
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 _SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
@@ -36,7 +37,8 @@ def console(*, error: bool = False) -> Console:
 def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under headings; on a terminal, cells that do not fit are folded.
 
-    A long table is printed some rows at a time: memory does not grow with it.
+    A long table is printed some rows at a time: memory does not grow with it. Columns become
+    wider where later rows need it.
 
     Args:
         columns: Headings, and the side on which the cells stand.
@@ -45,14 +47,15 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Non
     shown = ([printable(cell) for cell in row] for row in rows)
     named: Sequence[Column] = [(printable(heading), side) for heading, side in columns]
     widths = [len(heading) for heading, _ in named]
-    block, is_first = list(islice(shown, _ROWS_AT_ONCE)), True
+    block, is_first = list(islice(shown, ROWS_AT_ONCE)), True
     while block or is_first:
+        _widen(widths, block)
         if sys.stdout.isatty():
-            _print_on_screen(named, block, headings=is_first)
+            _print_on_screen(named, block, widths, headings=is_first)
         else:
             for line in _lines_of(named, block, widths, headings=is_first):
                 say(line)
-        block, is_first = list(islice(shown, _ROWS_AT_ONCE)), False
+        block, is_first = list(islice(shown, ROWS_AT_ONCE)), False
 
 
 def print_pages(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
@@ -64,22 +67,36 @@ def print_pages(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
 
     shown = [[printable(cell) for cell in row] for row in rows]
     widths = [len(heading) for heading, _ in columns]
+    _widen(widths, shown)
     click.echo_via_pager(f"{line}\n" for line in _lines_of(columns, shown, widths))
 
 
+def _widen(widths: list[int], rows: Sequence[Sequence[str]]) -> None:
+    """Make columns as wide as their cells."""
+    for n, cells in enumerate(zip(*rows, strict=True)):
+        widths[n] = max(widths[n], *map(len, cells))
+
+
 def _print_on_screen(
-    columns: Sequence[Column], rows: Sequence[Sequence[str]], *, headings: bool
+    columns: Sequence[Column],
+    rows: Sequence[Sequence[str]],
+    widths: Sequence[int],
+    *,
+    headings: bool,
 ) -> None:
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=headings)
-    for heading, side in columns:
+    # The same columns as those of the rows above, unless they are folded.
+    is_folded = sum(widths) + 2 * len(widths) > console().width
+    for (heading, side), width in zip(columns, widths, strict=True):
         table.add_column(
             Text(heading),
             justify="right" if side == "right" else "left",
             no_wrap=side != "left",
             overflow="fold",
+            min_width=None if is_folded else width,
         )
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
@@ -89,18 +106,12 @@ def _print_on_screen(
 def _lines_of(
     columns: Sequence[Column],
     rows: Sequence[Sequence[str]],
-    widths: list[int],
+    widths: Sequence[int],
     *,
     headings: bool = True,
 ) -> Iterator[str]:
-    """Headings and rows at full width: nothing is folded or left out.
-
-    `widths` are the least of the columns; they grow to those of the cells.
-    """
-    lines = [[heading for heading, _ in columns], *rows] if headings else rows
-    for n, cells in enumerate(zip(*lines, strict=True)):
-        widths[n] = max(widths[n], *map(len, cells))
-    for row in lines:
+    """Headings and rows at full width: nothing is folded or left out."""
+    for row in [[heading for heading, _ in columns], *rows] if headings else rows:
         line = "  ".join(
             cell.rjust(width) if side == "right" else cell.ljust(width)
             for cell, width, (_, side) in zip(row, widths, columns, strict=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, groupby, islice
+from operator import itemgetter
+from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
 from hybridlog.cli.answer_notes import print_reduced, print_unreadable
@@ -15,12 +17,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
 
 SCREEN_ROWS = 20
-"""Messages shown without --limit."""
-
-
-class _Answer(NamedTuple):
-    names: list[str]
-    rows: list[list[str]]
+"""Rows shown without --limit."""
 
 
 def print_answer(query: Query) -> Query:
@@ -35,12 +32,9 @@ def print_answer(query: Query) -> Query:
     limit = query.question.limit
     # One more than is shown tells whether there is more.
     answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
-    shown = 0
-    for table in answered.to_tables():
-        wanted = table if limit is not None else table.slice(0, SCREEN_ROWS - shown)
-        _print_block(_cells(wanted), answered.topics)
-        shown += wanted.num_rows
-    if not shown and not answered.counters.messages:
+    rows = print_rows(answered.to_tables(), limit, answered.topics)
+    missing = answered.counters.messages - answered.counters.reduced - rows
+    if not answered.counters.messages:
         output.note("No message.")
     if limit is None and answered.counters.messages > SCREEN_ROWS:
         output.note(
@@ -48,37 +42,46 @@ def print_answer(query: Query) -> Query:
             "gives all."
         )
         answered.counters.messages = SCREEN_ROWS
-    print_unreadable(answered.counters.messages - answered.counters.reduced - shown)
+    print_unreadable(missing)
     print_reduced(answered.counters.reduced)
     return answered
 
 
-def print_table_rows(table: pa.Table) -> None:
-    """Print the rows of a table for people to read; the first column is their title."""
-    answer = _cells(table)
-    if answer.rows and output.fits(answer.names, answer.rows):
-        output.print_table([(name, "left") for name in answer.names], answer.rows)
-        return
-    for row in answer.rows:
-        cells = zip(answer.names[1:], row[1:], strict=True)
-        output.print_record(row[0], [(name, cell) for name, cell in cells if cell])
+def print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[str] = ()) -> int:
+    """Print rows for people to read: a table if the first of them fit, else a block for each.
 
+    Memory does not grow with the number of rows.
 
-def _cells(table: pa.Table) -> _Answer:
-    return _Answer(list(table.column_names), cells(table))
+    Args:
+        tables: The rows.
+        limit: Number of rows to print; None for `SCREEN_ROWS`.
+        topics: Topics of messages, which are in the titles of blocks.
 
+    Returns:
+        Number of rows of the tables.
+    """
+    most = SCREEN_ROWS if limit is None else limit
+    read = 0
 
-def _print_block(answer: _Answer, topics: Sequence[str]) -> None:
-    if not answer.rows:
-        return
-    if output.fits(answer.names, answer.rows):
-        output.print_table([(name, "left") for name in answer.names], answer.rows)
-        return
-    for row in answer.rows:
-        # The first column is the time, the second the topic when there are several; a
-        # column without a value is another topic's.
-        several = len(topics) > 1
-        title = f"{row[0]}  {row[1] if several else topics[0]}"
-        first = 2 if several else 1
-        fields = [(n, c) for n, c in zip(answer.names[first:], row[first:], strict=True) if c]
-        output.print_record(title, fields)
+    def rows() -> Iterator[tuple[list[str], list[str]]]:
+        nonlocal read
+        for table in tables:
+            names, wanted = table.column_names, table.slice(0, max(most - read, 0))
+            read += table.num_rows
+            for row in cells(wanted):
+                yield names, row
+
+    # Headings are printed again only where the columns change.
+    for names, alike in groupby(rows(), itemgetter(0)):
+        lines = (row for _, row in alike)
+        first = list(islice(lines, output.ROWS_AT_ONCE))
+        if output.fits(names, first):
+            output.print_table([(name, "left") for name in names], chain(first, lines))
+            continue
+        begin = 2 if len(topics) > 1 else 1  # the first column is the time, the second the topic
+        for row in chain(first, lines):
+            title = "  ".join([*row[:begin], *(topics if len(topics) == 1 else ())])
+            # A column without a value is another topic's.
+            fields = zip(names[begin:], row[begin:], strict=True)
+            output.print_record(title, [(name, cell) for name, cell in fields if cell])
+    return read

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,19 +195,16 @@ def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
 
 
 def _print(tables: Iterable[pa.Table], limit: int | None) -> int:
-    from hybridlog.cli.screen import SCREEN_ROWS, print_table_rows
+    from hybridlog.cli.screen import SCREEN_ROWS, print_rows
 
-    most = SCREEN_ROWS if limit is None else limit
-    shown = 0
-    for table in _limited(chain(tables), most + (limit is None)):
-        rows = table.slice(0, most - shown)
-        print_table_rows(rows)
-        if table.num_rows > rows.num_rows:
-            output.note(
-                f"The first {SCREEN_ROWS} rows. --limit shows more, --format jsonl or -o FILE "
-                "gives all."
-            )
-        shown += rows.num_rows
-    if not shown:
+    # One more than is shown tells whether there is more.
+    rows = print_rows(_limited(tables, SCREEN_ROWS + 1 if limit is None else limit), limit)
+    if limit is None and rows > SCREEN_ROWS:
+        output.note(
+            f"The first {SCREEN_ROWS} rows. --limit shows more, --format jsonl or -o FILE gives "
+            "all."
+        )
+        return SCREEN_ROWS
+    if not rows:
         output.note("No row.")
-    return shown
+    return rows

@@ -99,6 +99,17 @@ def test_tables_and_notes(root: Path) -> None:
     assert run(root, "create table x as select 1").exit_code == 0
 
 
+@pytest.mark.parametrize("form", ["table", "csv"])
+def test_a_table_of_many_pieces_has_one_heading(root: Path, form: str) -> None:
+    done = run(root, "select recording, t from large", "-F", form, "-n", LARGE + 40)
+    first, *lines = done.stdout.splitlines()
+    assert first.replace(",", " ").replace('"', "").split() == ["recording", "t"]
+    assert len(lines) == LARGE + 40
+    assert not any("recording" in line for line in lines)
+    if form == "table":
+        assert len({len(line) for line in lines}) == 1
+
+
 def test_standard_input(root: Path) -> None:
     done = run(root, stdin="create table a as select 1 as x; select x + 1 as y from a;")
     assert done.stdout == '{"y": 2}\n'
