@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from hybridlog.live.statistics import TopicState
     from hybridlog.recorder import RecordReport
 
+_HEADINGS = ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost")
+_SPARE = ("jitter ms", "usual", "MB/s", "thinned")  # left out first where there is little room
 _SHORT = 60  # characters of a reason
 _SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 
@@ -59,32 +62,74 @@ class LiveTable:
 
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
         """Draw a state, with lines below it."""
-        rows = max(self._live.console.height - 6 - len(below), 3)
-        self._live.update(drawn(state, rows=rows, below=below), refresh=True)
+        console = self._live.console
+        found = drawn(state, width=console.width, height=console.height - 1, below=below)
+        self._live.update(found, refresh=True)
 
 
-def drawn(state: RecorderState, *, rows: int, below: Sequence[str] = ()) -> Group:
-    """A state as a table of at most `rows` topics, with lines below it."""
+def drawn(
+    state: RecorderState, *, width: int, height: int | None = None, below: Sequence[str] = ()
+) -> Group:
+    """A state as a table of topics, with lines below it.
+
+    Args:
+        state: The state.
+        width: Columns of the terminal; the less important columns are left out if it is narrow.
+        height: Lines of the terminal; None for all topics.
+        below: The lines.
+    """
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("topic", no_wrap=True, overflow="ellipsis", ratio=1)
-    for heading in ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    # When not all fit: topics with losses first, then those with most bytes.
-    topics = sorted(state.topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))
-    shown = {t.topic for t in topics[:rows]}
-    for topic in state.topics:
-        if topic.topic in shown:
-            table.add_row(*_cells(topic))
-    lines: list[Table | Text] = [table]
+    # Broken between its parts only.
+    whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
+    ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]
+    below = [line for each in below for line in textwrap.wrap(output.printable(each), width)]
+    topics = state.topics
+    rows = len(topics) if height is None else max(height - 1 - len(ends) - len(below), 4)
     if len(topics) > rows:
-        lines.append(Text(f"… and {output.counted(len(topics) - rows, 'more topic')}"))
-    lines.append(Text(summary(state), style="bold"))
-    lines.extend(Text(output.printable(line)) for line in below)
+        # Those with losses first, then those with most bytes; a line tells of the others.
+        topics = sorted(topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))[: rows - 1]
+    shown = {topic.topic for topic in topics}
+    topics = [topic for topic in state.topics if topic.topic in shown]
+    columns, room = _columns(topics, width)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("topic", no_wrap=True)
+    for heading in columns:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for topic, *cells in zip(topics, *columns.values(), strict=True):
+        table.add_row(Text(_cut(output.printable(topic.topic), room)), *cells)
+    lines: list[Table | Text] = [table]
+    if len(topics) < len(state.topics):
+        more = output.counted(len(state.topics) - len(topics), "more topic")
+        lines.append(Text(f"… and {more}"))
+    lines.extend(Text(line, style="bold") for line in ends)
+    lines.extend(map(Text, below))
     return Group(*lines)
+
+
+def _columns(topics: Sequence[TopicState], width: int) -> tuple[dict[str, list[Text]], int]:
+    """Cells by heading, as many as leave room for the names of the topics, and that room."""
+    rows = [_cells(topic) for topic in topics]
+    columns = {heading: [row[n] for row in rows] for n, heading in enumerate(_HEADINGS)}
+    longest = max((len(output.printable(topic.topic)) for topic in topics), default=0)
+    # Without any value first.
+    for spare in (*sorted(_SPARE, key=lambda name: any(map(len, columns[name]))), None):
+        taken = (2 + max(len(name), 0, *map(len, cells)) for name, cells in columns.items())
+        room = max(width - sum(taken), 4)
+        if spare is None or room >= min(longest, width // 2):
+            break
+        del columns[spare]
+    return columns, room
+
+
+def _cut(name: str, room: int) -> str:
+    """A name without its middle if it is too long: both ends tell topics apart."""
+    if len(name) <= room:
+        return name
+    end = 2 * room // 3
+    return f"{name[: max(room - end - 1, 0)]}…{name[-end:]}"
 
 
 def summary(state: RecorderState) -> str:
@@ -126,17 +171,16 @@ def in_short(reason: str) -> str:
     return sentence if len(sentence) <= _SHORT else f"{sentence[: _SHORT - 1]}…"
 
 
-def _cells(topic: TopicState) -> list[Text | str]:
+def _cells(topic: TopicState) -> list[Text]:
     from rich.text import Text
 
     slow = topic.expected_hz is not None and topic.hz < _SLOW * topic.expected_hz
     return [
-        Text(output.printable(topic.topic)),
         Text(f"{topic.hz:.1f}", style="yellow" if slow else ""),
         Text("" if topic.expected_hz is None else f"{topic.expected_hz:.1f}", style="dim"),
-        f"{topic.bytes_per_s / 1e6:.2f}",
-        "" if topic.jitter_ms is None else f"{topic.jitter_ms:.1f}",
-        str(topic.messages),
+        Text(f"{topic.bytes_per_s / 1e6:.2f}"),
+        Text("" if topic.jitter_ms is None else f"{topic.jitter_ms:.1f}"),
+        Text(str(topic.messages)),
         Text(str(topic.thinned) if topic.thinned else "", style="dim"),
         Text(str(topic.lost) if topic.lost else "", style="red"),
     ]

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.database import Database
 
 _EVERY_S = 1.0
-_ALL_ROWS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,8 @@ def command(
             elif table is not None:
                 table.show(_state(raw), _lines(values))
             else:
-                output.console().print(drawn(_state(raw), rows=_ALL_ROWS, below=_lines(values)))
+                console = output.console()
+                console.print(drawn(_state(raw), width=console.width, below=_lines(values)))
             if once or not (as_json or on_screen):
                 return
         if not as_json:

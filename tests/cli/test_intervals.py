@@ -78,7 +78,7 @@ def test_intervals_as_a_table(store: Path) -> None:
 def test_long_answers_are_printed_some_rows_at_a_time(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(output, "_ROWS_AT_ONCE", 2)
+    monkeypatch.setattr(output, "ROWS_AT_ONCE", 2)
     printed: list[str] = []
 
     def rows() -> Iterator[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -13,16 +14,19 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
 from mcap.writer import Writer
+from rich.console import Console
 
 from hybridlog.cli.app import app
-from hybridlog.cli.live_table import closing_rows, summary
+from hybridlog.cli.live_table import closing_rows, drawn, summary
 from hybridlog.live.recorder import RecorderState
+from hybridlog.live.statistics import TopicState
 from hybridlog.recorder import RecordReport
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import UsageError
@@ -412,3 +416,41 @@ def test_an_index_that_lags_says_why() -> None:
 )
 def test_what_came_a_moment_ago_is_not_behind(lag: int, late: int, told: str) -> None:
     assert told in summary(state_with({}, lag=lag, late=late)).split(" · ")
+
+
+@pytest.mark.parametrize(
+    ("width", "headings"),
+    [
+        (60, "Hz messages lost"),
+        (80, "Hz messages thinned lost"),
+        (100, "Hz usual MB/s messages thinned lost"),
+        (140, "Hz usual MB/s jitter ms messages thinned lost"),
+    ],
+)
+@pytest.mark.parametrize("height", [None, 24])
+def test_the_table_of_a_recorder_is_legible(width: int, headings: str, height: int | None) -> None:
+    topics = [
+        TopicState(
+            *(f"/camera_{n:02}/colour/image_raw/compressed/camera_info", "t", 123_400 + n, 9),
+            *(1234.5, 1250.25, 98.76e6, 12.3, 0.0, 10, 12_345 if n == 28 else 0),
+        )
+        for n in range(30)
+    ]
+    state = replace(state_with({"queue": 12_345}), topics=topics)
+    text = io.StringIO()
+    shown = drawn(state, width=width, height=height, below=["/odom x: nothing yet"])
+    Console(file=text, width=width).print(shown)
+    first, *lines = text.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    assert height is None or 1 + len(lines) == height
+    assert first.split() == ["topic", *headings.split()]
+    rows = [line.split() for line in lines if line.startswith("/camera_")]
+    more = len(topics) - len(rows)
+    assert len({name for name, *_ in rows}) == len(rows)
+    assert all(name.endswith("camera_info") for name, *_ in rows)
+    assert all({"1234.5", f"1234{row[0][8:10]}"} < {*row} for row in rows)
+    assert [row[-1] for row in rows].count("12345") == 1
+    assert any(f"… and {more} more topics" in line for line in lines) == bool(more)
+    parts = " ".join(line.rstrip() for line in lines[len(rows) :]).split(" · ")
+    assert {"index up to date", "lost 12345 (queue 12345) /odom x: nothing yet"} < {*parts}
+    assert all(line.rstrip().endswith(("·", ")", "yet", "topics")) for line in lines[len(rows) :])
