@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
+from hybridlog_storage.times import span_of
+
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 CRASH = "cut short by a crash"
 """Cause of the loss of what was not stored yet when a recorder died."""
 
-_LAST = 2**63 - 1  # ns
 _JOINED_NS = 12_000_000_000
 _SLOW_NS = 10_000_000_000  # interval between rows for losses that the user wants
 
@@ -180,8 +181,6 @@ def extent_of(entry: RecordingEntry) -> tuple[int, int]:
     """Log time `[begin, end)` of a recording, ns; empty at 0 without messages.
 
     Stored messages that are lost count, which preserves the meaning of relative times.
-    The span ends at the last nanosecond of 64 bits at the latest: a message of exactly that
-    time is in no interval.
     """
     spans = [*lost_spans(entry)]
     if entry.span is not None:
@@ -189,7 +188,7 @@ def extent_of(entry: RecordingEntry) -> tuple[int, int]:
     if not spans:
         return 0, 0
     first, last = min(first for first, _ in spans), max(last for _, last in spans)
-    return first, min(last + 1, _LAST)
+    return span_of(first, last)
 
 
 def _lost_from_store(entry: RecordingEntry) -> Iterator[Mapping[str, Any]]:

@@ -33,6 +33,7 @@ from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_format import OUR_NAMES
 from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, safe_point
+from hybridlog_storage.times import placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -286,7 +287,8 @@ class _Choice:
             batch = _where(batch, np.array(self._wanted, np.bool_)[batch.channel])
         if self._between is not None:
             begin, end = self._between
-            inside = (batch.log_time >= begin) & (batch.log_time < end)
+            times = placed(batch.log_time)
+            inside = (times >= begin) & (times < end)
             if self._front is not None:
                 batch, inside = self._front.split(batch, inside, channels)
             batch = _where(batch, inside)

@@ -16,6 +16,7 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import FieldTypes
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.times import placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -102,6 +103,7 @@ class Bins:
             if block is None:
                 return
             times, table = block
+            times = placed(times)
             cut = int(np.searchsorted(times, end))
             yield times[:cut], table.slice(0, cut)
             if cut < len(times):

@@ -19,6 +19,7 @@ from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.stamps import stamp_array
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
+from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -166,7 +167,7 @@ class Synced(Sequence[tuple["Message", ...]]):
             found = message_at(session, plain, self.counters, time)
             if found is not None and found.log_time_ns == time:
                 return found
-        span = Intervals.of([(recording, np.array([[time, time + 1, 1]], np.int64))])
+        span = Intervals.of([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
         question = replace(topic.question, recordings=(recording,), during=span)
         counters = Counters()
         runs = Planner(session, question, counters).runs()

@@ -17,10 +17,10 @@ from hybridlog.frames.names import free_name
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
-from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -126,7 +126,7 @@ class TopicReader:
 
     def latest(self, recording: str, moment: int) -> int | None:
         """Log time of the last message of a recording by a time, ns."""
-        if moment >= TIME_LIMIT - 1:
+        if moment >= END:
             return None
         question = replace(self.question, recordings=(recording,))
         found = message_at(self._session, question, self._counters, moment)
@@ -134,13 +134,11 @@ class TopicReader:
 
     def following(self, recording: str, moment: int) -> int | None:
         """Log time just behind the first message of a recording from a time on, ns."""
-        later = replace(
-            self.question, recordings=(recording,), bounds=(moment, TIME_LIMIT - 1), limit=1
-        )
+        later = replace(self.question, recordings=(recording,), bounds=(moment, END), limit=1)
         counters = Counters()
         try:
             for run in Planner(self._session, later, counters).runs():
-                return int(run.batch.log_time[0]) + 1
+                return min(int(run.batch.log_time[0]) + 1, END)
         except TimeError:
             return moment  # the recording ends before
         finally:

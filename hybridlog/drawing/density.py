@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.times import placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -207,7 +208,7 @@ def _add_estimated(parts: Parts, edges: NDArray[np.int64], counts: NDArray[np.in
     found = np.zeros((counts.shape[0], pixels))
     # Pixels of equal length, in which the parts begin and end.
     length = (int(edges[-1]) - int(edges[0])) / pixels
-    begin, end = ((t - edges[0]) / length for t in (parts.first, parts.last + 1))
+    begin, end = ((t - edges[0]) / length for t in (parts.first, placed(parts.last) + 1))
     rate = parts.messages / np.maximum(end - begin, 1e-9)
     begin, end = np.clip(begin, 0, pixels), np.clip(end, 0, pixels)
     low = np.minimum(begin.astype(np.intp), pixels - 1)

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
@@ -236,7 +237,7 @@ def _text(value: Any) -> str:
 
 
 def _time(ns: int) -> str:
-    return format_time(ns) if 0 <= ns < 1 << 63 else _duration(ns)
+    return format_time(ns) if BEGIN <= ns <= END else _duration(ns)
 
 
 def _duration(ns: int) -> str:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog_storage.times import placed
+
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
 
@@ -139,7 +141,7 @@ class _ChunkList:
         held.sort(key=lambda item: item[1][0])
         self._chunks = [chunk for chunk, _ in held]
         spans = np.array([span for _, span in held], np.int64).reshape(-1, 2)
-        first, self._last = np.ascontiguousarray(spans.T)
+        first, self._last = placed(spans[:, 0]), spans[:, 1].copy()
         self._longest = int((self._last - first).max()) if held else 0
         # Lists, since single numbers are looked up: numpy takes ten times as long.
         self._first: list[int] = first.tolist()

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from hybridlog.query.counters import Counters
-from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
+from hybridlog_storage.times import inside, placed, touches
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,10 +86,7 @@ class RecordingScan:
             first: Log time of its first message, ns.
             last: Log time of its last message, ns.
         """
-        if self.windows is None:
-            return True
-        place = int(np.searchsorted(self.windows[:, 1], first, "right"))
-        return place < len(self.windows) and bool(self.windows[place, 0] <= last)
+        return self.windows is None or touches(self.windows, first, last)
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,9 +292,7 @@ class ChunkScan:
             mask &= self._inside(batch, channel, mask, bounds)
         windows = task.scan.windows
         if windows is not None:
-            place = np.searchsorted(windows[:, 1], batch.log_time, "right")
-            begins = np.append(windows[:, 0], TIME_LIMIT - 1)
-            mask &= begins[place] <= batch.log_time
+            mask &= inside(batch.log_time, windows)
         if mask.all():
             batch.channel = channel
             return MessageRun(batch, seq, self._plan.channels)
@@ -337,12 +332,15 @@ class ChunkScan:
         else:
             from hybridlog.schema.stamps import stamps_of
 
-            times = np.full(len(batch), -1, np.int64)
+            times = np.zeros(len(batch), np.int64)
+            has_stamp = np.zeros(len(batch), np.bool_)
             for index in distinct(channel[mask]).tolist():
                 rows = np.flatnonzero(mask & (channel == index))
                 stamped, stamps = stamps_of(self._plan.channels[index].codec, batch.take(rows))
-                times[rows[stamped]] = stamps
-        return (times >= begin) & (times < end)
+                times[rows[stamped]], has_stamp[rows[stamped]] = stamps, True
+            mask = mask & has_stamp
+        times = placed(times)
+        return mask & (times >= begin) & (times < end)
 
     def _split(
         self, waiting: list[MessageRun], following: ChunkTask | None

@@ -22,6 +22,7 @@ from hybridlog.query.times import (
 from hybridlog.schema.column import ranges
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +35,6 @@ Span = tuple[int, int]
 MOST_PIECES = 10_000_000
 """Maximum number of intervals that `Intervals.cut` makes."""
 _AT_ONCE = 10_000  # intervals whose columns become Python numbers together
-_LAST = np.iinfo(np.int64).max
 
 
 class Events(Protocol):
@@ -206,7 +206,7 @@ class Intervals:
         """
         begin = np.maximum(self._begin, parse_duration(before)) - parse_duration(before)
         later = parse_duration(after)
-        end = np.minimum(self._end, _LAST - later) + later
+        end = np.minimum(self._end, END - later) + later
         return Intervals(self._recordings, self._recording, begin, end, self._messages)
 
     def merged(self) -> Intervals:
@@ -255,7 +255,7 @@ class Intervals:
             taken = other.of_recording(name)
             # What is between the others, from the first time to the last.
             begin = np.concatenate([[0], taken[:, 1]])
-            end = np.concatenate([taken[:, 0], [_LAST]])
+            end = np.concatenate([taken[:, 0], [END]])
             rows = np.stack([begin, end, np.zeros_like(begin)], axis=1)
             parts.append((name, rows[end > begin]))
         return self.common(Intervals.of(parts))
@@ -269,7 +269,7 @@ class Intervals:
         parts = []
         for name in self._recordings:
             rows = self._rows_of(name)
-            known = np.append(times.get(name, np.empty(0, np.int64)), _LAST)
+            known = np.append(times.get(name, np.empty(0, np.int64)), END)
             rows[:, 1] = known[np.searchsorted(known[:-1], rows[:, 1])]
             parts.append((name, rows))
         return Intervals.of(parts).merged()
@@ -464,7 +464,7 @@ class Holding:
         begin = time[first]
         end = np.append(begin[1:], following)
         if self._max_gap is not None:
-            end = np.minimum(end, np.minimum(begin, _LAST - self._max_gap) + self._max_gap)
+            end = np.minimum(end, np.minimum(begin, END - self._max_gap) + self._max_gap)
         rows = np.stack([begin, end, np.add.reduceat(count, first)], axis=1)[holds[last]]
         rows = joined(np.concatenate([self._open, rows]))
         self._open = rows[-1:]
@@ -490,6 +490,7 @@ class Changing:
         """
         if not len(time):
             return np.empty((0, 3), np.int64)
+        time = placed(time)
         times = np.stack([time, time + 1, np.ones_like(time)], axis=1)
         rows = np.concatenate([self._open, times])
         # An open change ends one nanosecond after its last step.

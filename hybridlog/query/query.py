@@ -983,7 +983,10 @@ class Query:
 
     def size_hint(self) -> int:
         """Approximate bytes of payload, for a progress bar."""
-        parts = Planner(self._session, replace(self.question, clock="log"), Counters()).parts()
+        question = self.question
+        if not question.is_by_log_time:
+            question = replace(question, bounds=None)
+        parts = Planner(self._session, question, Counters()).parts()
         return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
     # Helpers.

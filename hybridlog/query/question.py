@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hybridlog.losses import extent_of
-from hybridlog.query.times import TIME_LIMIT, TimeLike
+from hybridlog.query.times import TimeLike
 from hybridlog_storage.messages import REDUCED
+from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -173,7 +174,7 @@ class Part:
     @cached_property
     def log_windows(self) -> NDArray[np.int64]:
         """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
-        low, high = self.bounds if self.bounds and self.clock == "log" else (0, TIME_LIMIT - 1)
+        low, high = self.bounds if self.bounds and self.clock == "log" else (0, END)
         if self.windows is None:
             return np.array([[low, high]] if low < high else [], np.int64).reshape(-1, 2)
         cut = np.clip(self.windows, low, high)
@@ -182,7 +183,7 @@ class Part:
     @property
     def share(self) -> float:
         """Fraction of the topic's time in the part, 0 to 1."""
-        whole = self._messages_span
+        whole = self.span
         if whole is None:
             return 0.0
         cut = np.clip(self.log_windows, *whole)
@@ -191,7 +192,7 @@ class Part:
     @property
     def chunks(self) -> float:
         """Estimated number of chunks with its messages; other topics may share them."""
-        whole = self._messages_span
+        whole = self.span
         if whole is None:
             return 0.0
         longest = max(stats.longest for stats in self.stats)
@@ -204,7 +205,7 @@ class Part:
 
         Bounds of another clock do not restrict it.
         """
-        whole = self._messages_span
+        whole = self.span
         if self.recording.status == "open" and self.recording.span is not None:
             whole = extent_of(self.recording)
         if whole is None:
@@ -214,11 +215,11 @@ class Part:
         return (int(cut[0, 0]), int(cut[-1, 1])) if len(cut) else None
 
     @property
-    def _messages_span(self) -> Span | None:
+    def span(self) -> Span | None:
         """Log time of the topic's messages in the recording, ns; None without any."""
         firsts = [s.first for s in self.stats if s.first is not None]
         lasts = [s.last for s in self.stats if s.last is not None]
-        return (min(firsts), max(lasts) + 1) if firsts else None
+        return span_of(min(firsts), max(lasts)) if firsts else None
 
 
 def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:

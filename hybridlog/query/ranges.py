@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog.query.times import (
-    TIME_LIMIT,
     format_time,
     is_relative,
     parse_range,
@@ -16,6 +15,7 @@ from hybridlog.query.times import (
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,9 +72,7 @@ class Ranges(Sequence[Resolved]):
         self._each = each
         self._during = during
         self.first: NDArray[np.int64] = snapshot.begin[places]
-        self.last: NDArray[np.int64] = np.where(
-            snapshot.is_open[places], TIME_LIMIT - 1, snapshot.end[places]
-        )
+        self.last: NDArray[np.int64] = np.where(snapshot.is_open[places], END, snapshot.end[places])
 
     def __len__(self) -> int:
         return len(self._places)
@@ -141,8 +139,8 @@ class RangeResolver:
         if self._question.clock != "log" or is_relative(begin) or is_relative(stop):
             return None
         return (
-            0 if begin is None else parse_time(begin, start=None, end=None),
-            TIME_LIMIT - 1 if stop is None else parse_time(stop, start=None, end=None),
+            BEGIN if begin is None else parse_time(begin, start=None, end=None),
+            END if stop is None else parse_time(stop, start=None, end=None),
         )
 
     def spans(self) -> list[tuple[RecordingSummary, Span]]:
@@ -192,8 +190,8 @@ class RangeResolver:
         start, end = self._clock_span(recording)
         begin, stop = self._question.bounds
         return (
-            0 if begin is None else parse_time(begin, start=start, end=end),
-            TIME_LIMIT - 1 if stop is None else parse_time(stop, start=start, end=end),
+            BEGIN if begin is None else parse_time(begin, start=start, end=end),
+            END if stop is None else parse_time(stop, start=start, end=end),
         )
 
     def _clock_span(self, summary: RecordingSummary) -> Span:
@@ -213,7 +211,7 @@ class RangeResolver:
         if not known:
             return summary.extent
         first, last = min(low for low, _ in known), max(high for _, high in known)
-        return max(first, 0), min(last + 1, TIME_LIMIT - 1)
+        return span_of(first, last)
 
     def _is_outside(self, bounds: Span, recording: RecordingSummary) -> bool:
         """True if a range is empty, or does not overlap the recording on the log clock."""

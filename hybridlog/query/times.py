@@ -1,7 +1,7 @@
 """Times in the forms that people write, converted exactly to integer nanoseconds.
 
-A time is nanoseconds since the Unix epoch, `0 <= t < 2**63`. No text is converted through
-a float: `1425407313.123456789` retains its last digit.
+A time is nanoseconds since the Unix epoch in 64 bits, `-2**63 <= t < 2**63`. No text is
+converted through a float: `1425407313.123456789` retains its last digit.
 
 Forms that `parse_time` accepts:
 
@@ -38,6 +38,7 @@ from numbers import Integral, Real
 from typing import TYPE_CHECKING, TypeAlias
 
 from hybridlog_storage.errors import TimeError
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from typing import Any
@@ -110,10 +111,10 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
             `datetime` or `pandas.Timestamp` (naive: UTC), a `date`, or a `numpy.datetime64`.
         start: Origin of `+5s`, nanoseconds; None without a recording.
         end: Origin of `-10s`, nanoseconds: one past the last message, which makes
-            `[start, end)` the whole recording. A time before the epoch becomes 0.
+            `[start, end)` the whole recording.
 
     Raises:
-        TimeError: not a time, outside `[0, 2**63)`, or relative without a recording.
+        TimeError: not a time, outside of 64 bits, or relative without a recording.
     """
     if isinstance(text, str):
         return _checked(_parse_text(text, start, end), text)
@@ -142,7 +143,7 @@ def parse_range(
     """A half-open range `[begin, stop)` in nanoseconds.
 
     Args:
-        begin: First time of the range; None for `start`, or 0 if that is unknown.
+        begin: First time of the range; None for `start`, or -2**63 if that is unknown.
         stop: First time after the range; None for `end`, or 2**63 - 1.
         start: First log time, for relative times.
         end: One past the last log time, for relative times.
@@ -150,11 +151,11 @@ def parse_range(
     Raises:
         TimeError: `begin` or `stop` is no time, or the range is empty.
     """
-    low = (start or 0) if begin is None else parse_time(begin, start=start, end=end)
+    low, high = BEGIN if start is None else start, END if end is None else end
+    if begin is not None:
+        low = parse_time(begin, start=start, end=end)
     if stop is not None:
         high = parse_time(stop, start=start, end=end)
-    else:
-        high = TIME_LIMIT - 1 if end is None else end
     if high <= low:
         raise TimeError(
             f"the range is empty: it begins at {_spelled(begin, 'the start', low)} and ends "
@@ -294,8 +295,7 @@ def _relative(word: str, start: int | None, end: int | None) -> int:
         raise TimeError(f"{_shown(word)} is not a time: {ACCEPTED}")
     if word[0] == "+":
         return _base(start, word) + offset
-    # The last ten seconds of a log of five that starts at 0 are the whole log.
-    return max(0, _base(end, word) - offset)
+    return _base(end, word) - offset
 
 
 def _base(base: int | None, word: str) -> int:
@@ -375,11 +375,11 @@ def _duration(word: str) -> int | None:
 
 
 def _from_float(number: float) -> int:
-    if not math.isfinite(number) or not 0 <= number < TIME_LIMIT:
+    if not math.isfinite(number) or not -TIME_LIMIT <= number < TIME_LIMIT:
         raise TimeError(f"{number!r} is not a time: {ACCEPTED}")
     # The shortest decimal of this float is the text that the user typed.
     exact = Decimal(repr(number))
-    return _rounded(exact if exact >= _NANOSECONDS_FROM else exact * _SECOND)
+    return _rounded(exact if abs(exact) >= _NANOSECONDS_FROM else exact * _SECOND)
 
 
 def _rounded(number: Decimal) -> int:
@@ -419,10 +419,10 @@ def _from_datetime64(moment: object) -> int:
 
 
 def _checked(ns: int, source: object) -> int:
-    if not 0 <= ns < TIME_LIMIT:
+    if not -TIME_LIMIT <= ns < TIME_LIMIT:
         raise TimeError(
-            f"{_shown(source)} is out of range: times lie from 1970-01-01 to 2262-04-11 "
-            "(0 to 2**63 nanoseconds)"
+            f"{_shown(source)} is out of range: times lie from 1677-09-21 to 2262-04-11 "
+            "(-2**63 to 2**63 nanoseconds since 1970)"
         )
     return ns
 

@@ -16,6 +16,7 @@ from hybridlog.sources.rosbag2 import locate, plain, read_metadata
 from hybridlog.sources.rosbag2_metadata import NAME, BagMetadata
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
+from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,7 +83,7 @@ def read_time_range(path: Path) -> tuple[int, int] | None:
                 first = min(first, int(batch.log_time.min()))
                 last = max(last, int(batch.log_time.max()))
             source.extras.clear()
-    return (first, last + 1) if first <= last else None
+    return span_of(first, last) if first <= last else None
 
 
 def open_parts(paths: Sequence[Path]) -> Source:

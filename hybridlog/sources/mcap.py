@@ -35,6 +35,7 @@ from hybridlog_storage.mcap_scan import (
     scan,
 )
 from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
+from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -348,7 +349,7 @@ def _time_range(summary: Summary) -> tuple[int, int] | None:
         )
         if by_chunks != (start, last):
             return None
-    return (start, last + 1) if start <= last < (1 << 63) - 1 else None
+    return span_of(start, last) if start <= last <= END else None
 
 
 def _parts(length: NDArray[np.int64]) -> Iterator[slice]:

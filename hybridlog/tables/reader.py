@@ -39,6 +39,7 @@ from hybridlog.tables.layout import (
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import files
 from hybridlog_storage.errors import StoreError, exhausted
+from hybridlog_storage.times import placed, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -234,12 +235,12 @@ class TopicTable:
             if spans is None:
                 yield self._read(part, paths, own, kind)
                 continue
-            low, high = part.first[0], part.last[0]
-            near = [span for span in spans if span[0] <= high and span[1] > low]
+            low, high = span_of(part.first[0], part.last[0])
+            near = [span for span in spans if span[0] < high and span[1] > low]
             if not near:
                 continue
             rows = self._read(part, paths, own, kind)
-            bounds = np.searchsorted(rows.t, np.array(near, np.int64).reshape(-1, 2))
+            bounds = np.searchsorted(placed(rows.t), np.array(near, np.int64).reshape(-1, 2))
             begins, counts = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
             if len(near) == 1:
                 rows = rows.slice(int(bounds[0, 0]), int(bounds[0, 1]))

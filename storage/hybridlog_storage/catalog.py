@@ -47,6 +47,7 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
+from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -1052,7 +1053,7 @@ class Catalog:
             if (
                 bounds is not None
                 and clock == "log"
-                and not (first < bounds[1] and last >= bounds[0])
+                and not (min(first, END - 1) < bounds[1] and last >= bounds[0])
             ):
                 continue
             table, stamps = self._table(entry, number)
@@ -1114,14 +1115,14 @@ def _in_bounds(
     bounds: tuple[int, int],
     clock: str,
 ) -> NDArray[np.bool_]:
-    begin, end = (max(min(bound, (1 << 63) - 1), -(1 << 63)) for bound in bounds)
+    begin, end = (max(min(bound, END), BEGIN) for bound in bounds)
     if clock == "header":
         if stamps is None:
             return np.ones(len(parts), np.bool_)
-        inside = (stamps["first_stamp"] < end) & (stamps["last_stamp"] >= begin)
+        inside = (placed(stamps["first_stamp"]) < end) & (stamps["last_stamp"] >= begin)
         return np.asarray(inside & (stamps["stamped"] > 0))
     suffix = "_publish" if clock == "publish" else ""
-    inside = (parts[f"first{suffix}"] < end) & (parts[f"last{suffix}"] >= begin)
+    inside = (placed(parts[f"first{suffix}"]) < end) & (parts[f"last{suffix}"] >= begin)
     if clock == "publish":
         timed = [c.id for c in entry.channels if c.has_publish_time]
         inside &= np.isin(parts["channel"], np.array(timed, np.int64))

@@ -18,9 +18,10 @@ from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
+from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -162,7 +163,7 @@ class IntervalQueries:
         part = replace(question, recordings=(recording,), during=near)
         inner = IntervalQueries(self._session, part, self._planner.counters)
         found = [np.empty(0, np.int64), *(times for _, times in inner._times())]
-        times = np.sort(np.concatenate(found))
+        times = np.sort(placed(np.concatenate(found)))
         first, end = np.searchsorted(times, spans[:, 0]), np.searchsorted(times, spans[:, 1])
         inside: NDArray[np.bool_] = first < end
         return inside
@@ -338,6 +339,6 @@ def _steps(
 def _extent(recording: RecordingSummary) -> Span:
     """Span of log time in which a recording has messages, or may have some by now."""
     if recording.span is None:
-        return 0, TIME_LIMIT - 1
+        return 0, END
     begin, end = recording.extent
-    return begin, TIME_LIMIT - 1 if recording.status == "open" else end
+    return begin, END if recording.status == "open" else end

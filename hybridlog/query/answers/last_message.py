@@ -13,6 +13,7 @@ from hybridlog.message import Documents, Message, messages_in
 from hybridlog.query.chunk_lists import earlier_and_earlier
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import TimeLike, is_relative, parse_time
+from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,7 +33,7 @@ def message_at(
     snapshot = session.snapshot()
     places = session.chosen(question)
     start, end = snapshot.begin[places], snapshot.end[places]
-    latest = np.minimum(_moments(moment, start, end), end - 1)
+    latest = np.minimum(_moments(moment, start, end), np.where(end == END, END, end - 1))
     latest[(start >= end) | (start > latest)] = -1
     best: tuple[tuple[int, str, int], Message] | None = None
     # Ask the recording that could hold the latest message first: it usually does.
@@ -66,7 +67,7 @@ def just_before(question: Question, recording: str, begin: int, latest: int) -> 
     return replace(
         question,
         recordings=(recording,),
-        bounds=(begin, latest + 1),
+        bounds=span_of(begin, latest),
         clock="log",
         reverse=True,
         limit=1,

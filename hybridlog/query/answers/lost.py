@@ -11,7 +11,7 @@ import numpy as np
 from hybridlog.losses import CRASH, Cause, losses_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import TIME_LIMIT
+from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
-_EVERYTHING = np.array([[0, TIME_LIMIT - 1]], np.int64)
+_EVERYTHING = np.array([[0, END]], np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +99,8 @@ def lost_times(session: Session, question: Question) -> Intervals:
     for entry, row in _rows(session, question):
         if row["cause"] == Cause.DEGRADE:
             continue
-        low, high = _span_of(entry, row) or (0, TIME_LIMIT - 2)
-        parts.append((entry.id, np.array([[low, high + 1, 0]], np.int64)))
+        low, end = span_of(*(_span_of(entry, row) or (0, END)))
+        parts.append((entry.id, np.array([[low, end, 0]], np.int64)))
     return Intervals.of(parts)
 
 
@@ -142,7 +142,7 @@ def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
 def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
     """First and last log time of a loss, ns; None if it may be anywhere."""
     if row["cause"] == CRASH and entry.span is not None:
-        return entry.span[1] + 1, TIME_LIMIT - 2
+        return min(entry.span[1] + 1, END), END
     if row.get("from") is None or row.get("to") is None:
         return None
     return int(row["from"]), int(row["to"])

@@ -17,6 +17,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -146,7 +147,7 @@ class Rates:
         rate = (count - 1) * 1e9 / (last - first) if count > 1 and last > first else np.nan
         return (
             np.array([first], np.int64),
-            np.array([last + 1], np.int64),
+            np.array([min(last + 1, END)], np.int64),
             np.array([count], np.int64),
             np.array([rate if count else 0.0]),
         )
@@ -161,6 +162,7 @@ class Rates:
         end = np.append(begin[1:], high)
         messages = np.zeros(len(begin), np.int64)
         for times in self._times(stretch):
+            times = placed(times)  # noqa: PLW2901
             inside = times[(times >= low) & (times < high)]
             if len(inside):
                 windows = (inside - low) // size

@@ -16,6 +16,7 @@ import numpy as np
 
 from hybridlog.query.engines.base import Need, Outcomes, Values
 from hybridlog_storage.distinct import distinct
+from hybridlog_storage.times import END, inside, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,9 +85,7 @@ class ChunkIndex:
                 self._counters.bytes_read += reader.bytes_read - read_before
                 found.extend(times[channel] for channel in channels if channel in times)
         time = np.sort(np.concatenate(found))
-        place = np.searchsorted(windows[:, 1], time, "right")
-        inside = np.append(windows[:, 0], np.iinfo(np.int64).max)[place] <= time
-        time = time[inside]
+        time = time[inside(time, windows)]
         yield Outcomes(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
@@ -140,9 +139,10 @@ def count_in_chunks(
     if not held or not len(windows):
         return 0
     number, channel, first, last, messages = np.array(held, np.int64).T
+    first, last = placed(first), placed(last)
     # Only the first window that ends after the start of a chunk can contain the whole chunk.
     window = np.searchsorted(windows[:, 1], first, "right")
-    begin, end = np.append(windows, [[np.iinfo(np.int64).max] * 2], axis=0)[window].T
+    begin, end = np.append(windows, [[END, END]], axis=0)[window].T
     touched = begin <= last
     whole = touched & (begin <= first) & (last < end)
     total = int(messages[whole].sum())
@@ -154,6 +154,6 @@ def count_in_chunks(
         times = reader.read_times(chunk.place)
         counters.bytes_read += reader.bytes_read - read_before
         for of in channel[cut[number[cut] == row]].tolist():
-            before = np.searchsorted(times[of], windows)
+            before = np.searchsorted(placed(times[of]), windows)
             total += int((before[:, 1] - before[:, 0]).sum())
     return total

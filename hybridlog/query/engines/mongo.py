@@ -13,10 +13,10 @@ from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import Need, Outcomes, Values
 from hybridlog.query.predicate.to_mongo import MongoFilter, to_mongo
 from hybridlog.query.predicate.tree import And
-from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import DatabaseError, IndexChangedError
 from hybridlog_storage.index_columns import KEY, REFERENCE, key_columns, reference_columns
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -338,8 +338,7 @@ class Mongo:
         if not parts:
             return []
         order = sorted(range(len(parts)), key=spans.__getitem__)
-        # The end of the last nanosecond is no int64; nothing begins there.
-        ends = np.array([min(spans[i][1], TIME_LIMIT - 1) for i in order[:-1]], np.int64)
+        ends = np.array([min(spans[i][1], END) for i in order[:-1]], np.int64)
         low = np.maximum.accumulate(ends)
         high = np.array([spans[i][0] for i in order[1:]], np.int64)
         is_apart = low < high
@@ -420,7 +419,8 @@ def conditions(part: Part, place: TopicPlace) -> Iterator[tuple[_Filter, Span]]:
 
 def _on_clock(clock: str, bounds: Span) -> _Filter:
     name = STAMP if clock == "header" else "_meta.pub"
-    return {name: {"$gte": bounds[0], "$lt": bounds[1]}}
+    begin, end = bounds
+    return {name: {"$gte": begin, "$lte" if end == END else "$lt": end}}
 
 
 def _chosen(place: TopicPlace, span: Span, parts: Sequence[Part]) -> _Filter:
@@ -434,11 +434,10 @@ def _time_of(part: Part) -> tuple[Span, Span | None]:
 
     The log time is cut to that of its messages, where it is known.
     """
-    low, high = (0, TIME_LIMIT - 1) if part.bounds is None else part.bounds
-    first, end = 0, TIME_LIMIT - 1
+    low, high = (0, END) if part.bounds is None else part.bounds
+    first, end = 0, END
     if part.recording.status != "open":
-        first = min((s.first for s in part.stats if s.first is not None), default=0)
-        end = max((s.last + 1 for s in part.stats if s.last is not None), default=0)
+        first, end = part.span or (0, 0)
     if part.bounds is None:
         return (first, end), None
     if part.clock != "log":
@@ -449,9 +448,9 @@ def _time_of(part: Part) -> tuple[Span, Span | None]:
 
 def _between(place: TopicPlace, span: Span) -> _Filter:
     begin, end = span
-    if begin <= 0 and end >= TIME_LIMIT - 1:
+    if begin <= 0 and end >= END:
         return place.documents()
-    return place.documents(begin, end)
+    return place.documents(begin, end if end < END else None)
 
 
 def _keys_in(keys: KeyColumns, part: Part) -> KeyColumns:
@@ -463,7 +462,7 @@ def _keys_in(keys: KeyColumns, part: Part) -> KeyColumns:
     low, high = (
         int(np.searchsorted(keys.recording, recording, side)) for side in ("left", "right")
     )
-    own = keys.time[low:high]
+    own = placed(keys.time[low:high])
     begin, end = np.searchsorted(own, [windows[0, 0], windows[-1, 1]])
     return keys.take(slice(low + int(begin), low + int(end)))
 

@@ -23,6 +23,7 @@ from hybridlog.query.engines.base import (
 )
 from hybridlog.query.message_filter import can_decide
 from hybridlog.query.predicate.tree import is_meta
+from hybridlog_storage.times import inside, touches
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -101,18 +102,18 @@ class PayloadColumns:
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Columns of the rows for which the predicate holds, in order."""
         kind = part.channels[0].arrow_type(fields)
-        for (time, seq), holds, table, inside in self._rows(part, fields):
+        for (time, seq), holds, table, rows in self._rows(part, fields):
             if not holds.any():
                 continue
-            yield Values(time[holds], seq[holds], _taken(records_of(table, kind), inside[holds]))
+            yield Values(time[holds], seq[holds], _taken(records_of(table, kind), rows[holds]))
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """References of the rows for which the predicate holds."""
         wanted = {task.key for task in tasks}
         found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         for part in parts:
-            for _, holds, table, inside in self._rows(part, own=("ref",)):
-                places = places_of(table.column("ref").combine_chunks())[inside[holds]]
+            for _, holds, table, rows in self._rows(part, own=("ref",)):
+                places = places_of(table.column("ref").combine_chunks())[rows[holds]]
                 for key, offsets in offsets_by_chunk(part.recording.id, places).items():
                     if key in wanted:
                         found[key].append(offsets)
@@ -156,7 +157,7 @@ class PayloadColumns:
             names = ["t", "seq", *own, *columns]
             for group in range(reader.file.groups):
                 _, first, _, last, _ = reader.file.about.bounds[group]
-                if not _touches(part, first, last):
+                if not touches(part.log_windows, first, last):
                     continue
                 is_excluded = _is_excluded(part, reader, group)
                 if is_excluded and not every:
@@ -165,11 +166,11 @@ class PayloadColumns:
                 self._counters.bytes_read += reader.size([group], read)
                 table = reader.table(group, read)
                 time, seq = (table.column(n).to_numpy() for n in ("t", "seq"))
-                inside = np.flatnonzero(_inside(part, time))
-                holds = np.full(len(inside), not is_excluded)
+                rows = np.flatnonzero(inside(time, part.log_windows))
+                holds = np.full(len(rows), not is_excluded)
                 if part.predicate is not None and not is_excluded:
-                    holds = self._holds(part, records_of(table, asked))[inside]
-                yield (time[inside], seq[inside]), holds, table, inside
+                    holds = self._holds(part, records_of(table, asked))[rows]
+                yield (time[rows], seq[rows]), holds, table, rows
 
     def _holds(self, part: Part, records: pa.StructArray) -> NDArray[np.bool_]:
         from hybridlog.query.predicate.to_mask import to_mask
@@ -194,21 +195,6 @@ def _is_excluded(part: Part, reader: PayloadReader, group: int) -> bool:
     from hybridlog.payloads.zones import may_hold
 
     return part.predicate is not None and not may_hold(part.predicate.root, reader.zones[group])
-
-
-def _touches(part: Part, first: int, last: int) -> bool:
-    windows = part.log_windows
-    place = int(np.searchsorted(windows[:, 1], first, "right"))
-    return place < len(windows) and bool(windows[place, 0] <= last)
-
-
-def _inside(part: Part, time: NDArray[np.int64]) -> NDArray[np.bool_]:
-    windows = part.log_windows
-    if not len(windows):
-        return np.zeros(len(time), np.bool_)
-    place = np.searchsorted(windows[:, 1], time, "right")
-    begins = np.append(windows[:, 0], np.iinfo(np.int64).max)
-    return begins[place] <= time
 
 
 def _paths(part: Part, fields: Collection[str] | None) -> set[str] | None:

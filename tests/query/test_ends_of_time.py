@@ -1,0 +1,174 @@
+"""Times below 1970, and those up to the last nanosecond of 64 bits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
+import hybridlog as hl
+from hybridlog.cli.app import app
+from hybridlog.query.query import Query
+from hybridlog_storage.times import END, span_of
+from tests.query.test_engines import WAYS, only
+
+SECOND = 10**9
+STAMPS = [-2_145_916_800 * SECOND, -SECOND - 1, -1, 0, SECOND, None]  # from 1902 on
+LATE = [END - 1000, END - 1000, END - 1, END, END]
+
+
+def _write(path: Path, times: list[int]) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("State", "jsonschema", b"{}")
+        channel = writer.register_channel("/state", "json", schema)
+        for number, time in enumerate(times):
+            writer.add_message(channel, time, json.dumps({"v": number}).encode(), time)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _write_stamps(path: Path) -> None:
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    header, time = types.types["std_msgs/msg/Header"], types.types["builtin_interfaces/msg/Time"]
+    kind = types.types["geometry_msgs/msg/PointStamped"]
+    point = types.types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        definition, _ = types.generate_msgdef("geometry_msgs/msg/PointStamped", ros_version=2)
+        schema = writer.register_schema(
+            "geometry_msgs/msg/PointStamped", "ros2msg", definition.encode()
+        )
+        channel = writer.register_channel("/point", "cdr", schema)
+        for number, stamp in enumerate(STAMPS):
+            raw = b"\x00\x01\x00\x00"  # a message that is cut off has no stamp
+            if stamp is not None:
+                sec, nanosec = divmod(stamp, SECOND)
+                stamped = header(stamp=time(sec=sec, nanosec=nanosec), frame_id="")
+                message = kind(header=stamped, point=point)
+                raw = bytes(types.serialize_cdr(message, "geometry_msgs/msg/PointStamped"))
+            writer.add_message(channel, 1_700_000_000 * SECOND + number, raw, 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    place = tmp_path_factory.mktemp("ends")
+    with hl.open(place / "store", create=True, require_database=True) as opened:
+        for name, times in (("late", LATE), ("last", [END])):
+            _write(place / f"{name}.mcap", times)
+            opened.record(place / f"{name}.mcap", name=name)
+        _write_stamps(place / "stamps.mcap")
+        opened.record(place / "stamps.mcap", name="stamps")
+        yield opened
+
+
+def _late(store: hl.Store, name: str = "late") -> Query:
+    return store.topic("/state").in_recording(name)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("clock", ["log", "publish"])
+@pytest.mark.parametrize("condition", [None, "v >= 0"])
+def test_the_last_time_is_in_ranges_without_an_end(
+    store: hl.Store, way: str, clock: str, condition: str | None
+) -> None:
+    with only(way):
+        for name, begin, end, wanted in (
+            ("late", "start", "end", 5),
+            ("late", END - 1000, None, 5),
+            ("late", END - 999, None, 3),
+            ("late", END - 1000, END - 1, 2),
+            ("late", END - 1, None, 3),
+            ("late", 0, END, 5),
+            ("last", "start", "end", 1),
+            ("last", END - 5, None, 1),
+        ):
+            query = _late(store, name).between(begin, end).clock(clock)
+            if condition is not None:
+                query = query.where(condition)
+            assert query.count() == len(list(query)) == wanted, (name, begin, end)
+            assert query.to_arrow().num_rows == wanted
+            assert next(m.log_time_ns for m in query.reverse()) >= END - 1000
+
+
+def test_answers_about_the_last_time(store: hl.Store) -> None:
+    query = _late(store)
+    table = query.rate()
+    assert table.column("messages").to_pylist() == [5]
+    assert table.column("end").cast("int64").to_pylist() == [END]
+    windows = query.rate("500ns").column("messages").to_pylist()
+    assert windows == [2, 3]
+    assert _late(store, "last").rate().column("messages").to_pylist() == [1]
+    gaps = query.gaps(longer_than="10ns")
+    assert [(gap.begin_ns, gap.end_ns) for gap in gaps] == [(END - 1000, END - 1)]
+    changes = query.changes("v", pause="1ns")
+    assert [(c.begin_ns, c.end_ns, c.messages) for c in changes] == [
+        (END - 1000, END - 999, 1),
+        (END - 1, END, 3),
+    ]
+    assert query.at(END).fields == {"v": 4}
+    assert query.at(END - 2).fields == {"v": 1}
+    assert query.where("v == 4").at(END).fields == {"v": 4}
+    assert query.stats("v")[0].count == 5
+    assert [*query["v"].resample("500ns", "count").to_arrow().column("count").to_pylist()] == [2, 3]
+    windows_around = query.windows("2ns", "2ns")
+    assert len(windows_around) == 5
+    assert query.during(windows_around).count() == 5
+    assert store.align(query, query).to_arrow().num_rows == 5
+    assert span_of(END, END) == (END - 1, END)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_header_stamps_before_1970(store: hl.Store, way: str) -> None:
+    with only(way):
+        query = store.topic("/point").in_recording("stamps")
+        for begin, end, wanted in (
+            ("start", "end", 5),
+            (-SECOND - 1, 1, 3),
+            (-(10**19) // 2, 0, 3),
+            ("1969-12-31T23:59:58Z", "1970-01-01", 2),
+            ("1902-01-01", "1902-01-02", 1),
+            ("1969-12-31T23:59:58.999999999Z", None, 4),
+            (-1.5, 0.5, 3),
+            (None, -1, 2),
+            (0, None, 2),
+            ("start", "+1ns", 1),
+            ("-1s", "end", 1),
+            ("-1000000001ns", "end", 2),
+        ):
+            found = query.between(begin, end).clock("header")
+            assert found.count() == len(list(found)) == wanted, (begin, end)
+        assert query.where('header.stamp < t"1970-01-01"').count() == 3
+        assert query.where('header.stamp >= t"1969-12-31T23:59:58Z"').count() == 4
+        assert query.where("header.stamp < -1").count() == 2
+
+
+def test_exports_by_stamps_before_1970(store: hl.Store, tmp_path: Path) -> None:
+    place = store.topic("/point").directory
+    query = store.topic("/point").in_recording("stamps").clock("header")
+    query = query.between("1969-12-31", "1970-01-02")
+    assert query.size_hint() > 0
+    assert query.to_arrow().column("header.stamp").cast("int64").to_pylist() == STAMPS[1:5]
+    words = [
+        "fetch",
+        "--store",
+        str(place),
+        "-t",
+        "/point",
+        "-r",
+        "stamps",
+        "--clock",
+        "header",
+    ]
+    words += ["--between", "1969-12-31", "1970-01-02", "-o", str(tmp_path / "some.mcap")]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    with (tmp_path / "some.mcap").open("rb") as file:
+        assert len(list(make_reader(file).iter_messages())) == 4
