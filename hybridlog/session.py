@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +39,8 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
+from hybridlog_storage.forks import begins_anew
+from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader
 
@@ -53,7 +55,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
-    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
     from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
@@ -81,7 +83,6 @@ class Session:
 
     Attributes:
         directory: The store's directory.
-        catalog: Recordings, channels, chunks and schemas.
         connection: The connection to MongoDB.
         repairs: Repairs made when the store was opened.
         recent_chunks: Chunks that single messages were read from.
@@ -94,13 +95,14 @@ class Session:
         progress: Progress | None,
         cache_mb: int | None = None,
     ) -> None:
+        begins_anew(self, directory, mongo, progress, cache_mb)
         self.directory = directory
+        self._progress = progress
         self.connection = Connection(directory, mongo, cache_mb)
         self.repairs = RepairReport()
         self.recent_chunks = RecentChunks()
         self._unavailable: HybridlogError | None = None
         self._rests_until = 0.0
-        self._progress = progress
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
         self._indexed: set[str] = set()  # ids of those that it has in any case
@@ -116,13 +118,7 @@ class Session:
         self._chunk_lists = ChunkLists()
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and made if missing
         self._lock = threading.Lock()
-        self.catalog = open_catalog(directory)
         self._remember_meanings()
-        try:
-            self.snapshot()
-        except BaseException:
-            self.catalog.close()
-            raise
 
     # The index.
 
@@ -337,6 +333,11 @@ class Session:
         return found
 
     # The catalog.
+
+    @lazy
+    def catalog(self) -> Catalog:
+        """Recordings, channels, chunks and schemas."""
+        return open_catalog(self.directory)
 
     def snapshot(self) -> Snapshot:
         """All recordings in short."""
@@ -719,7 +720,7 @@ class Session:
             found = self._contents[recording] = MovedContents(recording)
         return found
 
-    @cached_property
+    @lazy
     def tables(self) -> Tables:
         """Parquet tables of topics; pyarrow is loaded for them."""
         from hybridlog.tables.reader import Tables

@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,29 +63,29 @@ class Snapshot:
     def __len__(self) -> int:
         return len(self.summaries)
 
-    @cached_property
+    @lazy
     def by_id(self) -> dict[str, int]:
         """The position of each recording in `summaries`, by id."""
         return {summary.id: place for place, summary in enumerate(self.summaries)}
 
-    @cached_property
+    @lazy
     def by_label(self) -> dict[str, int]:
         """The position of each recording, by label."""
         return {summary.label: place for place, summary in enumerate(self.summaries)}
 
-    @cached_property
+    @lazy
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
         return sorted({topic.topic for topics in self._topics.values() for topic in topics})
 
-    @cached_property
+    @lazy
     def schemas(self) -> frozenset[str]:
         """Hashes of all schemas."""
         return frozenset(
             topic.schema for topics in self._topics.values() for topic in topics if topic.schema
         )
 
-    @cached_property
+    @lazy
     def tags(self) -> dict[str, dict[str, list[int]]]:
         """Positions of the recordings with each tag, by key and value."""
         found: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))

@@ -178,6 +178,11 @@ class Store:
         self.directory = directory
         self.session = Session(directory, mongo, progress, cache_mb)
         self._sql: SqlEngine | None = None
+        try:
+            self.session.snapshot()
+        except BaseException:
+            self.session.catalog.close()
+            raise
 
     def __enter__(self) -> Self:
         """Return this store."""

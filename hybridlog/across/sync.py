@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, overload
@@ -84,8 +83,6 @@ class Synced(Sequence[tuple["Message", ...]]):
         self.counters = Counters()
         self._open_again = open_again
         self._session: Session | None = session
-        self._kept: list[Any] = []  # what another process has opened; it must not be closed here
-        self._process = os.getpid()
         limit = None if tolerance is None else parse_duration(tolerance)
         snapshot = session.snapshot()
         shared = [set(session.chosen(question).tolist()) for question in questions]
@@ -141,16 +138,13 @@ class Synced(Sequence[tuple["Message", ...]]):
     def __getstate__(self) -> dict[str, Any]:
         """All but the open store."""
         state = vars(self).copy()
-        state.update(_session=None, _kept=[], counters=Counters())
+        state.update(_session=None, counters=Counters())
         return state
 
     def _opened(self) -> Session:
         """The store, opened by this process."""
-        if self._session is None or self._process != os.getpid():
-            self._kept.append(self._session)
-            store = self._open_again()
-            self._kept.append(store)
-            self._session, self._process = store.session, os.getpid()
+        if self._session is None:
+            self._session = self._open_again().session
         return self._session
 
     def _read(self, session: Session, topic: _Topic, recording: str, row: int) -> Message:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.flushed import END
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
+from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from hybridlog.drawing.flushed import Flushed
@@ -104,7 +104,7 @@ class Log:
     text: str = ""
     flushed: Flushed | None = None
 
-    @cached_property
+    @lazy
     def filtered(self) -> Query | None:
         """The query for these lines."""
         query, kind = self.query, self.kind

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -34,6 +34,7 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
+from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,19 +88,19 @@ class Planner:
         self._scan = PayloadScan(session, counters)
         self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
 
-    @cached_property
+    @lazy
     def _mongo(self) -> Mongo:
         from hybridlog.query.engines.mongo import Mongo
 
         return Mongo(self.session, self.counters, lambda: self._asked)
 
-    @cached_property
+    @lazy
     def _tables(self) -> TablesEngine:
         from hybridlog.query.engines.tables import TablesEngine
 
         return TablesEngine(self.session, self.counters)
 
-    @cached_property
+    @lazy
     def _columns(self) -> PayloadColumns:
         from hybridlog.query.engines.payload_columns import PayloadColumns
 
@@ -167,7 +168,7 @@ class Planner:
         places = self.session.chosen(self.question).tolist()
         return self._channels_of(summaries[place] for place in places)
 
-    @cached_property
+    @lazy
     def examples(self) -> list[RecordedChannel]:
         """Channels of the question, of one recording for each set of topics and types.
 
@@ -185,7 +186,7 @@ class Planner:
             if channel.channel.topic in wanted
         ]
 
-    @cached_property
+    @lazy
     def ranks(self) -> dict[str, int]:
         """The place of each recording among those asked, by its key; ties are in this order."""
         keys = sorted(resolved.summary.key for resolved in self._ranges.resolve())

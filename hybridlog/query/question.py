@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from hybridlog.losses import extent_of
 from hybridlog.query.times import TimeLike
+from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import REDUCED
 from hybridlog_storage.times import END, span_of
 
@@ -94,7 +94,7 @@ class RecordedChannel:
     stats: ChannelStats
     reason: str | None
 
-    @cached_property
+    @lazy
     def codec(self) -> Codec:
         """Decodes its payloads; made when first used."""
         from hybridlog.schema.codecs import codec_for
@@ -166,12 +166,12 @@ class Part:
         """True if all of its messages have documents in MongoDB."""
         return all(c.channel.is_indexed for c in self.channels if c.stats.messages)
 
-    @cached_property
+    @lazy
     def field_types(self) -> Mapping[str, str] | None:
         """Types of the fields by path; None where a definition does not fix them."""
         return field_types(self.channels)
 
-    @cached_property
+    @lazy
     def log_windows(self) -> NDArray[np.int64]:
         """int64[n, 2]: the log time of the part; bounds of another clock do not restrict it."""
         low, high = self.bounds if self.bounds and self.clock == "log" else (0, END)

@@ -29,6 +29,7 @@ from hybridlog.schema.document import TooLarge, bodies, top_level_names
 from hybridlog.schema.wire import Decoded, WireReader
 from hybridlog.schema.wire_scan import MisfitError
 from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.forks import taken_by_forks
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -46,7 +47,7 @@ _MAX_UNROLLED = 10_000
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*\Z")
 
 # rosbags uses one module name for generated classes while it registers them.
-_REGISTERING = threading.Lock()
+_REGISTERING = taken_by_forks(threading.Lock())
 
 
 class RosCodec:

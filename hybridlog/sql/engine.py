@@ -23,6 +23,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
+from hybridlog_storage.forks import begins_anew
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,6 +55,7 @@ class SqlEngine:
     """
 
     def __init__(self, session: Session) -> None:
+        begins_anew(self, session)
         self.session = session
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -23,6 +22,7 @@ from hybridlog.tables.fields import without
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from hybridlog.session import Session
@@ -112,7 +112,7 @@ class TopicOfRecording:
         self._read: dict[tuple[int, int], StoredChunk] = {}
         self._lock = threading.Lock()
 
-    @cached_property
+    @lazy
     def channels(self) -> dict[int, RecordedChannel]:
         """Channels of the topic, by id."""
         found = {
@@ -132,7 +132,7 @@ class TopicOfRecording:
         """Number of its messages in segments that are not sealed."""
         return sum(segment.messages[channel] for segment in self._open for channel in self.channels)
 
-    @cached_property
+    @lazy
     def arrays(self) -> PayloadArrays:
         """The columns of its payloads."""
         from hybridlog.sql.payload_arrays import PayloadArrays
@@ -148,7 +148,7 @@ class TopicOfRecording:
             for channel in self.channels.values()
         )
 
-    @cached_property
+    @lazy
     def kinds(self) -> list[Any]:
         """Types of its messages."""
         if not self.is_fixed:
@@ -163,7 +163,7 @@ class TopicOfRecording:
             if not channel.is_reduced and channel.codec.indexed
         ]
 
-    @cached_property
+    @lazy
     def table(self) -> TopicTable | None:
         """Its table; None if it can have none."""
         if self.entry.status == "open" or any(True for _ in lost_spans(self.entry)):
@@ -173,7 +173,7 @@ class TopicOfRecording:
             return found
         return None  # small topics without a definition share a file, and its types
 
-    @cached_property
+    @lazy
     def sources(self) -> list[RowSource]:
         """Its rows, in parts, by log time."""
         if self.table is not None:
@@ -210,7 +210,7 @@ class TopicOfRecording:
                 return one.reader
         return self.session.segment(self.entry.id, segment)
 
-    @cached_property
+    @lazy
     def places(self) -> dict[tuple[int, int], ChunkPlace]:
         """Positions of its chunks, by segment and number."""
         chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
@@ -297,7 +297,7 @@ class _ChunkRows:
         self._place = place
         self.first, self.last = span or (place.first, place.last)
 
-    @cached_property
+    @lazy
     def kinds(self) -> Sequence[Any]:
         return [rows.records.type for rows in self.read(None, (), ScanCounts())]
 

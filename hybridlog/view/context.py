@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from starlette.responses import Response
@@ -20,6 +19,7 @@ from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.export.slice_cache import SliceCache
 from hybridlog.view.asked import Asked
 from hybridlog_storage.errors import HybridlogError, TopicError
+from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -54,22 +54,22 @@ class Context:
         self._next_look = time.monotonic() + REFRESH_S
         self._working = threading.BoundedSemaphore(MAX_WORKING)
 
-    @cached_property
+    @lazy
     def densities(self) -> DensityCache:
         """Counts of messages by pixel."""
         return DensityCache(self.store.session)
 
-    @cached_property
+    @lazy
     def matches(self) -> MatchCache:
         """Matches of the last questions."""
         return MatchCache()
 
-    @cached_property
+    @lazy
     def slices(self) -> SliceCache:
         """MCAP files of selections."""
         return SliceCache()
 
-    @cached_property
+    @lazy
     def flushed(self) -> FlushedMessages:
         """Flushed messages of running recordings."""
         from hybridlog.drawing.flushed import FlushedMessages

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog_storage.forks import taken_by_forks
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -39,7 +41,7 @@ class Buffers:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = taken_by_forks(threading.Lock())
         # Returned buffers. The garbage collector may return one at any point, on a thread that
         # already holds the lock.
         self._returned: deque[tuple[_Slab, int]] = deque()

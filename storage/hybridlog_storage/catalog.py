@@ -38,6 +38,7 @@ from hybridlog_storage.errors import (
     StoreError,
     exhausted,
 )
+from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import ChunkPlace
 from hybridlog_storage.summary import (
@@ -499,7 +500,7 @@ class Catalog:
         self.was_damaged = False
         self._path = store / CATALOG if store is not None else None
         self._store_id = store_id
-        self._lock = RLock()
+        self._lock = taken_by_forks(RLock())
         self._file: tuple[int, int] | None = None
         self._tables: OrderedDict[tuple[str, int, str], tuple[ChunkTable, NDArray[np.void] | None]]
         self._tables = OrderedDict()

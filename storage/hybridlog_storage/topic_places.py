@@ -14,11 +14,11 @@ import hashlib
 import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
 from hybridlog_storage.index_documents import PREFIX_BYTES, key_bound, last_key
+from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database, ReadConcern
@@ -55,7 +55,7 @@ class TopicPlace:
         """Name of the collection."""
         return SHARED if self.is_shared else collection_of(self.topic)
 
-    @cached_property
+    @lazy
     def prefix(self) -> bytes:
         """First bytes of the keys; empty in a collection of its own."""
         if not self.is_shared:

@@ -227,8 +227,10 @@ def test_a_set_is_read_after_a_fork_without_pickling(logs: Logs) -> None:
     context = multiprocessing.get_context("fork")
     answers = context.SimpleQueue()
 
+    catalog = logs.store.catalog
+
     def work() -> None:
-        answers.put((numbers(synced, 5), synced._session is not logs.store.session))
+        answers.put((numbers(synced, 5), logs.store.catalog is not catalog))
 
     workers = [context.Process(target=work) for _ in range(2)]
     for worker in workers:
@@ -237,7 +239,7 @@ def test_a_set_is_read_after_a_fork_without_pickling(logs: Logs) -> None:
     for worker in workers:
         worker.join()
     assert numbers(synced, 5) == want
-    assert synced._session is logs.store.session
+    assert logs.store.catalog is catalog
 
 
 def collated(sets: list[tuple[hl.Message, ...]]) -> np.ndarray:
