@@ -39,6 +39,7 @@ def unpack(
 def libraries(root: Path) -> str:
     """Where programs of a tree look for libraries: a value for `LD_LIBRARY_PATH`."""
     found = [*root.glob("usr/lib/*-linux-gnu"), *root.glob("lib/*-linux-gnu")]
+    found += root.glob("usr/lib/*-linux-gnu/pulseaudio")  # which libpulse finds by its own path
     return ":".join(map(str, found))
 
 

@@ -53,6 +53,7 @@ def _made(place: Path) -> str:
                 <!DOCTYPE fontconfig SYSTEM "fonts.dtd">
                 <fontconfig>
                   <dir>{place}/tree/usr/share/fonts</dir>
+                  <dir>/usr/share/fonts</dir>
                   <cachedir>{place}/fonts</cachedir>
                 </fontconfig>
                 """
