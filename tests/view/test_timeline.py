@@ -128,6 +128,23 @@ def test_gaps_are_those_of_queries(client: TestClient, demo_store: hl.Store) -> 
     assert end <= drawn[-1] < end + width
 
 
+def test_bins_that_only_just_fit(tmp_path: Path, asking: Asking) -> None:
+    """The greatest counts of one and of two bytes, and the first that need more."""
+    numbers = {255: 1, 256: 2, (1 << 16) - 1: 2, 1 << 16: 4}
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("full") as recording:
+            for number in numbers:
+                channel = Channel(f"/{number}", "raw", None)
+                for _ in range(number):
+                    recording.write(channel, b"", log_time=SECOND)
+        client = asking(store)
+        for number, size in numbers.items():
+            asked = {"recording": "full", "begin": 0, "end": 1, "pixels": 1}
+            found = picture_of(client, {**asked, "topic": f"/{number}"})
+            (lane,) = found.lanes
+            assert (lane.counts.tolist(), lane.counts.itemsize) == ([number], size)
+
+
 GOOD = {"recording": "robot", "begin": "0", "end": "1000", "pixels": "10", "topic": "/odom"}
 
 
@@ -227,7 +244,7 @@ def test_a_recording_that_goes_on_is_followed(
         # The cursor was at the end, and stays there.
         until(page, "document.querySelector('.readout').textContent.length > 0")
         at = json.loads(page.locator(".density").get_attribute("aria-valuenow") or "null")
-        assert at == pytest.approx((live()["end"] - 1) / SECOND)
+        assert at == pytest.approx((int(live()["end"]) - 1) / SECOND)
         recording.close()
         page.wait_for_selector("text=being recorded", state="detached")
         ended = live()
