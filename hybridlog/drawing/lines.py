@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.drawing.asked import Asked
+    from hybridlog.drawing.series import Numbers
 
 MOST: Final = 50
 """Lines that can be told apart, with good will."""
@@ -114,9 +115,9 @@ def _by_topic(query: Asked) -> Iterator[Asked]:
     return (query.with_topic(topic) for topic in query.topics)
 
 
-def drawable(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def drawable(values: Numbers) -> NDArray[np.float64]:
     """Values for an axis: NaN for infinite ones, and none so great that a range overflows."""
-    found: NDArray[np.float64] = np.clip(values, -_GREATEST, _GREATEST)
+    found = np.clip(values.astype(np.float64), -_GREATEST, _GREATEST)
     found[np.isinf(values)] = np.nan
     return found
 

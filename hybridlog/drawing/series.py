@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hybridlog.drawing.flushed import Flushed
     from hybridlog.query.question import Span
 
+Numbers: TypeAlias = "NDArray[np.floating[Any]]"
 GAP_PERIODS: Final = 5
 """A time without messages is a gap if it is longer than so many usual periods."""
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
@@ -45,8 +46,9 @@ class Series:
         field: Path of the field.
         times: int64[n], log time, ns since the epoch: of a message, or of the first one in a
             pixel.
-        least: float64[n], least value; NaN where a field is missing or NaN.
-        greatest: float64[n], greatest value.
+        least: float64[n], least value; NaN where a field is missing or NaN. Of integers of 64
+            bits, longdouble[n], which holds them all.
+        greatest: The same of the greatest value.
         exact: True if there is an entry for each message, and `least` equals `greatest`. Else
             there is one for each pixel with messages, and values that are infinite or NaN are
             left out if a pixel has others.
@@ -54,8 +56,8 @@ class Series:
 
     field: str
     times: NDArray[np.int64]
-    least: NDArray[np.float64]
-    greatest: NDArray[np.float64]
+    least: Numbers
+    greatest: Numbers
     exact: bool
 
     def by_column(self, columns: int) -> NDArray[np.float64]:
@@ -65,7 +67,7 @@ class Series:
             columns: Number of columns; there are no more than entries.
         """
         columns = max(1, min(columns, len(self.times)))
-        middle = self.least / 2 + self.greatest / 2
+        middle = (self.least / 2 + self.greatest / 2).astype(np.float64)
         is_known = np.isfinite(middle)
         if not is_known.any():
             return np.full(columns, np.nan)
@@ -86,7 +88,7 @@ class Series:
         found: NDArray[np.bool_] = is_known & ~edged[:-2] & ~edged[2:]
         return found
 
-    def polyline(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def polyline(self) -> tuple[NDArray[np.int64], Numbers]:
         """Corners of the line: times, ns, and values. A pixel has its least and its greatest."""
         if self.exact:
             return self.times, self.least
@@ -103,7 +105,7 @@ def series(
 ) -> list[Series]:
     """Fields of the messages of a query over log time.
 
-    Numbers become float64, true and false 1 and 0, times and durations nanoseconds. The
+    Numbers become floating, true and false 1 and 0, times and durations nanoseconds. The
     counters of the query are set to the cost.
 
     Args:
@@ -234,9 +236,9 @@ class _Wanted:
             raise UsageError(f"{text!r} names no single number: write position[0] for an element.")
         return cls(text, path, tuple(int(m[1]) if m[1] else m[2] for m in found))
 
-    def columns(self, table: pa.Table) -> dict[str, NDArray[np.float64] | None]:
+    def columns(self, table: pa.Table) -> dict[str, Numbers | None]:
         """Its columns in a table, by path; None for what is no number."""
-        found: dict[str, NDArray[np.float64] | None] = {}
+        found: dict[str, Numbers | None] = {}
         for field, column in zip(table.schema, table.columns, strict=True):
             path = (field.metadata or {}).get(FIELD, field.name.encode()).decode()
             if path != self.path and (self.access or not path.startswith(f"{self.path}.")):
@@ -269,8 +271,8 @@ def _stepped(array: Any, step: int | str) -> Any:
     return array.flatten().take(pa.array(begins + step, mask=counts <= step))
 
 
-def _numbers(array: Any) -> NDArray[np.float64] | None:
-    """Values as float64, NaN for null; None if they are no numbers."""
+def _numbers(array: Any) -> Numbers | None:
+    """Values as in a `Series`, NaN for null; None if they are no numbers."""
     import pyarrow as pa
 
     types, kind = pa.types, array.type
@@ -282,9 +284,12 @@ def _numbers(array: Any) -> NDArray[np.float64] | None:
         array = array.cast(pa.uint8())
     elif not (types.is_integer(kind) or types.is_floating(kind) or types.is_null(kind)):
         return None
-    values: NDArray[np.float64] = array.cast(pa.float64(), safe=False).to_numpy(
-        zero_copy_only=False
-    )
+    values: Numbers
+    if types.is_int64(array.type) or types.is_uint64(array.type):
+        values = array.fill_null(0).to_numpy(zero_copy_only=False).astype(np.longdouble)
+        values[array.is_null().to_numpy(zero_copy_only=False)] = np.nan
+    else:
+        values = array.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     return values
 
 
@@ -306,12 +311,12 @@ def _read(tables: Iterable[pa.Table], wanted: Sequence[_Wanted], grid: _Grid) ->
         TopicError: a field does not exist.
         UsageError: a field is no number.
     """
-    held: list[tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]] = []
+    held: list[tuple[NDArray[np.int64], dict[str, Numbers]]] = []
     names: list[dict[str, bool]] = [{} for _ in wanted]  # of columns, True for numbers
     rows = 0
     for table in tables:
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
-        columns: dict[str, NDArray[np.float64]] = {}
+        columns: dict[str, Numbers] = {}
         for one, known in zip(wanted, names, strict=True):
             for path, values in one.columns(table).items():
                 known[path] = known.get(path, False) or values is not None
@@ -335,7 +340,7 @@ def _read(tables: Iterable[pa.Table], wanted: Sequence[_Wanted], grid: _Grid) ->
 
 
 def _exact(
-    held: Sequence[tuple[NDArray[np.int64], Mapping[str, NDArray[np.float64]]]],
+    held: Sequence[tuple[NDArray[np.int64], Mapping[str, Numbers]]],
     paths: Sequence[str],
 ) -> list[Series]:
     times = np.concatenate([times for times, _ in held])
@@ -369,7 +374,7 @@ class _Grid:
         self._count = np.zeros(pixels, np.int64)
         self._first = np.zeros(pixels, np.int64)
         self._last = np.zeros(pixels, np.int64)
-        self._extremes: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._extremes: dict[str, Numbers] = {}
 
     @classmethod
     def over(cls, span: Span, pixels: int) -> _Grid:
@@ -377,7 +382,7 @@ class _Grid:
         begin, end = max(span[0], 0), min(span[1], TIME_LIMIT)
         return cls(begin, max(1, -(-(end - begin) // pixels)), pixels)
 
-    def add(self, times: NDArray[np.int64], columns: Mapping[str, NDArray[np.float64]]) -> None:
+    def add(self, times: NDArray[np.int64], columns: Mapping[str, Numbers]) -> None:
         """Add messages, which are in order of time and not before earlier ones."""
         if not len(times):
             return
@@ -391,10 +396,9 @@ class _Grid:
         self._last[used] = times[ends - 1]
         self._count[used] += ends - begins
         for path, values in columns.items():
-            if path not in self._extremes:
-                least, greatest = np.full((2, self.pixels), np.nan)
-                self._extremes[path] = least, greatest
-            least, greatest = self._extremes[path]
+            known = self._extremes.get(path, np.full((2, self.pixels), np.nan))
+            kind = np.promote_types(known.dtype, values.dtype)
+            least, greatest = self._extremes[path] = known.astype(kind, copy=False)
             finite = np.where(np.isfinite(values), values, np.nan)
             least[used] = np.fmin(least[used], np.fmin.reduceat(finite, begins))
             greatest[used] = np.fmax(greatest[used], np.fmax.reduceat(finite, begins))

@@ -20,12 +20,13 @@ class Current:
     Attributes:
         message: The last message not after that time; None if there is none.
         time: Its log time, ns since the start of the recording; None without a message.
-        until: Log time of the next message; None if no later one is known.
+        until: Log time of the next message; None if no later one is known. Both are texts, as
+            the page has no integers of 64 bits.
     """
 
     message: Message | None
-    time: int | None
-    until: int | None
+    time: str | None
+    until: str | None
 
     @property
     def tag(self) -> str:
@@ -37,7 +38,7 @@ class Current:
     def headers(self) -> dict[str, str]:
         """Headers of an answer about the message."""
         times = {"Hybridlog-Time": self.time, "Hybridlog-Until": self.until}
-        known = {name: str(time) for name, time in times.items() if time is not None}
+        known = {name: time for name, time in times.items() if time is not None}
         return {"ETag": self.tag, "Cache-Control": "private, no-cache", **known}
 
 
@@ -56,6 +57,6 @@ def current(context: Context, asked: Asked) -> Current:
     until = topic.next_time(later)
     return Current(
         message,
-        None if message is None else message.log_time_ns - topic.start,
-        None if until is None else until - topic.start,
+        None if message is None else str(message.log_time_ns - topic.start),
+        None if until is None else str(until - topic.start),
     )

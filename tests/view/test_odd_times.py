@@ -62,7 +62,7 @@ def test_pictures_at_the_ends_of_time(client: TestClient, label: str) -> None:
 def test_pixels_of_late_years(client: TestClient) -> None:
     asked = {"recording": "far", "topic": "/v", "begin": 0, "end": COUNT * MS, "pixels": 30}
     found = client.get("series", params={**asked, "field": "v"}).json()
-    assert found["times"] == [n * 10 * MS for n in range(30)]
+    assert found["times"] == [str(n * 10 * MS) for n in range(30)]
     (one,) = found["fields"]
     assert one["least"] == [n * 10 for n in range(30)]
     assert one["greatest"] == [n * 10 + 9 for n in range(30)]
@@ -75,6 +75,6 @@ def test_messages_at_the_ends_of_time(client: TestClient, label: str) -> None:
     at = [time - times[0] for time in times]
     for n in (0, 7, COUNT - 2):
         found = client.get("message", params={**asked, "at": at[n]}).json()
-        assert (found["time"], found["until"]) == (at[n], at[n + 1])
+        assert (found["time"], found["until"]) == (str(at[n]), str(at[n + 1]))
     rows = client.get("match-list", params={**asked, "where": "v > 5", "at": at[-2], "count": 9})
     assert rows.status_code == 200

@@ -100,8 +100,9 @@ def test_a_recording_is_first_shown_with_something(page: Page, demo_url: str) ->
     assert page.locator(".timeline .topic").evaluate_all(cut) == []
     first = """async times => {
         const types = ["sensor_msgs/Image", "sensor_msgs/LaserScan"];
-        const of = (first, at) => ({ topic: `/${at}`, type: types[at], messages: 1, first });
-        const info = { begin: 0, end: 100, topics: times.map(of) };
+        const of = (first, at) =>
+            ({ topic: `/${at}`, type: types[at], messages: 1, first: BigInt(first) });
+        const info = { begin: 0n, end: 100n, topics: times.map(of) };
         return (await import("./panels.js")).firstTime({ info });
     }"""
     assert [page.evaluate(first, times) for times in ([3, 8], [3, 60], [70, 60], [])] == [

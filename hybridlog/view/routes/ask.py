@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
 
 from hybridlog.drawing.matches import (
     AskedMatches,
@@ -17,22 +19,26 @@ from hybridlog.drawing.matches import (
     ticks,
 )
 from hybridlog.query.answers.infer_fields import infer_fields
+from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.times import TIME_LIMIT
 from hybridlog.query.topics import resolve
-from hybridlog.view.asked import MAX_OFFSET
 from hybridlog.view.context import Context, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog.view.stopping import stoppable_route
-from hybridlog_storage.errors import ResourceError, TopicError
+from hybridlog_storage.distinct import distinct
+from hybridlog_storage.errors import HybridlogError, ResourceError, TopicError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hybridlog.drawing.matches import Matches
     from hybridlog.sql.engine import SqlAnswer
+    from hybridlog.sql.topic_view import Remarks
     from hybridlog.view.asked import Asked
     from hybridlog.view.question import PageQuestion
+    from hybridlog_storage.catalog import RecordingEntry
 
 MAX_LISTED: Final = 200
 """Greatest number of matches that are listed at once."""
@@ -91,13 +97,13 @@ def match_list(context: Context, asked: Asked) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
     question = question_of(context, asked)
     start = start_of(question.recording)
-    place = Match(asked.moment(start), asked.integer("seq", -1, MAX_OFFSET, -1))
+    place = Match(asked.moment(start), asked.integer("seq", -1, TIME_LIMIT - 1, -1))
     count = asked.integer("count", 1, MAX_LISTED, MAX_LISTED)
     find = {"later": matches_after, "earlier": matches_before}
     asked_for = _matches(context, question)
     found = find[asked.word("direction", find, "later")](asked_for, place, count)
     return {
-        "rows": [[one.time - start, one.seq] for one in found],
+        "rows": [[str(one.time - start), one.seq] for one in found],
         "before": count_before(asked_for, found[0]) if found else None,
     }
 
@@ -154,7 +160,6 @@ def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, A
     """The first rows of a query in SQL."""
     from hybridlog.sql.shown import shown
 
-    recording = context.recording(asked)
     text = asked.text("text", longest=MAX_TEXT)
     with _sql_turn(stopped):
         connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
@@ -164,9 +169,10 @@ def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, A
             table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
             body = f"    print(store.sql({text!r}).to_pandas())\n"
             found = shown(table, SQL_COLUMNS)
-            times, labels = found.pop("times"), found["recordings"]
+            found["at"], found["recordings"] = _moments(
+                context, found.pop("times"), found["recordings"], answer.remarks
+            )
             return found | {
-                "at": _offsets(context, times, labels or [recording.label] * len(times)),
                 "more": is_cut,
                 "remarks": _remarks(context, answer),
                 "python": program(context.store, body),
@@ -175,21 +181,48 @@ def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, A
             connection.close()
 
 
-def _offsets(
-    context: Context, times: Sequence[int | None], labels: Sequence[str | None]
+def _moments(
+    context: Context,
+    times: Sequence[range | None],
+    labels: Sequence[str | None],
+    remarks: Remarks,
+) -> tuple[list[str | None], list[str | None]]:
+    """The message of each row: time since the start of its recording, ns, as text, and label.
+
+    It is the only one of the topics that were read at a time that the row may be of. Without a
+    column `recording`, the recording is known if a single one was read.
+    """
+    read = [entry.label for entry in remarks.recordings.values()]
+    named = labels or [read[0] if len(read) == 1 else None] * len(times)
+    found: list[str | None] = [None] * len(times)
+    for label in {*named} - {None}:
+        rows = [n for n, one in enumerate(named) if one == label and times[n]]
+        spans = [cast("range", times[n]) for n in rows]
+        with suppress(HybridlogError):  # there is no such recording, or it is damaged
+            entry = context.store.entry(str(label))
+            known = _messages_in(context, entry, remarks.topics, spans)
+            for n, time in zip(rows, known, strict=True):
+                found[n] = None if time is None else str(time - start_of(entry))
+    return found, [label if at else None for label, at in zip(named, found, strict=False)]
+
+
+def _messages_in(
+    context: Context, entry: RecordingEntry, topics: Collection[str], spans: Sequence[range]
 ) -> list[int | None]:
-    """Times since the start of the recording of each row, ns; None where that is not known."""
-    starts: dict[str | None, int | None] = {None: None}
-    for label in labels:
-        if label is not None and label not in starts:
-            try:
-                starts[label] = start_of(context.store.entry(label))
-            except TopicError:
-                starts[label] = None
-    return [
-        None if time is None or starts[label] is None else time - cast("int", starts[label])
-        for time, label in zip(times, labels, strict=False)
-    ]
+    """The only log time of messages of some topics in each span, ns; None for none or several."""
+    last = TIME_LIMIT - 1
+    bounds = np.array(
+        [[min(max(time, 0), last) for time in (one.start, one.stop)] + [0] for one in spans],
+        np.int64,
+    ).reshape(-1, 3)
+    own = {channel.topic for channel in entry.channels}
+    query = context.store.query(sorted(own & {*topics} or own), [entry.id])
+    asked = query.during(Intervals.of([(entry.id, bounds)]))
+    known = distinct(
+        np.concatenate([one.log_time for one in asked.match_times()] or [bounds[0:0, 0]])
+    )
+    low, high = np.searchsorted(known, bounds[:, :2]).T
+    return [int(known[a]) if b - a == 1 else None for a, b in zip(low, high, strict=True)]
 
 
 @contextmanager

@@ -47,7 +47,7 @@ def _log(topic: Topic, asked: Asked) -> Log:
 
 
 def _line(line: Line, start: int) -> dict[str, Any]:
-    found = {"time": line.time - start, "seq": line.seq, "text": line.text}
+    found: dict[str, Any] = {"time": str(line.time - start), "seq": line.seq, "text": line.text}
     if line.level:
         found["level"] = line.level
     if line.name:

@@ -73,8 +73,8 @@ def recording(context: Context, asked: Asked) -> dict[str, Any]:
         "name": entry.name,
         "status": entry.status,
         "start": str(start),
-        "begin": begin - start,
-        "end": end - start,
+        "begin": str(begin - start),
+        "end": str(end - start),
         "messages": entry.messages,
         "bytes": entry.stored_bytes,
         "tags": entry.tags,
@@ -172,6 +172,8 @@ def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
             first, last = stats.first - start, stats.last - start
             row["first"] = first if row["first"] is None else min(row["first"], first)
             row["last"] = last if row["last"] is None else max(row["last"], last)
+    for row in found.values():
+        row |= {end: str(row[end]) for end in ("first", "last") if row[end] is not None}
     return [found[topic] for topic in sorted(found)]
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_FIELDS: Final = 16
 """Most fields of one plot."""
+_GREATEST_EXACT: Final = 1 << 53
 
 
 def fields(context: Context, asked: Asked) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def series(context: Context, asked: Asked) -> dict[str, Any]:
         raise UsageError(f"These are {len(found)} fields, at most {MAX_FIELDS} fit in a plot.")
     return {
         "exact": all(one.exact for one in found),
-        "times": (found[0].times - start).tolist() if found else [],
+        "times": [str(time - start) for time in found[0].times.tolist()] if found else [],
         "fields": [
             {"field": one.field, "least": _values(one.least)}
             | ({} if one.exact else {"greatest": _values(one.greatest)})
@@ -55,9 +56,14 @@ def series(context: Context, asked: Asked) -> dict[str, Any]:
     }
 
 
-def _values(numbers: NDArray[np.float64]) -> list[float | None]:
-    """Null for NaN and infinities, which JSON lacks."""
-    return [value if isfinite(value) else None for value in numbers.tolist()]
+def _values(numbers: NDArray[np.floating[Any]]) -> list[float | str | None]:
+    """Null for NaN and infinities, which JSON lacks, and texts for integers that pages round."""
+    return [_value(value) if isfinite(value) else None for value in numbers.tolist()]
+
+
+def _value(number: float) -> float | str:
+    is_float = isinstance(number, float) or abs(number) <= _GREATEST_EXACT
+    return float(number) if is_float else str(int(number))
 
 
 routes = [route("/fields", fields), route("/series", series)]

@@ -98,8 +98,8 @@ def live(context: Context, asked: Asked) -> dict[str, Any]:
     return {
         "status": recording.status,
         "start": str(start),
-        "begin": begin - start,
-        "end": end - start,
+        "begin": str(begin - start),
+        "end": str(end - start),
         "messages": sum(row["messages"] for row in topics.values()),
         "topics": [topics[topic] for topic in sorted(topics)],
     }

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 def track_of(context: Context, asked: Asked) -> Response:
     """The track of a topic in metres, of a receiver from its first fix, and the times.
 
-    Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time.
+    Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time. A time
+    is the sum of `times` and `rests`: a float64 is too coarse far from the start.
     """
     topic = Topic(context, asked)
     start = topic.start
@@ -40,8 +41,11 @@ def track_of(context: Context, asked: Asked) -> Response:
         "fixes": found.fixes,
         "exact": found.exact,
     }
+    offsets = found.times - start
+    times = offsets.astype(np.float64)
     arrays: dict[str, NDArray[np.floating[Any]]] = {
-        "times": (found.times - start).astype(np.float64),
+        "times": times,
+        "rests": np.array([n - int(float(n)) for n in offsets.tolist()], np.float32),
         "xy": found.xy.astype(np.float32),
     }
     return packed_response(header, arrays)

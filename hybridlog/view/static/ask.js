@@ -186,7 +186,7 @@ export function mountAsk(main, recording) {
   }
 
   async function answerSql(question, signal) {
-    const found = await get("sql", { recording: recording.info.id, text: question.text }, { slot: "ask", signal });
+    const found = await get("sql", { text: question.text }, { slot: "ask", signal });
     python = found.python;
     told.textContent = "";
     fill(body, sqlTable(recording, found));

@@ -77,7 +77,7 @@ export function exportForm(recording) {
   async function load() {
     distance.hidden = part.value !== "around";
     const { begin, end } = { begin: state.get("begin"), end: state.get("end") };
-    const range = begin === null ? {} : { begin: Math.round(begin), end: Math.round(end) };
+    const range = begin === null ? {} : { begin, end };
     const asked = {
       recording: recording.info.id,
       ...PARTS[part.value].ask(predicate(recording) ?? {}, range, around.value),

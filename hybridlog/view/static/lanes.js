@@ -2,10 +2,13 @@
 
 import { ApiError, bytes } from "./api.js";
 import { notice } from "./dom.js";
+import { clamped } from "./range.js";
+import { instant } from "./state.js";
 
 const MOST_LANES = 64;
 const MOST_PIXELS = 8192;
 const MOST_BINS = 1 << 17;
+const LATEST = 2n ** 63n - 1n; // ns
 
 /**
  * Messages of one topic by bin.
@@ -104,17 +107,19 @@ export class Lanes {
   async fetch({ begin, end, pixels, topics }) {
     const asked = topics.slice(0, MOST_LANES);
     // As much again at both sides, so that moving the picture shows something at once.
-    const { info, label } = this.recording;
+    const { info } = this.recording;
     const margin = (end - begin) / 2;
-    const isWhole = begin <= info.begin && end >= info.end;
-    const [low, high] = isWhole ? [begin, end] : [begin - margin, end + margin];
+    const isWhole = begin <= Number(info.begin) && end >= Number(info.end);
+    const [low, high] = isWhole
+      ? [info.begin, info.end > info.begin ? info.end : info.begin + 1n]
+      : [begin - margin, end + margin].map((time) => clamped(instant(time), -LATEST, LATEST));
     const most = Math.min(MOST_PIXELS, Math.floor(MOST_BINS / asked.length));
     const answer = await bytes(
       "timeline",
       {
-        recording: label,
-        begin: Math.floor(low),
-        end: Math.ceil(high),
+        recording: info.id,
+        begin: low,
+        end: high,
         pixels: Math.max(Math.min(isWhole ? pixels : 2 * pixels, most), 1),
         topic: asked,
       },

@@ -6,12 +6,19 @@ import * as state from "./state.js";
 
 const EVERY_MS = 1000;
 
+/** What the server says of a recording, with times as BigInt. */
+export function timed(found) {
+  const first = (topic) => (topic.first ? state.instant(topic.first) : null);
+  const topics = found.topics.map((topic) => ({ ...topic, first: first(topic) }));
+  return { ...found, begin: state.instant(found.begin), end: state.instant(found.end), topics };
+}
+
 /** Keeps `recording.info` up to date. Returns a function that ends this. */
 export function followLive(recording) {
   let timer = 0;
   const stop = new AbortController();
   if (recording.info.status === "open") {
-    if (state.get("at") === 0) state.set({ at: lastTime(recording) });
+    if (state.get("at") === 0n) state.set({ at: lastTime(recording) });
     timer = setTimeout(look, EVERY_MS);
   }
   return () => {
@@ -30,20 +37,21 @@ export function followLive(recording) {
   }
 
   async function update() {
-    const parameters = { recording: recording.label };
-    const found = await get("live", parameters, { signal: stop.signal });
+    const parameters = { recording: recording.info.id };
+    const found = timed(await get("live", parameters, { signal: stop.signal }));
     const { info } = recording;
     if (found.messages === info.messages && found.status === info.status) return;
     const isAtEnd = state.get("at") >= lastTime(recording);
     const before = info.end;
     const isMoved = moveStart(BigInt(found.start));
     if (isMoved || found.status !== "open") {
-      Object.assign(info, await get("recording", parameters, { signal: stop.signal }));
+      Object.assign(info, timed(await get("recording", parameters, { signal: stop.signal })));
     }
     if (found.status === "open") Object.assign(info, { ...found, topics: merged(info, found) });
     if (isAtEnd) {
       const { begin, end } = visible(recording);
-      if (state.get("begin") !== null) show(recording, begin + info.end - before, end + info.end - before);
+      const by = Number(info.end - before);
+      if (state.get("begin") !== null) show(recording, begin + by, end + by);
       state.set({ at: lastTime(recording) });
     }
     recording.tell();
@@ -51,7 +59,7 @@ export function followLive(recording) {
 
   /** Times count from the first message, which is known for sure once a segment is sealed. */
   function moveStart(start) {
-    const by = Number(recording.start - start);
+    const by = recording.start - start;
     if (!by) return false;
     recording.start = start;
     const moved = (time) => (time === null ? null : time + by);
@@ -66,6 +74,6 @@ export function followLive(recording) {
 /** The topics as they are now, with what is known of them besides. */
 function merged(info, found) {
   const known = new Map(info.topics.map((one) => [one.topic, one]));
-  const empty = { encoding: "", bytes: 0, first: null, last: null };
-  return found.topics.map((one) => ({ ...empty, ...known.get(one.topic), ...one }));
+  const empty = { encoding: "", bytes: 0 };
+  return found.topics.map((one) => ({ ...one, ...empty, ...known.get(one.topic), messages: one.messages }));
 }

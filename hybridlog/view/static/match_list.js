@@ -67,7 +67,8 @@ export function matchList(recording) {
     const asked = predicate(recording);
     if (!asked) return null;
     try {
-      return await get("match-list", { ...asked, ...place }, { slot });
+      const found = await get("match-list", { ...asked, ...place }, { slot });
+      return { ...found, rows: found.rows.map(([time, seq]) => [state.instant(time), seq]) };
     } catch (error) {
       if (isAborted(error)) return null;
       if (!(error instanceof ApiError)) throw error;
@@ -82,7 +83,7 @@ export function matchList(recording) {
   }
 
   async function step(direction) {
-    const at = Math.round(state.get("at")) + (direction === "later" ? 1 : 0);
+    const at = state.get("at") + (direction === "later" ? 1n : 0n);
     const found = await list({ at, seq: -1, direction, count: 1 }, "match-step");
     if (!found) return;
     if (!found.rows.length) {
@@ -124,7 +125,7 @@ export function matchList(recording) {
 
   /** Marks the match at the cursor. */
   function mark() {
-    const at = Math.round(state.get("at"));
+    const at = state.get("at");
     [...rows.children].forEach((row, number) => {
       const isCurrent = shown.rows[number]?.[0] === at;
       row.toggleAttribute("aria-current", isCurrent);

@@ -2,7 +2,7 @@
 
 import { ApiError, get, isAborted } from "./api.js";
 import * as overlays from "./overlays.js";
-import { visible } from "./range.js";
+import { exactRange } from "./range.js";
 import * as state from "./state.js";
 
 const NAME = "matches";
@@ -41,12 +41,8 @@ export function drawMatches(recording) {
       overlays.draw(NAME, null);
       return;
     }
-    const { begin, end } = visible(recording);
-    const picture = {
-      begin: Math.floor(begin),
-      end: Math.ceil(end),
-      pixels: Math.min(window.innerWidth, MOST_PIXELS),
-    };
+    const pixels = Math.min(window.innerWidth, MOST_PIXELS);
+    const picture = { ...exactRange(recording), pixels };
     try {
       const options = { slot: NAME, signal: stop.signal };
       const { first, counts, bands } = await get("matches", { ...asked, ...picture }, options);

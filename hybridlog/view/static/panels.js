@@ -1,6 +1,7 @@
 /** The panels at the cursor: a grid, a head for each, and a menu to add one. */
 
 import { element, fill, notice } from "./dom.js";
+import { exactRange } from "./range.js";
 import * as state from "./state.js";
 import image from "./panels/image.js";
 import log from "./panels/log.js";
@@ -26,9 +27,9 @@ import points from "./panels/points.js";
  * @property {Object} options the panel's own, kept in the address
  * @property {function(Object)} setOptions changes some of them
  * @property {import("./recording.js").Recording} recording
- * @property {function(): number} cursor ns since the start
- * @property {function(): {begin: number, end: number}} range the visible one
- * @property {function(number)} seek moves the cursor
+ * @property {function(): BigInt} cursor ns since the start
+ * @property {function(): {begin: BigInt, end: BigInt}} range the visible one
+ * @property {function(number|BigInt)} seek moves the cursor
  */
 const KINDS = [image, points, map, plot, log, message];
 
@@ -49,13 +50,13 @@ function firstPanels(topics) {
 export function firstTime({ info }) {
   const shown = firstPanels(info.topics).filter(({ kind }) => kind !== log.kind);
   const names = shown.map(({ topic }) => topic);
-  const soon = info.begin + (info.end - info.begin) / 10;
+  const soon = info.begin + (info.end - info.begin) / 10n;
   const times = info.topics
     .filter(({ topic }) => names.includes(topic))
-    .map(({ first }) => first);
-  if (!times.length) return 0;
-  const earliest = Math.min(...times);
-  return Math.max(0, earliest, ...times.filter((first) => first <= soon));
+    .map(({ first }) => first)
+    .sort((a, b) => (a < b ? -1 : 1));
+  const found = times.findLast((first) => first <= soon) ?? times[0] ?? 0n;
+  return found < 0n ? 0n : found;
 }
 
 /** Shows a panel of a topic: of the first kind that is made for it, unless it is shown already. */
@@ -158,11 +159,8 @@ export function mountPanels(main, recording) {
         state.set({ panels: panels().map(merged) });
       },
       cursor: () => state.get("at"),
-      range: () => ({
-        begin: state.get("begin") ?? recording.info.begin,
-        end: state.get("end") ?? recording.info.end,
-      }),
-      seek: (at) => state.set({ at: Math.round(at) }),
+      range: () => exactRange(recording),
+      seek: (at) => state.set({ at }),
     };
     if (!kind || !topic) {
       body.append(element("p", {}, kind ? "This recording has no such topic." : "No such panel."));

@@ -34,7 +34,7 @@ export function mountPlayer(parent, recording) {
   let frame = 0;
   let before = 0;
   let told = 0;
-  let at = state.get("at");
+  let at = Number(state.get("at")); // where it plays
 
   const play = button("Play", toggle, "Play or pause (Space)");
   const rate = element(
@@ -71,8 +71,8 @@ export function mountPlayer(parent, recording) {
   function follow() {
     const now = state.get("at");
     // Someone else has moved the cursor while it plays.
-    if (now !== Math.round(at)) at = now;
-    readout.textContent = `${offset(now)}  ${moment(recording.toTime(now))}`;
+    if (now !== state.instant(at)) at = Number(now);
+    readout.textContent = `${offset(now, 9)}  ${moment(recording.toTime(now), 9)}`;
   }
 
   function toggle() {
@@ -81,8 +81,9 @@ export function mountPlayer(parent, recording) {
   }
 
   function start() {
-    at = state.get("at");
-    if (at >= lastTime(recording) && recording.info.status !== "open") at = recording.info.begin;
+    at = Number(state.get("at"));
+    const isAtEnd = state.get("at") >= lastTime(recording);
+    if (isAtEnd && recording.info.status !== "open") at = Number(recording.info.begin);
     before = told = performance.now();
     frame = requestAnimationFrame(step);
     play.textContent = "Pause";
@@ -98,10 +99,10 @@ export function mountPlayer(parent, recording) {
     at += (now - before) * 1e6 * Number(rate.value);
     before = now;
     const isOver = at >= lastTime(recording);
-    if (isOver) at = lastTime(recording);
+    if (isOver) at = Number(lastTime(recording));
     if (isOver || now - told >= UPDATE_MS) {
       told = now;
-      seek(recording, at);
+      seek(recording, isOver ? lastTime(recording) : at);
     }
     if (isOver && recording.info.status !== "open") pause();
     else frame = requestAnimationFrame(step);
@@ -121,7 +122,7 @@ export function mountPlayer(parent, recording) {
     const isButton = target.closest("button, a, summary") !== null;
     if (isButton && (key === " " || key === "Enter")) return;
     const { begin, end } = visible(recording);
-    const share = (end - begin) / (event.shiftKey ? 1000 : 50);
+    const share = state.instant(Math.ceil((end - begin) / (event.shiftKey ? 1000 : 50)));
     const actions = {
       " ": toggle,
       ArrowLeft: () => seek(recording, state.get("at") - share),

@@ -3,7 +3,7 @@
 import { ApiError, get } from "./api.js";
 import { mountAsk } from "./ask.js";
 import { element, fill } from "./dom.js";
-import { followLive } from "./live.js";
+import { followLive, timed } from "./live.js";
 import { firstTime, mountPanels } from "./panels.js";
 import * as state from "./state.js";
 import { mountTimeline } from "./timeline.js";
@@ -12,9 +12,9 @@ import { count, counted, duration, moment, size } from "./words.js";
 /**
  * @typedef {Object} Recording
  * @property {string} label
- * @property {Object} info the answer of the server: topics, marks, losses, begin, end
+ * @property {Object} info the answer of the server: topics, marks, losses; begin, end as BigInt
  * @property {BigInt} start the time that all other times count from, ns since 1970
- * @property {function(number): BigInt} toTime ns since 1970 of a time since the start
+ * @property {function(number|BigInt): BigInt} toTime ns since 1970 of a time since the start
  * @property {function(function()): function()} on calls back when `info` has changed, of a
  *     recording that goes on; returns a function that ends this
  * @property {function()} tell calls them back
@@ -34,11 +34,11 @@ export function mountRecording(main, label) {
 
   async function load() {
     try {
-      const info = await get("recording", { recording: label });
+      const info = timed(await get("recording", { recording: label }));
       if (isGone) return;
       const recording = made(info);
       // Nothing was said of the cursor: at the very start most topics have no message yet.
-      const isFresh = state.get("at") === 0 && state.get("panels") === null;
+      const isFresh = state.get("at") === 0n && state.get("panels") === null;
       if (isFresh && info.status !== "open") state.set({ at: firstTime(recording) });
       const drawHead = () => fill(head, summaryOf(recording));
       drawHead();
@@ -62,7 +62,7 @@ function made(info) {
     label: info.label,
     info,
     start: BigInt(info.start),
-    toTime: (offset) => recording.start + BigInt(Math.round(offset)),
+    toTime: (offset) => recording.start + state.instant(offset),
     on: (callback) => {
       listeners.add(callback);
       return () => listeners.delete(callback);
@@ -76,7 +76,7 @@ function summaryOf({ info, start }) {
   const lost = info.losses.reduce((sum, loss) => sum + (loss.count ?? 0), 0);
   const parts = [
     moment(start, 0),
-    duration(info.end - info.begin),
+    duration(Number(info.end - info.begin)),
     counted(info.topics.length, "topic"),
     counted(info.messages, "message"),
     size(info.bytes),

@@ -11,7 +11,7 @@ export function sqlTable(recording, answer) {
   const { columns, rows, at, recordings } = answer;
   const cell = (text, [name, isNumber], row) => {
     const shown =
-      TIMES.includes(name) && typeof at[row] === "number"
+      TIMES.includes(name) && at[row]
         ? element("button", { type: "button", class: "plain link", onclick: () => go(row) }, text)
         : text;
     return element("td", { class: isNumber ? "number" : null }, shown);
@@ -38,11 +38,11 @@ export function sqlTable(recording, answer) {
     element("p", { class: "summary" }, summaryOf(answer)),
   );
 
-  /** Shows the moment of a row, in its recording. */
+  /** Shows the message of a row, in its recording. */
   function go(row) {
-    const label = recordings[row] ?? recording.label;
-    if (label === recording.label) state.set({ at: at[row] });
-    else state.show(label, { at: at[row], ask: state.get("ask") });
+    const label = recordings[row];
+    if (label === recording.label) state.set({ at: state.instant(at[row]) });
+    else state.show(label, { at: state.instant(at[row]), ask: state.get("ask") });
   }
 }
 

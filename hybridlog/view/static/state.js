@@ -3,17 +3,22 @@
  * the same.
  *
  * - recording: label or id; "" for the list of recordings
- * - begin, end: the visible range, ns since the start of the recording; null for all of it
- * - at: the cursor, ns since the start of the recording
+ * - begin, end: the visible range, ns since the start of the recording, as BigInt; null for all
+ * - at: the cursor, ns since the start of the recording, as BigInt
  * - panels: [{kind, topic, options}]
  * - ask: the question {kind, text, …}, or null
  */
 
-const EMPTY = { recording: "", begin: null, end: null, at: 0, panels: null, ask: null };
+const EMPTY = { recording: "", begin: null, end: null, at: 0n, panels: null, ask: null };
 const MOST_PANELS = 24;
 
 let values = { ...EMPTY };
 const listeners = [];
+
+/** A time as BigInt: of a text, or the nearest one to a number, which is too coarse far from 0. */
+export function instant(time) {
+  return BigInt(typeof time === "number" ? Math.round(time) : time);
+}
 
 /** One value, or all of them. */
 export function get(key) {
@@ -21,12 +26,14 @@ export function get(key) {
 }
 
 /**
- * Changes some values and tells who listens to them.
+ * Changes some values and tells who listens to them. Times may be numbers.
  *
- * @param {Object} changes
+ * @param {Object} given
  * @param {{isStep?: boolean}} [options] whether the browser's "back" returns to what was before
  */
-export function set(changes, { isStep = false } = {}) {
+export function set(given, { isStep = false } = {}) {
+  const exact = ([key, value]) => [key, typeof value === "number" ? instant(value) : value];
+  const changes = Object.fromEntries(Object.entries(given).map(exact));
   const changed = Object.keys(changes).filter((key) => !isSame(values[key], changes[key]));
   if (!changed.length) return;
   values = { ...values, ...changes };
@@ -87,7 +94,7 @@ function textOf(state) {
   const pairs = new URLSearchParams();
   if (state.recording) pairs.set("recording", state.recording);
   for (const key of ["begin", "end", "at"]) {
-    if (state[key] !== EMPTY[key]) pairs.set(key, Math.round(state[key]));
+    if (state[key] !== EMPTY[key]) pairs.set(key, state[key]);
   }
   for (const key of ["panels", "ask"]) {
     if (state[key] !== null) pairs.set(key, JSON.stringify(state[key]));
@@ -97,14 +104,14 @@ function textOf(state) {
 
 function fromAddress() {
   const pairs = new URLSearchParams(location.hash.slice(1));
-  const whole = (key) => (/^-?\d{1,19}$/.test(pairs.get(key) ?? "") ? Number(pairs.get(key)) : null);
+  const whole = (key) => (/^-?\d{1,19}$/.test(pairs.get(key) ?? "") ? BigInt(pairs.get(key)) : null);
   const [begin, end] = [whole("begin"), whole("end")];
   const isRange = begin !== null && end !== null && begin < end;
   return {
     recording: pairs.get("recording") ?? "",
     begin: isRange ? begin : null,
     end: isRange ? end : null,
-    at: whole("at") ?? 0,
+    at: whole("at") ?? 0n,
     panels: panelsFrom(parsed(pairs.get("panels"))),
     ask: questionFrom(parsed(pairs.get("ask"))),
   };
@@ -136,5 +143,5 @@ function isPlain(value) {
 }
 
 function isSame(a, b) {
-  return a === b || JSON.stringify(a) === JSON.stringify(b);
+  return a === b || (a instanceof Object && JSON.stringify(a) === JSON.stringify(b));
 }

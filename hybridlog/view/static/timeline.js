@@ -101,7 +101,7 @@ export function mountTimeline(parent, recording) {
       return;
     }
     const { begin, end } = recording.info;
-    const asked = { recording: recording.label, begin, end };
+    const asked = { recording: recording.info.id, begin, end };
     marks = await get("marks", asked, { slot: "marks" }).then((answer) => answer.marks, () => marks);
     schedule();
   }
@@ -139,9 +139,9 @@ export function mountTimeline(parent, recording) {
     drawAxis();
     drawTip();
     const at = state.get("at");
-    canvas.setAttribute("aria-valuemin", recording.info.begin / 1e9);
-    canvas.setAttribute("aria-valuemax", recording.info.end / 1e9);
-    canvas.setAttribute("aria-valuenow", at / 1e9);
+    canvas.setAttribute("aria-valuemin", Number(recording.info.begin) / 1e9);
+    canvas.setAttribute("aria-valuemax", Number(recording.info.end) / 1e9);
+    canvas.setAttribute("aria-valuenow", Number(at) / 1e9);
     canvas.setAttribute("aria-valuetext", offset(at));
   }
 
@@ -211,6 +211,7 @@ export function mountTimeline(parent, recording) {
     const picture = prepared(canvas);
     const { context, width, height, toX } = picture;
     const paints = { ...colours.all(), ...hatches(context, colours.all()) };
+    const extent = { begin: Number(recording.info.begin), end: Number(recording.info.end) };
     const row = rowHeight();
     const inset = NARROW.matches ? 14 : 3;
     const { first, topics: shown } = seen();
@@ -220,7 +221,7 @@ export function mountTimeline(parent, recording) {
       const box = { top: top + inset, height: row - inset - 2 };
       context.fillStyle = paints.line;
       context.fillRect(0, top + row - 1, width, 1);
-      if (messages) drawLane(picture, box, lanes.of(topic), paints, recording.info);
+      if (messages) drawLane(picture, box, lanes.of(topic), paints, extent);
       for (const loss of recording.info.losses) {
         if (loss.begin === null || loss.count === 0 || (loss.topic ?? topic) !== topic) continue;
         drawLoss(picture, { top, height: row - 1 }, loss, paints);
@@ -262,7 +263,7 @@ export function mountTimeline(parent, recording) {
       context.fillStyle = paints.held;
       context.fillRect(low, 0, high - low, height);
     }
-    const x = toX(state.get("at"));
+    const x = toX(Number(state.get("at")));
     if (x < -1 || x > width + 1) return;
     context.fillStyle = paints.text;
     context.fillRect(Math.round(x) - 0.75, 0, 1.5, height);
@@ -295,7 +296,7 @@ export function mountTimeline(parent, recording) {
       context.fillRect(toX(loss.begin), AXIS - 3, Math.max(toX(loss.end) - toX(loss.begin), 3), 3);
     }
     drawCursor(picture, paints);
-    const x = toX(state.get("at"));
+    const x = toX(Number(state.get("at")));
     context.beginPath();
     context.moveTo(x - 5, AXIS - 9);
     context.lineTo(x + 5, AXIS - 9);
@@ -311,7 +312,7 @@ export function mountTimeline(parent, recording) {
     const { begin, end } = visible(recording);
     const nsPerPixel = (end - begin) / canvas.clientWidth;
     const time = begin + hover.x * nsPerPixel;
-    const lines = [`${offset(time, digitsOf(nsPerPixel))}  ${moment(recording.toTime(time))}`];
+    const lines = [`${offset(state.instant(time), digitsOf(nsPerPixel))}  ${moment(recording.toTime(time))}`];
     if (hover.lane !== null) lines.push(...aboutLane(topics[hover.lane].topic, time, nsPerPixel));
     const near = 4 * nsPerPixel;
     lines.push(...marks.filter(({ at }) => Math.abs(at - time) < near).slice(0, 5).map(({ text }) => `Mark: ${text}`));

@@ -1,5 +1,6 @@
-/** Numbers, sizes and times in words. Times are whole nanoseconds, as numbers or as BigInt. */
+/** Numbers, sizes and times in words. Times are whole nanoseconds, as BigInt. */
 
+const SECOND = 1000000000n;
 const SIZES = ["B", "kB", "MB", "GB", "TB"];
 
 /** `12,345`. */
@@ -38,14 +39,16 @@ export function duration(ns) {
 
 /** `+12.345 s`: a time since the start of a recording, ns. */
 export function offset(ns, digits = 3) {
-  return `${ns < 0 ? "−" : "+"}${Math.abs(ns / 1e9).toFixed(digits)} s`;
+  const unit = 10n ** BigInt(9 - digits);
+  const text = String(((ns < 0n ? -ns : ns) + unit / 2n) / unit).padStart(digits + 1, "0");
+  const point = text.length - digits;
+  return `${ns < 0n ? "−" : "+"}${text.slice(0, point)}${digits ? "." : ""}${text.slice(point)} s`;
 }
 
 /** `2026-11-27 10:20:30.123`, UTC, of nanoseconds since 1970 as BigInt. */
 export function moment(ns, digits = 3) {
-  const milliseconds = Number(ns / 1000000n);
-  const date = new Date(milliseconds);
-  if (Number.isNaN(date.getTime())) return `${ns} ns`;
-  const [day, time] = date.toISOString().slice(0, -1).split("T");
-  return `${day} ${digits ? time : time.slice(0, 8)}`;
+  const second = ns >= 0n ? ns / SECOND : (ns + 1n) / SECOND - 1n;
+  const [day, time] = new Date(Number(second) * 1000).toISOString().split("T");
+  const rest = String(ns - second * SECOND).padStart(9, "0").slice(0, digits);
+  return `${day} ${time.slice(0, 8)}${digits ? "." : ""}${rest}`;
 }

@@ -1,6 +1,7 @@
 /** Keeps what a panel shows current at the cursor, without a queue of requests. */
 
 import { ApiError } from "../api.js";
+import { instant } from "../state.js";
 
 const MOST_KEPT = 64;
 const MOST_BYTES = 64 << 20;
@@ -10,8 +11,8 @@ const STILL_PLAYING = 160; // ms between two steps of a cursor that plays
  * An answer about one message.
  *
  * @typedef {Object} Answer
- * @property {?number} time log time of the message, ns since the start; null without one
- * @property {?number} until log time of the next message; null if no later one is known
+ * @property {?BigInt} time log time of the message, ns since the start; null without one
+ * @property {?BigInt} until log time of the next message; null if no later one is known
  * @property {number} [size] bytes
  */
 
@@ -21,7 +22,8 @@ const STILL_PLAYING = 160; // ms between two steps of a cursor that plays
  * for the time at which the answer will have come.
  *
  * @param {Object} parts
- * @param {function(number): Promise<Answer>} parts.load asks for the message at a time
+ * @param {function(BigInt): Promise<Answer>} parts.load asks for the message at a time; its times
+ *     are texts still
  * @param {function(Answer)} parts.show shows one
  * @param {function(Error)} parts.fail shows why there is none
  * @param {import("../recording.js").Recording} parts.recording
@@ -31,7 +33,7 @@ export function follow({ load, show, fail, recording }) {
   let { start } = recording; // what the times of these count from
   let shown = null;
   let wanted = null;
-  let last = { at: 0, when: -Infinity };
+  let last = { at: 0n, when: -Infinity };
   let speed = 0; // ns of the recording for each ms; 0 when it does not play
   let latency = 30; // ms
   let isRunning = false;
@@ -65,7 +67,7 @@ export function follow({ load, show, fail, recording }) {
 
   function received(answer, at) {
     // Of a recording that goes on, later messages may come.
-    if (answer.until === null && recording.info.status === "open") answer.until = at + 1;
+    if (answer.until === null && recording.info.status === "open") answer.until = at + 1n;
     keep(answer);
     const isEarly = speed && answer.time > wanted;
     if (covers(answer, wanted) || !isEarly) take(answer);
@@ -73,13 +75,14 @@ export function follow({ load, show, fail, recording }) {
 
   async function ask() {
     if (isRunning || isGone) return;
-    const at = Math.round(wanted + speed * latency);
+    const at = wanted + instant(speed * latency);
     if (kept.some((answer) => covers(answer, at))) return;
     isRunning = true;
     const begun = performance.now();
     try {
       const answer = await load(at);
       if (isGone) return;
+      for (const name of ["time", "until"]) answer[name] &&= instant(answer[name]);
       if (recording.start === start) received(answer, at);
       latency += (performance.now() - begun - latency) / 4;
     } catch (error) {
@@ -106,7 +109,7 @@ export function follow({ load, show, fail, recording }) {
     want(at) {
       if (recording.start !== start) [start, kept, shown] = [recording.start, [], null];
       const when = performance.now();
-      const step = at - last.at;
+      const step = Number(at - last.at);
       const isPlaying = step > 0 && when - last.when < STILL_PLAYING;
       if (at !== last.at) {
         speed = isPlaying ? step / Math.max(when - last.when, 1) : 0;

@@ -47,8 +47,8 @@ function mount(body, panel) {
   /** The picture, decoded already, so that it takes the place of another one at once. */
   async function load(at) {
     const response = await request("image", { ...asked, at });
-    const time = wholeOf(response.headers.get("Hybridlog-Time"));
-    const until = wholeOf(response.headers.get("Hybridlog-Until"));
+    const time = response.headers.get("Hybridlog-Time");
+    const until = response.headers.get("Hybridlog-Until");
     const type = response.headers.get("Content-Type");
     if (type === "application/json") return { time, until, ...(await response.json()) };
     const data = await response.blob();
@@ -95,8 +95,4 @@ async function decoded(data) {
   } finally {
     URL.revokeObjectURL(image.src);
   }
-}
-
-function wholeOf(text) {
-  return text === null ? null : Number(text);
 }

@@ -2,6 +2,7 @@
 
 import { ApiError, get, isAborted } from "../api.js";
 import { element, fill } from "../dom.js";
+import { instant } from "../state.js";
 import { counted, offset } from "../words.js";
 import { literal, moment, opening } from "./python.js";
 import { ofTypes } from "./types.js";
@@ -169,6 +170,7 @@ function mount(body, panel) {
   async function answered(request, use) {
     try {
       const found = await request;
+      for (const line of found.lines ?? []) line.time = instant(line.time);
       if (!isGone) use(found);
     } catch (error) {
       if (isGone || isAborted(error)) return;

@@ -4,6 +4,7 @@ import { ApiError, bytes, get } from "../api.js";
 import { element } from "../dom.js";
 import { unpack } from "../spatial/packed.js";
 import { metres, plane } from "../spatial/plane.js";
+import { instant } from "../state.js";
 import { counted, offset } from "../words.js";
 import { follow } from "./follow.js";
 import { opening } from "./python.js";
@@ -186,12 +187,12 @@ function mount(body, panel) {
 
   function pick(x, y, pixel) {
     if (!track) return;
-    const { times, xy } = track.arrays;
+    const { times, rests, xy } = track.arrays;
     let nearest = NEAR * pixel;
     let time = null;
     for (let at = 0; at < times.length; at += 1) {
       const distance = Math.hypot(xy[2 * at] - x, xy[2 * at + 1] - y);
-      if (distance <= nearest) [nearest, time] = [distance, times[at]];
+      if (distance <= nearest) [nearest, time] = [distance, instant(times[at]) + instant(rests[at])];
     }
     if (time !== null) panel.seek(time);
   }
@@ -219,7 +220,7 @@ function mount(body, panel) {
     if (!fix) return;
     facts.textContent = fix.time === null ? "Nothing at or before the cursor." : describeFix(fix);
     facts.title = facts.textContent;
-    place.dataset.fix = JSON.stringify(fix);
+    place.dataset.fix = JSON.stringify(fix, (_, value) => (typeof value === "bigint" ? `${value}` : value));
   }
 
   function refuse(error) {
@@ -294,8 +295,8 @@ function boxOf(xy) {
 }
 
 function degrees({ latitude, longitude }) {
-  const north = `${Math.abs(latitude).toFixed(7)}° ${latitude < 0 ? "S" : "N"}`;
-  return `${north}, ${Math.abs(longitude).toFixed(7)}° ${longitude < 0 ? "W" : "E"}`;
+  const north = `${Math.abs(latitude)}° ${latitude < 0 ? "S" : "N"}`;
+  return `${north}, ${Math.abs(longitude)}° ${longitude < 0 ? "W" : "E"}`;
 }
 
 function describeFix(fix) {

@@ -85,6 +85,10 @@ function mount(body, panel) {
     return fieldsOf(panel.options) ?? [];
   }
 
+  function typeOf(field) {
+    return known.find(({ path }) => path === field)?.type;
+  }
+
   function update() {
     if (!isGone && place.clientWidth) ask();
     showCursor();
@@ -97,10 +101,10 @@ function mount(body, panel) {
     const pixels = Math.min(Math.max(Math.round(place.clientWidth), 1), MOST_PIXELS);
     const { info, start } = panel.recording;
     const isOpen = info.status === "open";
-    const now = JSON.stringify([begin, end, names, pixels, isOpen && info.messages, `${start}`]);
+    const now = JSON.stringify([`${begin} ${end} ${start}`, names, pixels, isOpen && info.messages]);
     if (now === wanted) return;
     wanted = now;
-    chart?.setScale("x", { min: begin, max: end }); // at once, with the values that are there
+    chart?.setScale("x", scaleOf(panel.range())); // at once, with the values that are there
     showLegend();
     if (!names.length) return drawAnswer({ times: [], fields: [], exact: true });
     try {
@@ -108,7 +112,7 @@ function mount(body, panel) {
       const answer = await get("series", parameters, { slot });
       if (isGone) return;
       problem.hidden = true;
-      drawAnswer(answer);
+      drawAnswer({ ...answer, times: answer.times.map(state.instant) });
     } catch (error) {
       refuse(error);
     }
@@ -127,9 +131,8 @@ function mount(body, panel) {
     drawn = answer;
     if (isAlike && chart) chart.setData(dataOf(answer), false);
     else redraw();
-    const { begin, end } = panel.range();
     chart.batch(() => {
-      chart.setScale("x", { min: begin, max: end });
+      chart.setScale("x", scaleOf(panel.range()));
       chart.setScale("y", heightOf(answer));
     });
     showCursor();
@@ -139,9 +142,8 @@ function mount(body, panel) {
   function redraw() {
     if (!drawn) return;
     chart?.destroy();
-    const { begin, end } = panel.range();
     chart = new uPlot(optionsOf(), dataOf(drawn), place);
-    chart.setScale("x", { min: begin, max: end });
+    chart.setScale("x", scaleOf(panel.range()));
     chart.setScale("y", heightOf(drawn));
     chart.over.append(line);
     chart.over.addEventListener("click", clicked);
@@ -215,7 +217,7 @@ function mount(body, panel) {
     const at = panel.cursor();
     const { begin, end } = panel.range();
     line.hidden = at < begin || at > end;
-    line.style.transform = `translateX(${chart.valToPos(at, "x")}px)`;
+    line.style.transform = `translateX(${chart.valToPos(Number(at), "x")}px)`;
     if (chart.cursor.left === undefined || chart.cursor.left < 0) showValues();
   }
 
@@ -251,7 +253,7 @@ function mount(body, panel) {
     const place = isHovered ? idx : placeAt(drawn.times, panel.cursor());
     drawn.fields.forEach((one) => {
       const output = legend.querySelector(`output[data-field="${CSS.escape(one.field)}"]`);
-      if (output) output.textContent = place < 0 ? "" : valueText(one, place);
+      if (output) output.textContent = place < 0 ? "" : valueText(one, place, typeOf(one.field));
     });
   }
 
@@ -271,16 +273,22 @@ function namesOf({ fields, exact }) {
   return JSON.stringify([exact, ...fields.map(({ field }) => field)]);
 }
 
+/** Numbers to draw; integers that these are too coarse for are texts in an answer. */
 function dataOf({ times, fields }) {
-  return [times, ...fields.flatMap(({ least, greatest }) => [least, greatest ?? least])];
+  const drawn = (values) => values.map((value) => (value === null ? null : Number(value)));
+  return [times, ...fields.flatMap(({ least, greatest }) => [least, greatest ?? least])].map(drawn);
+}
+
+function scaleOf({ begin, end }) {
+  return { min: Number(begin), max: Number(end) };
 }
 
 /** The range of all values, with a little room. */
 function heightOf({ fields }) {
   let [low, high] = [Infinity, -Infinity];
   for (const { least, greatest } of fields) {
-    for (const value of least) if (value !== null && value < low) low = value;
-    for (const value of greatest ?? least) if (value !== null && value > high) high = value;
+    for (const value of least) if (value !== null && value < low) low = Number(value);
+    for (const value of greatest ?? least) if (value !== null && value > high) high = Number(value);
   }
   if (low > high) return { min: 0, max: 1 };
   const room = high > low ? (high - low) * 0.05 : Math.abs(high) * 0.05 || 1;
@@ -298,14 +306,19 @@ function placeAt(times, at) {
   return low - 1;
 }
 
-function valueText({ least, greatest }, place) {
+function valueText({ least, greatest }, place, type) {
   const [low, high] = [least[place], (greatest ?? least)[place]];
   if (low === null) return "–";
-  return low === high ? numberText(low) : `${numberText(low)} … ${numberText(high)}`;
+  return low === high ? numberText(low, type) : `${numberText(low, type)} … ${numberText(high, type)}`;
 }
 
-function numberText(value) {
-  return Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(6)));
+/** The shortest digits that give a value back in its type. */
+function numberText(value, type) {
+  const isShort = type === "float32" || type === "summary";
+  if (!isShort || Number.isInteger(value) || Math.fround(value) !== value) return String(value);
+  let digits = 1;
+  while (Math.fround(value.toPrecision(digits)) !== value) digits += 1;
+  return String(Number(value.toPrecision(digits)));
 }
 
 function timeText(ns) {

@@ -1,0 +1,199 @@
+"""Times and integers that numbers of a page are too coarse for: clocks that jump from 1970, ids."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlencode
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog_storage.messages import Channel, Schema
+from tests.view.conftest import Asking, served
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+    from starlette.testclient import TestClient
+
+BOOT = 10**9
+START = 1_700_000_000_123_456_789
+STEP = 101  # ns; numbers of a page tell 256 ns apart
+COUNT = 200
+TIMES = [START + n * STEP for n in range(COUNT)]
+OFFSETS = [str(time - BOOT) for time in TIMES]
+DEFINITION = (
+    b"uint64 id\nint64 sid\nfloat64 longitude\nfloat64 latitude\nfloat32 f\nuint64[2] ids\n"
+)
+NUMBERS: dict[str, Any] = {"recording": "jump", "topic": "/num"}
+MATCHES = {**NUMBERS, "where": "longitude > 13"}
+
+
+def row(n: int) -> dict[str, Any]:
+    """Exact values of a message."""
+    return {
+        "id": 2**64 - 1 - n,
+        "sid": -(2**63) + n,
+        "longitude": 13.40495412345678 + n * 1e-14,
+        "latitude": 52.520008123456789,
+        "f": float(np.float32(0.1 + n / 1000)),
+        "ids": [2**64 - 1 - n, 2**53 + 1],
+    }
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    boot = Channel("/boot", "ros1", Schema("own/Boot", "ros1msg", b"uint8 n\n"))
+    numbers = Channel("/num", "ros1", Schema("own/Numbers", "ros1msg", DEFINITION))
+    with hl.open(tmp_path_factory.mktemp("exact") / "store", create=True) as made:
+        for label in ("jump", "other"):
+            with made.start(label) as recording:
+                recording.write(boot, b"\0", log_time=BOOT)
+                for n, time in enumerate(TIMES):
+                    payload = struct.pack("<Qqddf2Q", *list(row(n).values())[:-1], *row(n)["ids"])
+                    recording.write(numbers, payload, log_time=time + (label == "other"))
+        yield made
+
+
+@pytest.fixture(scope="module")
+def client(store: hl.Store, asking: Asking) -> TestClient:
+    return asking(store)
+
+
+def message_at(client: TestClient, at: str) -> dict[str, Any]:
+    found = client.get("message", params={**NUMBERS, "at": at}).json()
+    return {**found, "id": found["tree"]["items"][0]["text"]}
+
+
+def test_a_match_leads_to_its_message(client: TestClient) -> None:
+    listed = client.get("match-list", params={**MATCHES, "at": 0, "count": COUNT}).json()
+    assert [at for at, _ in listed["rows"]] == OFFSETS
+    for n, (at, _) in enumerate(listed["rows"]):
+        found = message_at(client, at)
+        assert (found["time"], found["id"]) == (at, str(row(n)["id"]))
+        assert found["until"] == (OFFSETS[n + 1] if n + 1 < COUNT else None)
+        after = {**MATCHES, "at": int(at) + 1, "count": 1}
+        later = client.get("match-list", params=after).json()["rows"]
+        assert [at for at, _ in later] == OFFSETS[n + 1 : n + 2]
+
+
+def test_values_of_a_plot_are_exact(client: TestClient) -> None:
+    fields = ["id", "sid", "ids[0]", "ids[1]", "longitude"]
+    asked = {**NUMBERS, "field": fields, "begin": 0, "end": int(OFFSETS[-1]) + 1}
+    few = client.get("series", params={**asked, "pixels": 1000}).json()
+    assert few["times"] == OFFSETS
+    lines = {one["field"]: one["least"] for one in few["fields"]}
+    assert lines["id"] == lines["ids[0]"] == [str(row(n)["id"]) for n in range(COUNT)]
+    assert lines["sid"] == [str(row(n)["sid"]) for n in range(COUNT)]
+    assert lines["ids[1]"] == [str(2**53 + 1)] * COUNT
+    assert lines["longitude"] == [row(n)["longitude"] for n in range(COUNT)]
+    asked = {**asked, "begin": int(OFFSETS[0]), "pixels": 2}
+    many = client.get("series", params=asked).json()
+    ends = {one["field"]: [*one["least"], *one["greatest"]] for one in many["fields"]}
+    half = COUNT // 2
+    assert ends["id"] == [str(row(n)["id"]) for n in (half - 1, COUNT - 1, 0, half)]
+    assert ends["sid"] == [str(row(n)["sid"]) for n in (0, half, half - 1, COUNT - 1)]
+
+
+def test_times_of_a_track_are_exact(client: TestClient) -> None:
+    content = client.get("track", params={**NUMBERS, "pixels": 1000}).content
+    (length,) = struct.unpack("<I", content[:4])
+    head = json.loads(content[4 : 4 + length])
+    place, found = 4 + length, {}
+    for one in head["arrays"]:
+        kind = np.dtype(one["type"])
+        found[one["name"]] = np.frombuffer(content, kind, one["count"], place).tolist()
+        place += kind.itemsize * one["count"]
+    times = [int(a) + int(b) for a, b in zip(found["times"], found["rests"], strict=True)]
+    assert [str(time) for time in times] == OFFSETS
+
+
+SQL = "select {} from num where recording = 'jump' order by t"
+
+
+@pytest.mark.parametrize("column", ["t", "log_time", "t, log_time", "log_time, recording"])
+def test_rows_of_sql_lead_to_their_message(client: TestClient, column: str) -> None:
+    found = client.get("sql", params={"text": SQL.format(column)}).json()
+    # Ten messages lie in a microsecond: its beginning alone does not tell which one a row is.
+    exact = [at if column.startswith("t") else None for at in OFFSETS]
+    assert found["at"] == exact
+    assert found["recordings"] == [at and "jump" for at in exact]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "select t from num order by t",  # of two recordings
+        "select t + 1 as t from num where recording = 'jump'",  # no message is there
+        "select 1700000000123456789 as t",  # of no recording
+        "select t, 'none' as recording from num where recording = 'jump'",
+        "select t, 'other' as recording from num where recording = 'jump'",
+        "select 9000000000000000000 as t, 'jump' as recording",
+        "select timestamp '9999-01-01' as log_time, 'jump' as recording",
+        "select null::bigint as t, 'jump' as recording",
+        "select b.t, a.log_time from num b join boot a using (recording) where recording = 'jump'",
+    ],
+)
+def test_other_rows_of_sql_lead_nowhere(client: TestClient, text: str) -> None:
+    found = client.get("sql", params={"text": text}).json()
+    assert found["rows"]
+    assert {*found["at"]} == {None}
+
+
+def test_values_of_sql_are_exact(client: TestClient) -> None:
+    text = "select id, sid, longitude, f, {'at': latitude} as at from num where t = "
+    found = client.get("sql", params={"text": f"{text}{TIMES[7]} limit 1"}).json()
+    want = row(7)
+    values = [str(want[name]) for name in ("id", "sid", "longitude")]
+    assert found["rows"] == [[*values, "0.107", f"{{at: {want['latitude']}}}"]]
+
+
+def test_a_row_of_sql_leads_into_its_recording(client: TestClient) -> None:
+    text = "select t, recording from num order by t, recording limit 4"
+    found = client.get("sql", params={"text": text}).json()
+    assert found["recordings"] == ["jump", "other", "jump", "other"]
+    assert found["at"] == [str(int(OFFSETS[n // 2]) + n % 2) for n in range(4)]
+    boots = client.get("sql", params={"text": "select log_time, recording from boot"}).json()
+    assert boots["at"] == ["0", "0"]
+    assert sorted(boots["recordings"]) == ["jump", "other"]
+
+
+@pytest.mark.peer("browser")
+def test_the_page_shows_what_is_clicked(page: Page, store: hl.Store) -> None:
+    fields = ["id", "sid", "longitude", "f"]
+    panels = [
+        {"kind": "message", "topic": "/num", "options": {}},
+        {"kind": "plot", "topic": "/num", "options": {"fields": fields}},
+    ]
+    ask = {"kind": "predicate", "topic": "/num", "text": MATCHES["where"], "within": ""}
+    shown = {"recording": "jump", "panels": json.dumps(panels), "ask": json.dumps(ask)}
+
+    def check(n: int) -> None:
+        page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
+        page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
+        assert f"at={OFFSETS[n]}" in page.evaluate(
+            "import('./state.js').then(s => `at=${s.get('at')}`)"
+        )
+        for field in fields:
+            output = page.locator(f'output[data-field="{field}"]')
+            value = row(n)[field]
+            assert output.inner_text() == (str(np.float32(value)) if field == "f" else str(value))
+
+    with served(store) as url:
+        page.goto(f"{url}#{urlencode(shown)}")
+        for n in (2, 99, 50):
+            page.get_by_role("complementary").get_by_role("button", name=f"#{n + 1} ").first.click()
+            check(n)
+        page.locator("body").press("n")
+        check(51)
+        for n in range(50, 40, -1):
+            page.keyboard.press("p")
+            check(n)
+        page.keyboard.press("End")
+        page.locator(".tree .leaf", has_text=f"id{row(COUNT - 1)['id']}").first.wait_for()
+        readout = page.get_by_label("Cursor", exact=True).inner_text()
+        assert readout.split()[0] == f"+{int(OFFSETS[-1]) // 10**9}.{OFFSETS[-1][-9:]}"
+        assert readout.endswith(str(TIMES[-1])[-9:])
