@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines.base import Engine, Outcomes, Values
+    from hybridlog.query.engines.base import Engine, Objects, Outcomes, Values
     from hybridlog.query.engines.mongo import Mongo
     from hybridlog.query.engines.payload_columns import PayloadColumns
     from hybridlog.query.engines.tables import TablesEngine
@@ -271,6 +271,10 @@ class Planner:
             return self._scan.values_of(self.plan([part]), fields)
         self._tell_unasked([part])
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
+
+    def objects(self, part: Part) -> Iterator[Objects]:
+        """The matching messages of a part as plain objects, in order."""
+        return self._scan.objects_of(self.plan([part]))
 
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""

@@ -6,9 +6,9 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, islice
+from itertools import groupby, islice, pairwise
 from operator import itemgetter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -28,13 +28,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines.base import Values
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 _T = TypeVar("_T")
+Rows: TypeAlias = "pa.StructArray | Sequence[Mapping[str, object]]"
+"""Messages, as columns or as plain objects."""
 
 
 class IntervalQueries:
@@ -231,37 +232,46 @@ class IntervalQueries:
     def _changes_in(
         self, part: Part, span: Span, paths: Collection[str], tolerance: float, changing: Changing
     ) -> Iterator[NDArray[np.int64]]:
-        carried = self._row_before(part, span, paths)
-        for found in self._values(_bounded(part, span), paths):
-            if not len(found.log_time):
-                continue
-            differs, carried = _steps(carried, found.records, tolerance)
-            yield changing.add(found.log_time[differs])
+        ask = partial(self._rows, paths=paths)
+        summaries = _summaries(part, paths)
+        names = [[path] if path in summaries else path.split(".") for path in paths]
+        carried = self._row_before(part, span, ask)
+        for times, rows in ask(_bounded(part, span)):
+            if len(rows):
+                differs, carried = _steps(carried, rows, names, tolerance)
+                yield changing.add(times[differs])
         yield changing.finish()
 
-    def _values(self, part: Part, paths: Collection[str]) -> Iterator[Values]:
-        """Fields of the matching messages; summaries of arrays (`ranges.min`) as fields."""
+    def _rows(self, part: Part, paths: Collection[str]) -> Iterator[tuple[NDArray[np.int64], Rows]]:
+        """Fields of the matching messages; summaries of arrays (`ranges.min`) as fields.
+
+        Columns where one definition fixes their types. Otherwise plain objects: in columns null
+        and missing are the same, and values of different types have no common one.
+        """
         from hybridlog.frames.columns import flat, with_summaries
-        from hybridlog.frames.names import is_summary
+        from hybridlog.query.predicate.to_bool import with_statistics
         from hybridlog.schema.arrow_columns import structs
 
-        known = part.field_types or {}
-        summaries = {path for path in paths if is_summary(path, known)}
+        summaries = _summaries(part, paths)
         read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
-        for found in self._planner.values(part, read):
+        types = {c.arrow_type(read) for c in part.channels if not c.is_reduced}
+        if part.field_types is None or len(types) > 1:
+            for times, objects in self._planner.objects(part):
+                yield times, [with_statistics(each, summaries) for each in objects]
+            return
+        for times, _, records in self._planner.values(part, read):
             if summaries:
-                leaves = with_summaries(flat(found.records), paths)
-                found = found._replace(records=structs(leaves, len(found.log_time)))  # noqa: PLW2901
-            yield found
+                records = structs(with_summaries(flat(records), paths), len(times))  # noqa: PLW2901
+            yield times, records
 
-    def _row_before(self, part: Part, span: Span, paths: Collection[str]) -> pa.StructArray | None:
+    def _row_before(
+        self, part: Part, span: Span, ask: Callable[[Part], Iterator[tuple[object, Rows]]]
+    ) -> Rows | None:
         """The fields of the last matching message before a span."""
         for begin in _earlier(part, span):
             last = None
-            earlier = _bounded(part, (begin, span[0]))
-            for found in self._beside(partial(self._values, paths=paths), earlier):
-                if len(found.records):
-                    last = found.records.slice(len(found.records) - 1)
+            for _, rows in self._beside(ask, _bounded(part, (begin, span[0]))):
+                last = rows[-1:] if len(rows) else last
             if last is not None:
                 return last
         return None
@@ -313,27 +323,37 @@ def _bounded(part: Part, span: Span) -> Part:
     return replace(part, bounds=span, clock="log", windows=None)
 
 
+def _summaries(part: Part, paths: Collection[str]) -> set[str]:
+    """Those of some paths that are summaries of arrays."""
+    from hybridlog.frames.names import is_summary
+
+    return {path for path in paths if is_summary(path, part.field_types or {})}
+
+
 def _steps(
-    carried: pa.StructArray | None, records: pa.StructArray, tolerance: float
-) -> tuple[NDArray[np.bool_], pa.StructArray]:
+    carried: Rows | None, rows: Rows, paths: Sequence[Sequence[str]], tolerance: float
+) -> tuple[NDArray[np.bool_], Rows]:
     """Find the rows that differ from the row before them; also returns the last row."""
     import pyarrow as pa
 
-    from hybridlog.query.rows_differ import rows_differ
+    from hybridlog.query.rows_differ import objects_differ, rows_differ
 
-    last = records.slice(len(records) - 1)
-    together = records
+    if not isinstance(rows, pa.StructArray):
+        first = rows[0] if carried is None else carried[0]
+        found = [objects_differ(a, b, paths, tolerance) for a, b in pairwise([first, *rows])]
+        return np.array(found, np.bool_), rows[-1:]
+    together: pa.StructArray = rows
     if carried is not None:
-        tables = [pa.Table.from_struct_array(part) for part in (carried, records)]
+        tables = [pa.Table.from_struct_array(part) for part in (carried, rows)]
         joined_table = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
         together = joined_table.to_struct_array().combine_chunks()
     if isinstance(together, pa.ChunkedArray):
         together = pa.concat_arrays(together.chunks)
-    rows = np.arange(1, len(together))
-    differs = rows_differ(together, rows, rows - 1, tolerance)
+    numbers = np.arange(1, len(together))
+    differs = rows_differ(together, numbers, numbers - 1, tolerance)
     if carried is None:
         differs = np.concatenate([[False], differs])
-    return differs, last
+    return differs, rows[-1:]
 
 
 def _extent(recording: RecordingSummary) -> Span:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -61,6 +61,18 @@ class Values(NamedTuple):
     log_time: NDArray[np.int64]
     seq: NDArray[np.int64]
     records: pa.StructArray
+
+
+class Objects(NamedTuple):
+    """Matching messages as plain objects, in order of log time and arrival.
+
+    Attributes:
+        log_time: int64[n], ns.
+        objects: n messages, as `Codec.objects` makes them.
+    """
+
+    log_time: NDArray[np.int64]
+    objects: Sequence[Mapping[str, object]]
 
 
 class Engine(Protocol):

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
-from hybridlog.query.engines.base import Need, Outcomes, Values
+from hybridlog.query.engines.base import Need, Objects, Outcomes, Values
 
 if TYPE_CHECKING:
-    from hybridlog.query.chunk_scan import ChunkTask
+    from hybridlog.query.chunk_scan import ChunkTask, MessageRun
     from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Part, RecordedChannel
@@ -78,19 +78,35 @@ class PayloadScan:
 
     def values_of(self, plan: ScanPlan, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the messages of a plan, in order."""
+        for channel, run in self._by_channel(plan):
+            batch = run.batch
+            decoded = channel.codec.arrow(batch.buffer, batch.offset, batch.length, fields)
+            good = decoded.rows
+            self._counters.unreadable += len(batch) - len(good)
+            yield Values(batch.log_time[good], run.seq[good], decoded.records)
+
+    def objects_of(self, plan: ScanPlan) -> Iterator[Objects]:
+        """The messages of a plan as plain objects, in order."""
+        from hybridlog.schema.object_rows import objects_of, payloads_of
+
+        for channel, run in self._by_channel(plan):
+            where = run.batch.buffer, run.batch.offset, run.batch.length
+            found = channel.codec.objects(*where)
+            if found is None:
+                found = objects_of(channel.codec.plain, payloads_of(*where))
+            self._counters.unreadable += len(run.batch) - len(found.rows)
+            yield Objects(run.batch.log_time[found.rows], found.objects)
+
+    def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
+        """The whole messages of a plan in order, those of one channel at a time."""
         for run in ChunkScan(plan, self._session.segment).runs():
             changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
             for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
                 channel = plan.channels[int(own.batch.channel[0])]
                 if channel.is_reduced:
                     self._counters.reduced += len(own.batch)
-                    continue
-                decoded = channel.codec.arrow(
-                    own.batch.buffer, own.batch.offset, own.batch.length, fields
-                )
-                good = decoded.rows
-                self._counters.unreadable += len(own.batch) - len(good)
-                yield Values(own.batch.log_time[good], own.seq[good], decoded.records)
+                elif len(own.batch):
+                    yield channel, own
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """No selection: nothing is known before the messages are read."""

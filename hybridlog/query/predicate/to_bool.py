@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias, TypeGuard
+from typing import TypeAlias, TypeGuard, cast
 
 from hybridlog.query.predicate.numbers import HIGH, LOW, equal, is_number, nearest, ordered
 from hybridlog.query.predicate.regex import compile_regex, text_of
@@ -327,6 +327,19 @@ def statistic(stat: Stat, values: Sequence[object]) -> float | None:
     if stat == "mean":
         return _mean(numbers)
     return min(finite) if stat == "min" else max(finite)
+
+
+def with_statistics(message: Message, paths: Iterable[str]) -> Message:
+    """A message with statistics of its arrays as fields of their paths (`ranges.min`)."""
+    found = dict(message)
+    for path in paths:
+        *names, stat = path.split(".")
+        array: object = message
+        for name in names:
+            array = array.get(name) if isinstance(array, Mapping) else None
+        if isinstance(array, list | bytes):
+            found[path] = statistic(cast("Stat", stat), array)
+    return found
 
 
 def _mean(values: Sequence[float]) -> float | None:

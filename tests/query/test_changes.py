@@ -1,0 +1,167 @@
+"""Changes of fields that have values of several kinds, null, or nothing."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import count, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog.query.rows_differ import objects_differ
+from hybridlog_storage.segment_writer import SegmentSettings
+
+CASES = Path(__file__).parents[1] / "cases"
+BASE = 1_700_000_000 * 10**9
+NAMES = count()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with hl.open(tmp_path_factory.mktemp("changes") / "store", create=True) as opened:
+        yield opened
+
+
+def _record(store: hl.Store, place: Path, messages: list[Any]) -> str:
+    name = f"log{next(NAMES)}"
+    with (place / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("State", "jsonschema", b"{}")
+        channel = writer.register_channel("/state", "json", schema, {"name": name})
+        for number, message in enumerate(messages):
+            writer.add_message(
+                channel, BASE + number, json.dumps(message | {"pad": "x" * 400}).encode(), BASE
+            )
+        writer.finish()  # type: ignore[no-untyped-call]
+    small = SegmentSettings(chunk_size=1024)  # two messages in a chunk
+    store.record(place / "log.mcap", name=name, settings=small)
+    return name
+
+
+def _steps(store: hl.Store, name: str, *fields: str, begin: int = 0) -> list[int]:
+    query = store.topic("/state").in_recording(name)
+    if begin:
+        query = query.between(BASE + begin, None)
+    found = query.changes(*fields, pause=0)
+    assert all(change.messages == 1 and change.end_ns == change.begin_ns + 1 for change in found)
+    return [change.begin_ns - BASE for change in found]
+
+
+def test_null_and_missing_are_different(store: hl.Store, tmp_path: Path) -> None:
+    messages = [{"m": 1}, {"m": None}, {}, {"m": None}, {"m": 1}, {"m": 1}]
+    name = _record(store, tmp_path, messages)
+    assert _steps(store, name, "m") == [1, 2, 3, 4]
+    assert _steps(store, name, "m", begin=2) == [2, 3, 4]
+    below = [{"o": {"m": 1}}, {"o": {"m": None}}, {"o": {}}, {"o": None}, {}]
+    name = _record(store, tmp_path, below)
+    assert _steps(store, name, "o.m") == [1, 2]
+    assert _steps(store, name, "o") == [1, 2, 3, 4]
+    in_list = [{"a": [{"m": None}, {}]}, {"a": [{"m": None}, {"m": None}]}, {"a": [{}, {}]}]
+    name = _record(store, tmp_path, in_list)
+    assert _steps(store, name, "a[].m") == _steps(store, name, "a") == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("file", "topic", "field", "wanted"),
+    [
+        ("changes_json_mixed", "/param", "value", [2, 4, 5]),
+        ("changes_json_mixed", "/param", "name", []),
+        ("one_int_str", "/s", "v", [1, 2, 3, 4, 5]),
+        ("one_int_str", "/s", "k", []),
+    ],
+)
+def test_mixed_kinds_and_definitions(
+    store: hl.Store, file: str, topic: str, field: str, wanted: list[int]
+) -> None:
+    if file not in {entry.label for entry in store.recordings()}:
+        store.record(CASES / f"{file}.mcap", name=file)
+    found = store.topic(topic).in_recording(file).changes(field, pause="1us")
+    assert [(change.begin_ns - BASE) // 10**8 for change in found] == wanted
+
+
+def test_summaries_where_definitions_differ(store: hl.Store, tmp_path: Path) -> None:
+    with (tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        for number, (kind, width, values) in enumerate(
+            [("float64", 8, [1, 4]), ("float32", 4, [4, 1]), ("float32", 4, [1, 4, 2])]
+        ):
+            schema = writer.register_schema("my/msg/A", "ros2msg", f"{kind}[] a\n".encode())
+            channel = writer.register_channel("/two", "cdr", schema)
+
+            head = b"\x00\x01\x00\x00" + len(values).to_bytes(4, "little") + b"\0" * (width - 4)
+            raw = head + np.array(values, f"<f{width}").tobytes()
+            writer.add_message(channel, BASE + number, raw, 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    store.record(tmp_path / "two.mcap")
+    query = store.topic("/two")
+    assert len(query.changes("a.min", "a.max", pause=0)) == 0
+    assert [c.begin_ns - BASE for c in query.changes("a.n", pause=0)] == [2]
+    assert [c.begin_ns - BASE for c in query.changes("a", pause=0)] == [1, 2]
+
+
+scalars = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.sampled_from([0, 1, 1.0, -0.0, 2**53 + 1, 2**63, 2**70, math.nan, math.inf]),
+    st.sampled_from(["", "1", "a"]),
+)
+values = st.recursive(
+    scalars,
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from("mn"), inner),
+    max_leaves=4,
+)
+messages = st.lists(st.dictionaries(st.sampled_from("ab"), values), min_size=1, max_size=8)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """A plain evaluation: what JSON would write, but for numbers by value."""
+    kinds = [
+        "number" if isinstance(v, int | float) and not isinstance(v, bool) else type(v).__name__
+        for v in (one, other)
+    ]
+    if kinds[0] != kinds[1]:
+        return False
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if isinstance(one, dict):
+        return set(one) == set(other) and all(_same(one[name], other[name]) for name in one)
+    return bool(one == other or (one != one and other != other))
+
+
+@settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(messages=messages)
+def test_as_a_plain_comparison(store: hl.Store, tmp_path: Path, messages: list[Any]) -> None:
+    name = _record(store, tmp_path, messages)
+    for field in ("a", "b"):
+        wanted = [
+            number
+            for number, (before, after) in enumerate(pairwise(messages), 1)
+            if (field in before) != (field in after)
+            or (field in before and not _same(before[field], after[field]))
+        ]
+        assert _steps(store, name, field) == wanted
+
+
+def test_tolerance_of_objects() -> None:
+    path = [("x",)]
+    assert not objects_differ({"x": [1, 2.0]}, {"x": [1.5, 2]}, path, 0.5)
+    assert objects_differ({"x": [1, 2.0]}, {"x": [1.6, 2]}, path, 0.5)
+    assert objects_differ({"x": 10**400}, {"x": 1.0}, path, 1.0)
+    assert objects_differ({"x": True}, {"x": 1}, path, 1.0)
+    deep: Any = 1
+    for _ in range(10_000):
+        deep = [deep]
+    assert not objects_differ({"x": deep}, {"x": deep}, path)
