@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Any, Final
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+MAX_STRANGERS: Final = 64
+"""Connections without a request that has the token; the oldest one makes room for another."""
 
 
 class BoundedConnection(H11Protocol):
@@ -15,6 +18,8 @@ class BoundedConnection(H11Protocol):
 
     Attributes:
         patience_s: Time for a request to arrive, from the connection or the last answer on.
+        is_stranger: True until a request has the token.
+        since: Time of the event loop at which it was made.
     """
 
     patience_s = 30.0
@@ -22,11 +27,19 @@ class BoundedConnection(H11Protocol):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._waiting: asyncio.TimerHandle | None = None
+        self.is_stranger = True
+        self.since = self.loop.time()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """A client has connected."""
         super().connection_made(transport)
         self._wait()
+        known: set[Any] = self.connections
+        strangers = [one for one in known if one.is_stranger]
+        if len(strangers) > MAX_STRANGERS:
+            oldest = min(strangers, key=lambda one: one.since)
+            known.discard(oldest)  # it is lost a little later
+            oldest.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection is closed."""
@@ -39,6 +52,8 @@ class BoundedConnection(H11Protocol):
         super().handle_events()
         if self.cycle is not before:
             self._stop_waiting()
+            guard: Any = self.config.app
+            self.is_stranger &= not guard.knows(self.scope["path"])
 
     def on_response_complete(self) -> None:
         """A request is answered."""

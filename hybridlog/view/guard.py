@@ -77,8 +77,7 @@ class Guard:
             return  # a web socket is closed without an answer
         headers = Headers(scope=scope)
         path: str = scope["path"]
-        first, _, rest = path.removeprefix("/").partition("/")
-        refusal = self._refusal(scope["method"], headers, first.encode(), f"/{rest}")
+        refusal = self._refusal(scope["method"], headers, path)
         if refusal is not None:
             code, reason = refusal
             response = PlainTextResponse(f"{reason}\n", code, headers=HEADERS)
@@ -100,17 +99,20 @@ class Guard:
 
         await self._app({**scope, "root_path": self._root}, receive, guarded)
 
-    def _refusal(
-        self, method: str, headers: Headers, token: bytes, below: str
-    ) -> tuple[int, str] | None:
+    def knows(self, path: str) -> bool:
+        """True for a path that has the token."""
+        first = path.removeprefix("/").partition("/")[0]
+        return secrets.compare_digest(first.encode(), self._token)
+
+    def _refusal(self, method: str, headers: Headers, path: str) -> tuple[int, str] | None:
         """Status and reason; None for a request of the page."""
         if any(len(headers.getlist(name)) > 1 for name in _ONCE):
             return 400, "A header occurs twice."
         if headers.get("host") not in self._hosts:
             return 421, "This server answers to 127.0.0.1 only."
-        if not secrets.compare_digest(token, self._token):
+        if not self.knows(path):
             return 404, "Open the address that `hybridlog view` printed; it has a token."
-        if not self._is_own(headers, below):
+        if not self._is_own(headers, path.removeprefix(self._root)):
             return 403, "Pages of other sites may not read this store."
         preflight = method == _PREFLIGHT and headers.get("origin") in self._origins
         if method not in _METHODS and not preflight:

@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -436,6 +437,33 @@ def test_connections_that_only_wait_are_closed(
             time.sleep(0.05)
         assert 200 in statuses
         assert statuses <= {200, 503}
+
+
+@pytest.mark.parametrize("shown", ["nothing", "part", "refused"])
+def test_strangers_do_not_keep_the_page_out(demo_store: hl.Store, shown: str) -> None:
+    """More connections without the token than are served at once, held open."""
+    with served(demo_store) as url, ExitStack() as opened:
+        parts = urlsplit(url)
+        assert parts.port is not None
+        host = f"Host: {parts.netloc}\r\n"
+        said = {
+            "nothing": "",
+            "part": f"GET {parts.path} HTTP/1.1\r\n{host}X: ",
+            "refused": f"GET /no-token/ HTTP/1.1\r\n{host}\r\n",
+        }[shown]
+        kept = http.client.HTTPConnection("127.0.0.1", parts.port, timeout=60)
+        for n in range(300):
+            if n % 50 == 0:  # a connection of the page, which is older than most strangers
+                kept.request("GET", f"{parts.path}recordings")
+                answer = kept.getresponse()
+                assert (answer.status, bool(answer.read())) == (200, True)
+            stranger = socket.create_connection(("127.0.0.1", parts.port), timeout=60)
+            opened.enter_context(stranger).sendall(said.encode())
+        door = Door(parts.port, parts.path.strip("/"))
+        assert {door.below("recordings").status for _ in range(20)} == {200}
+        kept.request("GET", f"{parts.path}recordings")
+        assert kept.getresponse().status == 200
+        kept.close()
 
 
 def _drip(connection: socket.socket) -> bool:
