@@ -11,10 +11,9 @@ import os
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -117,10 +116,8 @@ class Inventory:
         """Files of columns of payloads, as the journal and the segments list them."""
         found: dict[str, PayloadFile] = {}
         for summary in self.summaries.values():
-            if summary.compacted is not None:
-                with suppress(KeyError, TypeError, ValueError):
-                    files = cast("Iterable[Mapping[str, Any]]", summary.compacted["files"])
-                    found.update({file.file: file for file in journal.payload_files(files)})
+            files = (summary.compacted or {}).get("files", ())
+            found.update({file.file: file for file in files})
         return found | (self.state.payloads if self.state is not None else {})
 
     def stored_file(self, number: int) -> tuple[str, int]:
@@ -159,8 +156,6 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
     found = Inventory(label, listing, state)
     listed = state.sealed if state is not None else {}
     numbers = {sealed.digest: number for number, sealed in listed.items()}
-    for number, written in (state.thinned if state is not None else {}).items():
-        numbers.update(dict.fromkeys((digest for digest, _ in written), number))
     for number, name in listing.sealed.items():
         try:
             found.summaries[number] = read_summary(path / name, number)
@@ -172,9 +167,9 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
         problem = _difference(found, summary, number, recording)
         if problem is not None:
             del found.summaries[number]
-            belongs = numbers.get(summary.digest)
+            belongs = numbers.get(_whole_digest(summary))
             found.misfits.append(Misfit(number, name, problem, belongs=belongs))
-        elif number not in listed and state is not None:
+        elif state is not None and not _is_listed(found, state, number):
             reason = "the journal does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
     for number, sealed in listed.items():
@@ -192,7 +187,8 @@ def _difference(
 ) -> str | None:
     """The difference of a whole segment from the journal; None if it matches.
 
-    A segment with moved chunks gets the digest that it had before.
+    A segment with moved chunks gets the digest that it had before, which it names itself: the
+    journal may lack the line about it.
     """
     its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
     if its_id != recording:
@@ -201,34 +197,24 @@ def _difference(
         return f"it is segment {its_number} of this recording"
     state = inventory.state
     sealed = state.sealed.get(number) if state is not None else None
-    before = _before_thinning(state, summary, number)
-    if before is not None:
+    whole = _whole_digest(summary)
+    if whole != summary.digest and (sealed is None or sealed.digest == whole):
         inventory.stored[number] = summary.digest, summary.size
-        inventory.summaries[number] = replace(summary, digest=before)
+        inventory.summaries[number] = replace(summary, digest=whole)
     elif sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
         return "it is not the segment that the journal lists: an older or a changed one"
     return None
 
 
-def _before_thinning(
-    state: JournalState | None, summary: SegmentSummary, number: int
-) -> str | None:
-    """The digest of a segment with moved chunks before that; None for others.
+def _whole_digest(summary: SegmentSummary) -> str:
+    """The digest of a segment before chunks of it were moved."""
+    return (summary.compacted or {}).get("digest", summary.digest)  # type: ignore[no-any-return]
 
-    Where lines of the journal are lost, the segment itself says it.
-    """
-    if summary.compacted is None:
-        return None
-    said = summary.compacted.get("digest")
-    sealed = state.sealed.get(number) if state is not None else None
-    is_listed = state is not None and (summary.digest, summary.size) in state.thinned.get(
-        number, ()
-    )
-    if not is_listed and state is not None and state.is_proof:
-        return None
-    if not isinstance(said, str) or (sealed is not None and sealed.digest != said):
-        return None
-    return said
+
+def _is_listed(inventory: Inventory, state: JournalState, number: int) -> bool:
+    """True if the journal lists a valid segment as its file is now."""
+    stored = inventory.stored.get(number)
+    return number in state.sealed and (stored is None or stored in state.thinned.get(number, ()))
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -342,36 +328,26 @@ def topic_types(entry: RecordingEntry) -> set[TopicType]:
 
 def _base(inventory: Inventory) -> RecordingEntry:
     state = inventory.state
-    said: Mapping[str, Any] | None = None
+    said: dict[str, Any]
     if state is not None and state.begun:
         said = {**state.begun, "name": state.name, "tags": state.tags}
     elif inventory.summaries:
-        first = inventory.summaries[min(inventory.summaries)]
-        said = first.recording
-        if state is not None:  # only the first line is lost
-            said = {**said, "tags": {**cast("dict[str, str]", said.get("tags", {})), **state.tags}}
-            said["name"] = state.name or said.get("name")
-    if said is None:
+        said = dict(inventory.summaries[min(inventory.summaries)].recording)
+    else:
         raise SegmentError(
             f"Recording {inventory.label!r} has neither a journal nor a segment that can be read."
         )
     try:
-        entry = RecordingEntry(
-            id=inventory.id,
-            label=inventory.label,
-            name=str(said["name"]),
-            tags=dict(cast("Mapping[str, str]", said["tags"])),
-            source=dict(cast("Mapping[str, Any]", said["source"])),
-            created=int(cast(int, said["created"])),
-            status="open",
-        )
+        said = journal.description_of(said)
     except (KeyError, TypeError, ValueError) as error:
         raise SegmentError(
             f"The description of recording {inventory.label!r} is damaged: {error!r}"
         ) from error
-    if len(entry.id) != 32 or set(entry.id) - set("0123456789abcdef"):
-        raise SegmentError(f"The id of recording {inventory.label!r} is damaged: {entry.id!r}")
+    entry = RecordingEntry(label=inventory.label, status="open", **said)
+    entry.source = {"path": "", "kind": "", "bytes": 0, **entry.source}
     if state is not None:
+        entry.name = state.name or entry.name  # also where only the first line is lost
+        entry.tags |= state.tags
         entry.notes = list(state.notes)
         entry.marks = list(state.marks)
     entry.payloads = [asdict(file) for file in inventory.payloads.values()]
@@ -537,16 +513,31 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
             journal.event(journal.NOTED, text=n["text"]) | {"at": n["at"]} for n in state.notes
         ]
         lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
-    if inventory.payloads:
-        files = [asdict(file) for file in inventory.payloads.values()]
-        segments = [
-            {"segment": number, "digest": digest, "bytes": size}
-            for number, (digest, size) in inventory.stored.items()
-        ]
-        lines.append(journal.event(journal.COMPACTED, files=files, segments=segments))
+    lines += _compacted_lines(inventory)
     if inventory.end is not None:
         lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
     return lines
+
+
+def unlisted_lines(inventory: Inventory) -> list[journal.Event]:
+    """The lines about valid segments, and the columns that they need, that a journal lacks."""
+    unlisted = {misfit.segment: misfit.file for misfit in inventory.misfits if misfit.is_unlisted}
+    state = inventory.state
+    if state is None or not unlisted:
+        return []
+    # It may have listed other segments that are gone; this cannot be excluded.
+    reason = f"it did not list {', '.join(unlisted.values())}"
+    new = [sealed_line(inventory, number) for number in unlisted if number not in state.sealed]
+    return [journal.event(journal.REBUILT, reason=reason), *new, *_compacted_lines(inventory)]
+
+
+def _compacted_lines(inventory: Inventory) -> list[journal.Event]:
+    files = [asdict(file) for file in inventory.payloads.values()]
+    segments = [
+        {"segment": number, "digest": digest, "bytes": size}
+        for number, (digest, size) in inventory.stored.items()
+    ]
+    return [journal.event(journal.COMPACTED, files=files, segments=segments)] if files else []
 
 
 def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
@@ -561,7 +552,7 @@ def sealed_line(inventory: Inventory, number: int) -> journal.Event:
     file = inventory.listing.sealed[number]
     size = summary.size
     if number in inventory.stored and summary.compacted is not None:
-        size = int(cast(int, summary.compacted.get("bytes", size)))
+        size = summary.compacted.get("bytes", size)
     return sealed_event(Sealed(number, file, size, summary.digest, channels))
 
 

@@ -477,7 +477,11 @@ class Recording:
             for number, segment in sorted(sealed.items())
             if segment is not None and self._is_believed(number, segment, listed.get(number))
         }
-        self.unlisted = self.segments.keys() - listed.keys()
+        self.unlisted = {
+            number
+            for number, segment in self.segments.items()
+            if not self._is_listed(number, segment, listed.get(number))
+        }
         for segment in self.segments.values():
             files = self.journal.files if self.journal is not None else {}
             files = files or {f["file"]: f for f in (segment.compacted or {}).get("files", ())}
@@ -501,13 +505,16 @@ class Recording:
         if listed is None:
             return True
         was = listed["digest"], listed["bytes"]
-        are = segment.digest, len(segment.data)
-        assert self.journal is not None
-        if are == was or are in self.journal.thinned.get(number, ()):
-            return True
         whole = segment.compacted or {}
         said = whole.get("digest"), whole.get("bytes")
-        return not self.journal.is_proof and said == was
+        return was in {(segment.digest, len(segment.data)), said}
+
+    def _is_listed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
+        if listed is None or self.journal is None:
+            return False
+        are = segment.digest, len(segment.data)
+        is_whole = are == (listed["digest"], listed["bytes"])
+        return is_whole or are in self.journal.thinned.get(number, ())
 
     def _end(self) -> dict[str, Any] | None:
         if self.journal is not None and self.journal.end is not None:

@@ -68,8 +68,9 @@ def _print_repairs(store: Store) -> None:
         _print_recovered(recording, segments)
     for recording in repairs.journals:
         note(
-            f"Recording {recording} has lost its journal. It was written again, but a missing "
-            "segment would go unnoticed: compare the recording with a copy if you have one."
+            f"Recording {recording} has lost its journal, or lines of it. They were written again, "
+            "but a missing segment would go unnoticed: compare the recording with a copy if you "
+            "have one."
         )
     for recording in repairs.adopted:
         note(f"Recording {recording} came from another store; it belongs to this one now.")

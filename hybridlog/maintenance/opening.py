@@ -18,6 +18,7 @@ from hybridlog.entries import (
     journal_from_segments,
     sealed_event,
     take_inventory,
+    unlisted_lines,
 )
 from hybridlog.payloads import files as payload_files
 from hybridlog.payloads.layout import PARTS
@@ -317,6 +318,9 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         report.journals.append(label)
         inventory = take_inventory(directory, label)
     state = inventory.state
+    if inventory.stored and (missing := unlisted_lines(inventory)):
+        lines += missing  # moved chunks are read from the files that the journal lists
+        report.journals.append(label)
     if state is not None and state.end is None:
         lines.append(journal.event(journal.ENDED, end=_end_of(inventory)))
     if state is not None and state.store and state.store != directory.settings.store_id:

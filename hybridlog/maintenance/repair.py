@@ -7,12 +7,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog.entries import journal_from_segments, sealed_line, take_inventory
+from hybridlog.entries import journal_from_segments, take_inventory, unlisted_lines
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, reindex
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
 from hybridlog.payloads.contents import open_segment
-from hybridlog_storage import durability, files, journal
+from hybridlog_storage import durability, files
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
@@ -158,15 +158,10 @@ def _put_journal_right(directory: StoreDirectory, label: str) -> list[Repaired]:
     if state.torn:
         log.append()
         done.append(Repaired(label, "journal", f"{state.torn} bytes after its last line cut off"))
-    unlisted = [m for m in inventory.misfits if m.is_unlisted]
-    if unlisted:
-        # It may have listed other segments that are gone; this cannot be excluded.
-        reason = f"it did not list {', '.join(misfit.file for misfit in unlisted)}"
-        log.append(
-            journal.event(journal.REBUILT, reason=reason),
-            *[sealed_line(inventory, misfit.segment) for misfit in unlisted],
-        )
-        done += [Repaired(label, misfit.file, "listed in the journal") for misfit in unlisted]
+    if lines := unlisted_lines(inventory):
+        log.append(*lines)
+        unlisted = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
+        done += [Repaired(label, file, "listed in the journal") for file in unlisted]
     return done
 
 

@@ -23,7 +23,7 @@ class RepairReport:
         recovered: Segments that a crash left open.
         indexed: Recordings whose index was behind, and the number of missing chunks.
         removed: Recordings whose removal was finished, or whose files are gone.
-        journals: Recordings whose journal was rebuilt.
+        journals: Recordings whose journal was rebuilt, or lacked lines.
         adopted: Recordings that came from another store.
         copies: Copies of a recording, and the label of the one in use.
         unreadable: Recordings that could not be repaired, and the reason.

@@ -14,10 +14,13 @@ would have announced never began.
 from __future__ import annotations
 
 import json
+import math
 import os
+import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -184,15 +187,15 @@ class JournalState:
         elif name == SEALED:
             self._seal(line)
         elif name == ENDED:
-            self.end = dict(line["end"])
+            self.end = end_of(line["end"])
         elif name == RENAMED:
             self._rename(line)
         elif name == TAGGED:
-            self.tags[_text(line["key"])] = _text(line["value"])
+            self.tags[_key(line["key"])] = _text(line["value"])
         elif name == UNTAGGED:
-            self.tags.pop(_text(line["key"]), None)
+            self.tags.pop(_key(line["key"]), None)
         elif name == NOTED:
-            self.notes.append({"at": int(line["at"]), "text": _text(line["text"])})
+            self.notes.append(_values(line, {"at": _time, "text": _text}))
         elif name == MARKED:
             self._mark(line)
         elif name == ADOPTED:
@@ -206,46 +209,25 @@ class JournalState:
     def _begin(self, line: Event) -> None:
         if self.begun:
             raise ValueError("a second beginning")
-        recording = _text(line["id"])
-        if len(recording) != 32 or set(recording) - set("0123456789abcdef"):
-            raise ValueError("an id that is none")
-        said = _text(line["store"]), _text(line["name"]), _tags(line["tags"])
-        self.store, self.name, self.tags = said
-        self.id, self.begun = recording, dict(line)
+        said = description_of(line)
+        self.store, self.begun = _text(line["store"]), {**_plain(line), **said}
+        self.id, self.name, self.tags = said["id"], said["name"], dict(said["tags"])
 
     def _rename(self, line: Event) -> None:
         labels = line.get("from"), line.get("to")
-        moving = (_text(labels[0]), _text(labels[1])) if any(labels) else None
+        moving = None if labels == (None, None) else (_label(labels[0]), _label(labels[1]))
         self.name, self.moving = _text(line["name"]), moving
 
     def _mark(self, line: Event) -> None:
-        mark = {
-            "time": int(line["time"]),
-            "text": _text(line["text"]),
-            "tags": _tags(line["tags"]),
-            "segment": int(line["segment"]),
-        }
+        mark = _values(line, _MARK)
         # A mark whose segment a crash kept from being listed does not exist.
         self.marks = [m for m in self.marks if m["segment"] in self.sealed]
         self.marks.append(mark)
 
     def _seal(self, line: Event) -> None:
-        channels = tuple(
-            {
-                "id": int(c["id"]),
-                "topic": _text(c["topic"]),
-                "messages": int(c["messages"]),
-                "payload_bytes": int(c["payload_bytes"]),
-                "first": int(c["first"]),
-                "last": int(c["last"]),
-            }
-            for c in line["channels"]
-        )
-        number = int(line["segment"])
-        file = _text(line["file"])
-        if Path(file).name != file or file in {"", ".."}:
-            raise ValueError("a name that leads elsewhere")
-        sealed = SealedSegment(number, file, int(line["bytes"]), _text(line["digest"]), channels)
+        channels = tuple(_values(channel, _CHANNEL) for channel in _list(line["channels"]))
+        sealed = SealedSegment(**_values(line, _SEALED), channels=channels)
+        number, _ = sealed.segment, _number(sealed.messages)
         before = self.sealed.get(number)
         if before is not None and before.digest != sealed.digest:
             self.replaced.append((before, sealed))
@@ -253,13 +235,10 @@ class JournalState:
 
     def _compact(self, line: Event) -> None:
         found = payload_files(line.get("files", ()))
-        segments = [
-            (int(value["segment"]), (_text(value["digest"]), int(value["bytes"])))
-            for value in line.get("segments", ())
-        ]
+        segments = [_values(value, _THINNED) for value in line.get("segments", ())]
         self.payloads.update({file.file: file for file in found})
-        for number, written in segments:
-            self.thinned.setdefault(number, []).append(written)
+        for one in segments:
+            self.thinned.setdefault(one["segment"], []).append((one["digest"], one["bytes"]))
 
 
 def payload_files(values: Iterable[Mapping[str, Any]]) -> list[PayloadFile]:
@@ -268,16 +247,47 @@ def payload_files(values: Iterable[Mapping[str, Any]]) -> list[PayloadFile]:
     Raises:
         KeyError, TypeError, ValueError: A value is missing or invalid.
     """
-    return [
-        PayloadFile(
-            _inner_path(value["file"]),
-            int(value["bytes"]),
-            _text(value["digest"]),
-            _text(value["topic"]),
-            int(value["messages"]),
-        )
-        for value in values
-    ]
+    return [PayloadFile(**_values(value, _PAYLOAD_FILE)) for value in values]
+
+
+def description_of(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The description of a recording in its first event or in a segment.
+
+    Raises:
+        KeyError, TypeError, ValueError: A value is missing or invalid.
+    """
+    return _values(value, _DESCRIPTION)
+
+
+def end_of(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The end of a recording in an event or in a segment.
+
+    Raises:
+        KeyError, TypeError, ValueError: A value is missing or invalid.
+    """
+    return _with_known(value, _END)
+
+
+def compacted_of(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The statement of a segment with moved chunks.
+
+    Raises:
+        KeyError, TypeError, ValueError: A value is missing or invalid.
+    """
+    return _with_known(value, _COMPACTED)
+
+
+def loss_rows(values: object) -> list[dict[str, Any]]:
+    """Rows of the loss ledger in an event or in a segment.
+
+    Raises:
+        KeyError, TypeError, ValueError: A value is missing or invalid.
+    """
+    rows = [{**_plain(row), **_values(row, _LOSS)} for row in _list(values)]
+    for begin, end in ((row["from"], row["to"]) for row in rows):
+        if (begin, end) != (None, None) and not begin <= end:
+            raise ValueError("a loss that ends before it begins")
+    return rows
 
 
 def read_lines(data: bytes) -> Iterator[tuple[int, dict[str, Any] | None]]:
@@ -405,22 +415,112 @@ def _whole(fd: int, size: int) -> int:
     return 0
 
 
-def _inner_path(value: object) -> str:
-    """A path of a folder and a file in it."""
-    path = _text(value)
-    names = path.split("/")
-    if len(names) != 2 or any(name in {"", ".", ".."} or "\0" in name for name in names):
-        raise ValueError("a path that leads elsewhere")
-    return path
+# Checks of values. They raise KeyError, TypeError or ValueError.
+
+_Check = Callable[[Any], Any]
 
 
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError("no text")
+def _values(value: Mapping[str, Any], checks: Mapping[str, _Check]) -> dict[str, Any]:
+    return {name: check(value[name]) for name, check in checks.items()}
+
+
+def _with_known(value: Mapping[str, Any], checks: Mapping[str, _Check]) -> dict[str, Any]:
+    """Any values; those with a check may be missing."""
+    known = {name: check for name, check in checks.items() if name in value}
+    return {**_plain(value), **_values(value, known)}
+
+
+def _text(value: object, like: str = ".*") -> str:
+    """Text that a regular expression matches."""
+    if not isinstance(value, str) or re.fullmatch(like, value, re.DOTALL) is None:
+        raise TypeError("no text, or another one")
+    value.encode()  # fails for half of a surrogate pair
     return value
 
 
-def _tags(value: object) -> dict[str, str]:
-    if not isinstance(value, dict):
-        raise TypeError("no tags")
-    return {_text(key): _text(of) for key, of in value.items()}
+def _number(value: object, within: range = range(1 << 48)) -> int:
+    """By default a number of bytes or messages; a sum of many still has 64 bits."""
+    if type(value) is not int or value not in within:  # a boolean is no number
+        raise ValueError("no number, or one out of range")
+    return value
+
+
+def _list(value: object) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError("no list")
+    return value
+
+
+def _tags(value: Mapping[str, object]) -> dict[str, str]:
+    return {_key(key): _text(of) for key, of in value.items()}
+
+
+def _plain(value: Any, depth: int = 8) -> Any:
+    """A value that the catalog and MongoDB can hold."""
+    if depth and isinstance(value, Mapping):
+        return {_key(key): _plain(inner, depth - 1) for key, inner in value.items()}
+    if depth and isinstance(value, list):
+        return [_plain(inner, depth - 1) for inner in value]
+    if isinstance(value, str):
+        return _text(value)
+    if value is None or isinstance(value, bool):
+        return value
+    return value if isinstance(value, float) and math.isfinite(value) else _time(value)
+
+
+def _or_none(check: _Check) -> _Check:
+    return lambda value: None if value is None else check(value)
+
+
+_name: Final = r"(?!\.{1,2}(/|$))[^/\0]{1,255}"  # of a file in a folder
+_key: Final = partial(_text, like=r"[^\0]*")
+_label: Final = partial(_text, like=rf"(?!\.){_name}")  # hidden ones are of interrupted work
+_time: Final = partial(_number, within=range(-(1 << 62), 1 << 63))
+_segment: Final = partial(_number, within=range(10**9))
+_THINNED: Final[Mapping[str, _Check]] = {"segment": _segment, "bytes": _number, "digest": _text}
+_SEALED: Final[Mapping[str, _Check]] = {"file": partial(_text, like=_name), **_THINNED}
+_CHANNEL: Final[Mapping[str, _Check]] = {
+    "id": partial(_number, within=range(1 << 16)),
+    "topic": _text,
+    **dict.fromkeys(("messages", "payload_bytes"), _number),
+    **dict.fromkeys(("first", "last"), _time),
+}
+_PAYLOAD_FILE: Final[Mapping[str, _Check]] = {
+    "file": partial(_text, like=f"{_name}/{_name}"),
+    **dict.fromkeys(("bytes", "messages"), _number),
+    **dict.fromkeys(("digest", "topic"), _text),
+}
+_COMPACTED: Final[Mapping[str, _Check]] = {
+    "digest": _text,
+    "bytes": _number,
+    "files": payload_files,
+}
+_MARK: Final[Mapping[str, _Check]] = {
+    "time": _time,
+    "text": _text,
+    "tags": _tags,
+    "segment": _segment,
+}
+_SOURCE: Final[Mapping[str, _Check]] = {
+    **dict.fromkeys(("path", "kind", "profile", "fingerprint"), _text),
+    "bytes": _number,
+}
+_DESCRIPTION: Final[Mapping[str, _Check]] = {
+    "id": partial(_text, like="[0-9a-f]{32}"),
+    "name": _text,
+    "tags": _tags,
+    "source": partial(_with_known, checks=_SOURCE),
+    "created": _time,
+}
+_LOSS: Final[Mapping[str, _Check]] = {
+    **dict.fromkeys(("cause", "reason"), _text),
+    **dict.fromkeys(("file", "topic"), _or_none(_text)),
+    **dict.fromkeys(("count", "offset", "length"), _or_none(_number)),
+    **dict.fromkeys(("from", "to"), _or_none(_time)),
+}
+_END: Final[Mapping[str, _Check]] = {
+    "status": partial(_text, like="complete|damaged|recovered"),
+    "losses": loss_rows,
+    "cut_bytes": _number,
+    "damage": lambda value: [_text(reason) for reason in _list(value)],
+}

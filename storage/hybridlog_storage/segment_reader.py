@@ -21,7 +21,7 @@ from mcap.records import AttachmentIndex, Metadata, MetadataIndex, Statistics
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema as SchemaRecord
 
-from hybridlog_storage import files
+from hybridlog_storage import files, journal
 from hybridlog_storage.append_file import BLOCK, DIRECT
 from hybridlog_storage.attachments import MAX_HEAD, Attachment, FileHandle, parse_attachment
 from hybridlog_storage.buffers import buffers
@@ -111,7 +111,8 @@ class SegmentSummary:
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
-        compacted: What a segment with moved chunks says of them; None in others.
+        compacted: `digest` and `bytes` of a segment before chunks were moved, and the `files` of
+            columns that it needs; None in others.
         table: The chunk table.
         digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
@@ -126,7 +127,7 @@ class SegmentSummary:
     losses: list[dict[str, Any]]
     attachments: list[AttachmentIndex]
     metadata: list[MetadataIndex]
-    compacted: dict[str, object] | None
+    compacted: dict[str, Any] | None
     table: ChunkTable
     digest: str
     size: int
@@ -312,8 +313,11 @@ class SegmentReader:
                 found[index.name] = json_of(self.metadata(table, index))
                 if index.name == RECORDING_METADATA:
                     check_format(found[index.name], self.path)
+                else:
+                    found[index.name] = _said(journal.end_of, found[index.name])
             elif index.name == COMPACTED_METADATA:
-                found[index.name] = json_of(self.metadata(table, index))
+                value = json_of(self.metadata(table, index))
+                found[index.name] = _said(journal.compacted_of, value)
             elif index.name == LOSSES_METADATA:
                 losses += loss_rows(json_of(self.metadata(table, index)))
         if RECORDING_METADATA not in found:
@@ -660,10 +664,14 @@ def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
     Raises:
         SegmentError: The value is damaged.
     """
-    found = value.get("rows")
-    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
-        raise SegmentError("a record of the loss ledger is damaged")
-    return found
+    return _said(journal.loss_rows, value.get("rows"))
+
+
+def _said(check: Callable[[Any], _T], value: object) -> _T:
+    try:
+        return check(value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
 
 
 def check_format(recording: Mapping[str, object], path: Path) -> None:

@@ -18,6 +18,7 @@ class Answer(NamedTuple):
 
     out: str
     err: str
+    code: int = 0
 
     @property
     def json(self) -> Any:
@@ -28,18 +29,19 @@ class Answer(NamedTuple):
         return self.out.splitlines()
 
 
-def answer(*arguments: object, store: Path, code: int = 0) -> Answer:
+def answer(*arguments: object, store: Path, code: int | None = 0) -> Answer:
     """Run a command to its end; much faster than `run`, which starts a process.
 
     Args:
         arguments: Of the command.
         store: What HYBRIDLOG_STORE says.
-        code: The exit code that is expected.
+        code: The exit code that is expected; None for any.
     """
     environment = {"HYBRIDLOG_STORE": str(store)}
     done = CliRunner().invoke(app, [*map(str, arguments)], env=environment, standalone_mode=False)
     error = done.exception
     if error is not None and not isinstance(error, HybridlogError | ClickException):
         raise error
-    assert (0 if error is None else error.exit_code) == code, (error, done.output)
-    return Answer(done.stdout, done.stderr)
+    found = done.exit_code if error is None else error.exit_code
+    assert code in {None, found}, (error, done.output)
+    return Answer(done.stdout, done.stderr, found)

@@ -13,10 +13,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog.payloads.contents import open_segment
 from hybridlog.payloads.reader import RecordingPayloads
 from hybridlog_storage import journal
+from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.segment_reader import SegmentReader
 from tests.payloads.logs import (
@@ -31,6 +33,7 @@ from tests.payloads.logs import (
 )
 
 IMAGES = COUNT // 10
+NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 
 
 @pytest.fixture(scope="module")
@@ -375,8 +378,72 @@ def test_an_interruption_is_undone_or_finished(thin: hl.Store, plain: Path, tmp_
     with hl.open(tmp_path / "store") as store:
         assert messages(store) == messages(thin)
     assert (recording / name).read_bytes() == whole
-    # An older journal does not know the segment.
-    (recording / journal.JOURNAL).write_bytes(b"".join(unannounced))
-    (recording / name).write_bytes(small)
-    with hl.open(tmp_path / "store") as store:
-        assert store.recordings()[0].status == "damaged"
+
+
+@pytest.fixture(scope="module")
+def edited(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """A store whose journal ends with many steps: a segment without chunks twice over."""
+    path = tmp_path_factory.mktemp("edited") / "store"
+    shutil.copytree(plain, path)
+    with hl.open(path) as store:
+        store.compact(topics=["scan"], drop_mcap=True)
+        store.compact(topics=["cloud"])
+        store.compact(drop_mcap=True)
+        store.tag("log", place="lab")
+        store.mark("log", BASE + STEP, "here")
+        yield store
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [1, 4, 7, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in range(2, 30) if n % 3 != 1)],
+)
+def test_a_journal_that_lacks_its_last_lines_loses_no_message(
+    edited: hl.Store, tmp_path: Path, lost: int
+) -> None:
+    copy_of(edited, tmp_path)
+    path = recording_of(tmp_path / "store") / journal.JOURNAL
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[: max(len(lines) - lost, 1)]))
+    with hl.open(tmp_path / "store", mongo=NOWHERE) as store:
+        assert store.recordings()[0].status == "unproven"
+        assert messages(store) == messages(edited)
+        assert store.recordings()[0].digests == edited.recordings()[0].digests
+        assert all(one.is_cured for one in store.repair())
+    with hl.open(tmp_path / "store", mongo=NOWHERE) as store:
+        assert messages(store) == messages(edited)
+        assert [one.place for one in store.verify().findings] == ["journal"]
+        state = journal.read(path.parent)
+        assert state is not None
+        assert set(state.payloads) == {one["file"] for one in edited.recordings()[0].payloads}
+
+
+def test_an_older_journal_in_a_store_that_cannot_be_written(thin: hl.Store, tmp_path: Path) -> None:
+    copy_of(thin, tmp_path)
+    path = recording_of(tmp_path / "store") / journal.JOURNAL
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(line for line in lines if b'"compacted"' not in line))
+    directory = StoreDirectory(tmp_path / "store")
+    inventory = take_inventory(directory, "log")
+    assert not inventory.lost
+    assert not inventory.is_proven
+    assert inventory.stored.keys() == inventory.summaries.keys()
+    assert set(inventory.payloads) == {one["file"] for one in thin.recordings()[0].payloads}
+
+
+def test_exchanged_segments_that_the_journal_lists_as_whole_ones(
+    thin: hl.Store, tmp_path: Path
+) -> None:
+    copy_of(thin, tmp_path)
+    recording = recording_of(tmp_path / "store")
+    lines = (recording / journal.JOURNAL).read_bytes().splitlines(keepends=True)
+    whole = b"".join(line for line in lines if b'"compacted"' not in line)
+    (recording / journal.JOURNAL).write_bytes(whole)
+    one, other = recording / "000000.mcap", recording / "000001.mcap"
+    content = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+    with hl.open(tmp_path / "store", mongo=NOWHERE) as store:
+        store.repair()
+        assert other.read_bytes() != content == one.read_bytes()
+        assert messages(store) == messages(thin)

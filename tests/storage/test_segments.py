@@ -61,6 +61,10 @@ RECORDING = {
     "source": {},
     "created": 1,
 }
+LOSS = {
+    "cause": "queue", "count": 3, "file": "", "from": 5, "length": None, "offset": None,
+    "reason": "", "to": 6, "topic": "/small",
+}  # fmt: skip
 SCHEMA = Schema("std_msgs/String", "ros1msg", b"string data")
 CHANNELS = [
     Channel("/small", "ros1", SCHEMA, {"callerid": "/n"}, has_publish_time=False),
@@ -980,7 +984,7 @@ def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
     writer.add_extra(Metadata("source", {"k": "v"}))
     writer.append(batch_of(rows[12:]), CHANNELS)
     writer.flush()
-    writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [{"topic": "/small", "count": 3}]}))
+    writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
     (path,) = writer.close(json_metadata(END_METADATA, {"status": "complete"}))
     return path.read_bytes(), chunks
 
@@ -1096,7 +1100,7 @@ def test_the_summary_tells_what_the_chunks_hold(tmp_path: Path) -> None:
                 of = chunk.batch.log_time[chunk.batch.channel == channel]
                 assert times.tolist() == sorted(of.tolist())
     assert summary.size == len(whole)
-    assert summary.losses == [{"topic": "/small", "count": 3}]
+    assert summary.losses == [LOSS]
     tail = whole[summary.table.end :]
     assert summary.digest == f"sha256:{hashlib.sha256(tail).hexdigest()}"
     # The footer says where the summary starts.
@@ -1349,11 +1353,11 @@ def test_when_the_journal_fails_the_segment_is_sealed_later(tmp_path: Path) -> N
     before = opened.read_bytes()
     # Who gives up tries it once more, and says the rest in another segment.
     fails = False
-    writer.give_up([json_metadata(END_METADATA, {"status": "full"})])
+    writer.give_up([json_metadata(END_METADATA, {"status": "damaged"})])
     assert [sealed.file for sealed in told] == ["000000.mcap", "000001.mcap"]
     assert (directory / "000000.mcap").read_bytes() == before
     with SegmentReader(directory / "000001.mcap", 1) as reader:
-        assert reader.summary().end == {"status": "full"}
+        assert reader.summary().end == {"status": "damaged"}
 
 
 def test_a_sealed_segment_is_not_replaced(tmp_path: Path) -> None:
@@ -1538,7 +1542,7 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
         except (DiskFullError, StoreError):
             try:
                 if gives_up:
-                    writer.give_up([json_metadata(END_METADATA, {"status": "full"})])
+                    writer.give_up([json_metadata(END_METADATA, {"status": "damaged"})])
                 else:
                     writer.abort()
             except (DiskFullError, StoreError):
