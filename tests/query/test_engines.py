@@ -141,6 +141,8 @@ def _json_message(rng: random.Random) -> dict[str, Any]:
         ("a", lambda: [rng.choice(numbers) for _ in range(rng.choice([0, 1, 3, 40]))]),
         ("o", lambda: {"v": rng.choice([1, None])}),
         ("l", lambda: [[rng.choice(numbers)] for _ in range(rng.choice([0, 2]))]),
+        ("g", lambda: [[rng.choice(numbers[:4])] * rng.choice([1, 40]) for _ in range(2)]),
+        ("h", lambda: [[[{"v": rng.choice(numbers)}]], [rng.choice([[], 1])]]),
     ):
         if rng.random() < 0.8:
             found[name] = make()
@@ -246,7 +248,10 @@ ros_numbers = st.sampled_from(
     ]
 )
 json_numbers = st.sampled_from(
-    ["x", "n", "a", "l", "a.n", "a.min", "l[0]", "o.v", "a[1]", "a[1:3]", "l[1:].n"]
+    [
+        *("x", "n", "a", "l", "a.n", "a.min", "l[0]", "o.v", "a[1]", "a[1:3]", "l[1:].n"),
+        *("g", "g[0]", "g[1:]", "g.n", "g[1].n", "h", "h.v", "h[0].v", "h[0][0].v"),
+    ]
 )
 pattern = st.sampled_from(["'^slip'", "'(?i)slip'", "'[0-9]$'", "'^$'", "'l.p 1'"])
 

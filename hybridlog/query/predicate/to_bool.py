@@ -98,7 +98,7 @@ def numbers_at(message: Message, path: str) -> list[float]:
     """
     parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
     found = _Reader(FieldTypes.of(None), summarised=False).leaves(message, Field(parts))
-    values = (value for leaf in found for value in (leaf if isinstance(leaf, list) else [leaf]))
+    values = (v for leaf in found for v in (_flat(leaf) if isinstance(leaf, list) else [leaf]))
     return [value for value in values if is_number(value)]
 
 
@@ -193,6 +193,14 @@ class _Reader:
         )
         return found
 
+    def elements(self, values: list[object]) -> Iterator[object]:
+        """The elements of an array, also those of the arrays in it."""
+        for value in _flat(values):
+            if not self.types.known and self._is_summary(value, (), element=True):
+                yield from _hidden(value, (), None)
+            else:
+                yield value
+
     def _typed_statistic(self, stat: Stat, array: object, parts: Parts) -> Iterator[object]:
         if isinstance(array, list | bytes):
             kind = self.types.kind(".".join(part for part in parts if isinstance(part, str)))
@@ -247,7 +255,7 @@ class _Reader:
         if isinstance(part, int) and part < len(values):
             yield from self._reach(values[part], parts[1:], names, element=True)
         # MongoDB also accepts a number as a name.
-        for inner in values:
+        for inner in _flat(values) if isinstance(part, str) else values:
             if self._is_summary(inner, names, element=True):
                 yield _UNKNOWN
             elif isinstance(inner, Mapping):
@@ -271,9 +279,21 @@ class _Reader:
         if isinstance(part, int) and isinstance(value, list) and part < len(value):
             yield from self._values(value[part], rest, names, element=True)
         # MongoDB also accepts a number as a name.
-        for inner in value if isinstance(value, list) else [value]:
+        inside = value if isinstance(part, int) and isinstance(value, list) else _flat(value)
+        for inner in inside:
             if isinstance(inner, Mapping) and str(part) in inner:
                 yield from self._values(inner[str(part)], rest, (*names, str(part)))
+
+
+def _flat(values: object) -> Iterator[object]:
+    """The elements of a list, also those of the lists in it, in their order."""
+    left = [values]
+    while left:
+        value = left.pop()
+        if isinstance(value, list):
+            left += reversed(value)
+        else:
+            yield value
 
 
 def _hidden(
@@ -419,14 +439,12 @@ def _holds(reader: _Reader, asked: Field, test: _Leaf, message: Message) -> Trut
     """True if a test holds for any value at a path."""
     unknown = False
     for leaf in reader.leaves(message, asked):
-        if isinstance(leaf, list):
-            if any(test(element, True) for element in leaf):
+        is_list = isinstance(leaf, list)
+        for value in reader.elements(leaf) if isinstance(leaf, list) else (leaf,):
+            found = test(value, is_list)
+            if found:
                 return True
-            continue
-        found = test(leaf, False)
-        if found:
-            return True
-        unknown |= found is None
+            unknown |= found is None
     return None if unknown else False
 
 

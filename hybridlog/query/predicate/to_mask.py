@@ -297,6 +297,8 @@ class _Columns:
         """The values at a path through lists."""
         part = parts[0]
         elements = _flattened(values, rows)
+        while isinstance(part, str) and _is_list(elements.values.type):
+            elements = _flattened(elements.values, elements.rows)
         inside = elements.values.type
         named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
         if isinstance(part, int):
@@ -474,19 +476,23 @@ def _as_integers(values: pa.Array) -> pa.Array:
 
 
 def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
-    """The values that are no lists, the elements of lists, and nulls."""
+    """The values that are no lists, the elements of lists and of the lists in them, and nulls."""
     values, rows = leaves.values, leaves.rows
+    is_element = False
     if leaves.is_hidden or leaves.is_summary:
         yield leaves
         return
-    if _is_list(values.type):
+    while True:
+        if values.null_count:
+            none = rows[~_valid(values)]
+            yield _Leaves(pa.nulls(len(none)), none, is_element=leaves.is_element or is_element)
+        if not _is_list(values.type):
+            break
         inner = _flattened(values, rows)
-        yield inner._replace(values=_plain(inner.values))
-    else:
-        yield _Leaves(values, rows)
-    if values.null_count:
-        rows = rows[~_valid(values)]
-        yield _Leaves(pa.nulls(len(rows)), rows, is_element=leaves.is_element)
+        values, rows, is_element = _plain(inner.values), inner.rows, True
+    if is_element and pa.types.is_struct(values.type) and set(_names(values.type)) in _SUMMARIES:
+        raise _UnfitError  # it may be the summary of an array in an array
+    yield _Leaves(values, rows, is_element=is_element)
 
 
 def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:

@@ -256,13 +256,26 @@ class _Compiler:
     def _behind_summaries(self, asked: Field) -> list[_Pair]:
         """Documents in which a summary above a path hides the values at the path."""
         parts = asked.parts
-        return [
+        arrays = self._arrays(asked)
+        summaries = [
             _perhaps(
                 self._summary(array)
                 if isinstance(parts[len(array.parts)], int)
                 else self._summary_of_others(array)
             )
-            for array in self._arrays(asked)
+            for array in arrays
+        ]
+        return [*summaries, *self._in_nested(arrays)]
+
+    def _in_nested(self, arrays: Sequence[Field]) -> list[_Pair]:
+        """Documents in which an array has arrays in it, which MongoDB does not look into."""
+        lists: Filter = {"$elemMatch": {"$type": "array"}}
+        summaries: Filter = {"$elemMatch": {"n": {"$exists": True}}}
+        return [
+            _perhaps({array.path: test})
+            for array in arrays
+            if self._types.is_open(array)
+            for test in (lists, summaries)
         ]
 
     def _exists(self, asked: Field) -> _Pair:
@@ -317,7 +330,8 @@ class _Compiler:
         else:
             found = _any_of(self._in_order(asked, order, values[0]))
         if stat is None:
-            return _any_of([found, *self._behind_summaries(asked)])
+            nested = self._in_nested([asked])
+            return _any_of([found, *nested, *self._behind_summaries(asked)])
         array = Field(asked.parts[:-1])
         found = _Pair(found.possible, {"$and": [found.certain, self._unambiguous(array, stat)]})
         lists = [self._of_open_lists(array, stat, order, value) for value in values]
@@ -444,7 +458,7 @@ class _Compiler:
             found.append(_perhaps(self._summary(asked)))
         if self._stat(asked) is not None:
             found.append(_perhaps({Field(asked.parts[:-1]).path: {"$type": "array"}}))
-        return _any_of([*found, *self._behind_summaries(asked)])
+        return _any_of([*found, *self._in_nested([asked]), *self._behind_summaries(asked)])
 
     # Numbers.
 

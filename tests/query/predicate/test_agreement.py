@@ -217,7 +217,7 @@ def lists_of(elements: st.SearchStrategy[object]) -> st.SearchStrategy[list[obje
     return st.lists(elements, max_size=2) | st.lists(elements, min_size=4, max_size=5)
 
 
-arrays = lists_of(small) | lists_of(plain) | lists_of(lists_of(small))
+arrays = lists_of(small) | lists_of(plain) | lists_of(lists_of(small) | lists_of(lists_of(plain)))
 json_values = st.recursive(
     plain | arrays,
     lambda inner: st.dictionaries(names, inner, max_size=3) | lists_of(inner),
@@ -229,6 +229,9 @@ even_messages = st.fixed_dictionaries(
     {},
     optional={
         "a": st.none() | st.lists(st.none() | st.integers(-1, 2), max_size=5),
+        "h": st.lists(
+            st.lists(st.lists(st.fixed_dictionaries({}, optional={"a": small}), max_size=5))
+        ),
         "m": st.none()
         | st.lists(
             st.fixed_dictionaries(
@@ -276,7 +279,17 @@ even_paths = [
         "m.q[1:].max",
         "g[0][1:3]",
     ),
-    *("m[:1].n", "g[0:2]", "g[0:2].n", "d[0:2]", "d[0:2].a"),
+    *(
+        "m[:1].n",
+        "g[0:2]",
+        "g[0:2].n",
+        "d[0:2]",
+        "d[0:2].a",
+        "h.a",
+        "h[0].a",
+        "h[1:].a",
+        "h[0][1].a",
+    ),
 ]
 
 SLOW = settings(
@@ -322,7 +335,7 @@ def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -
 @pytest.mark.parametrize(
     ("where", "expected"),
     [
-        ("a < 100", "short long far"),  # any element
+        ("a < 100", "short long far nested"),  # any element, also of the arrays in an array
         ("a == 500", "far"),
         ("a != 500", "short long none parts nested named"),
         ("a[39] == 500", "far"),
@@ -366,6 +379,47 @@ def test_what_json_arrays_answer(ask: Ask, where: str, expected: str) -> None:
     codec = codec_for(Channel("/j", "json", None))
     documents = [codec.fields(json.dumps(message).encode()) for message in messages.values()]
     ask(list(messages.values()), documents, [where], None)
+    test = to_bool(parse(where))
+    assert [name for name, message in messages.items() if test(message)] == expected.split()
+
+
+@pytest.mark.parametrize(
+    ("where", "expected"),
+    [
+        ("a == 5", "flat two three mixed"),
+        ("a[:1] == 5", "flat two three"),
+        ("a[1:] == 5", "mixed"),
+        ("a[0] == 5", "flat two three"),
+        ("a[0][0] == 5", "two three"),
+        ("a[0][0][0] == 5", "three"),
+        ("not (a == 5)", "long empty"),
+        ("a != 5", "long empty"),
+        ("a in [4, 5]", "flat two three mixed"),
+        ("a < 7", "flat two three mixed long"),
+        ("a == 45", "long"),
+        ("a == 46", ""),
+        ("a ~ '^x$'", "mixed"),
+        ("a == null", "mixed"),
+        ("a.w == 3", "three mixed"),
+        ("a.w exists", "three mixed"),
+        ("a.w missing", "flat two long empty"),
+        ("a.n == 2", "three mixed empty"),
+    ],
+)
+def test_arrays_of_arrays_are_looked_into(ask: Ask, where: str, expected: str) -> None:
+    messages: dict[str, Message] = {
+        "flat": {"a": [5]},
+        "two": {"a": [[5, 6]]},
+        "three": {"a": [[[5], [6]], [[{"w": 3}]]]},
+        "mixed": {"a": [[8, "x", None], [[5, {"w": 3}], 9]]},
+        "long": {"a": [list(range(6, 46))]},
+        "empty": {"a": [[], [[]]]},
+    }
+    codec = codec_for(Channel("/j", "json", None))
+    documents = [codec.fields(json.dumps(message).encode()) for message in messages.values()]
+    ask(list(messages.values()), documents, [where], None)
+    for one, document in zip(messages.values(), documents, strict=True):
+        ask([one], [document], [where], None)  # columns of one kind
     test = to_bool(parse(where))
     assert [name for name, message in messages.items() if test(message)] == expected.split()
 

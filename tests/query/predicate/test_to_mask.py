@@ -136,7 +136,8 @@ def test_arrays_of_any_depth() -> None:
     )
     assert mask_of("g[0] == 2", records) == [True, False, False]
     assert mask_of("g[1][0] > 5", records) == [False, True, False]
-    assert mask_of("g == 2", records) == [False] * 3
+    assert mask_of("g == 2", records) == [True, False, False], "arrays in an array are looked into"
+    assert mask_of("not (g > 2)", records) == [False, False, True]
     assert mask_of("g.n == 2", records) == [True, True, False]
     assert mask_of("m.q > 2", records) == [False, False, True]
     assert mask_of("m.q > 5", records) == [False] * 3, "infinities are no finite elements"
