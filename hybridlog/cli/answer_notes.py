@@ -17,22 +17,27 @@ if TYPE_CHECKING:
 
 
 def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
-    """Print what an answer cost.
+    """Print what an answer cost, as far as it cost anything.
 
     Args:
         counters: Of the query.
         elapsed: Seconds, including the opening of the store.
         count: The answer was a number, not messages.
     """
-    taken = f"{output.size(counters.bytes_read)} read from disk"
-    if counters.chunks_read:
-        taken += f" in {output.counted(counters.chunks_read, 'chunk')}"
-    given = counters.messages - counters.reduced
-    found = "" if count else f"{output.counted(given, 'message')}{latched(counters)}, "
-    output.note(
-        f"{found}{output.size(counters.payload_bytes)} of payload, {taken}, "
-        f"{output.counted(counters.documents_read, 'index document')}, {elapsed:.3f} s"
-    )
+    used = []
+    if not count:
+        given = counters.messages - counters.reduced
+        used.append(f"{output.counted(given, 'message')}{latched(counters)}")
+    if counters.payload_bytes:
+        used.append(f"{output.size(counters.payload_bytes)} of payload")
+    if counters.bytes_read:
+        chunks = counters.chunks_read
+        where = f" in {output.counted(chunks, 'chunk')}" if chunks else ""
+        used.append(f"{output.size(counters.bytes_read)} read from disk{where}")
+    if counters.documents_read:
+        used.append(output.counted(counters.documents_read, "index document"))
+    time = f"{elapsed:.3f} s"
+    output.note(f"{', '.join(used)}, {time}" if used else f"answered in {time}")
 
 
 def latched(counters: Counters) -> str:

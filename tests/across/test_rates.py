@@ -298,7 +298,7 @@ def test_the_commands(logs: Logs) -> None:
     store = logs.store.directory.path
     rates = run("rate", "-t", "base", "--window", "500ms", "-F", "csv", store=store)
     assert rates.lines[0] == '"begin","end","recording","topic","messages","rate"'
-    assert "0 index documents" in rates.err
+    assert "index document" not in rates.err
     assert run("gaps", "-t", "right/pose", "-r", "b", "--count", "-q", store=store).out == (
         f"{len(logs.store.topic('right/pose').in_recording('b').gaps())}\n"
     )
