@@ -1,4 +1,4 @@
-"""Lists of names in messages for people."""
+"""Numbers and lists of names in messages for people."""
 
 from __future__ import annotations
 
@@ -14,3 +14,14 @@ def listed(names: Iterable[str], most: int = MOST_LISTED) -> str:
     if len(known) <= most + 1:
         return ", ".join(known) or "none"
     return f"{', '.join(known[:most])} and {len(known) - most} more"
+
+
+def counted(number: int, what: str, plural: str | None = None) -> str:
+    """`1 message`, `2 messages`."""
+    return f"{number} {what if number == 1 else plural or what + 's'}"
+
+
+def unfit(messages: int) -> str:
+    """A number of unreadable messages: `1 message does not fit its definition`."""
+    verb = "does not fit its" if messages == 1 else "do not fit their"
+    return f"{counted(messages, 'message')} {verb} definition"

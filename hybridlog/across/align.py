@@ -15,6 +15,7 @@ from hybridlog.across.match import HOWS, UNKNOWN, How, match
 from hybridlog.across.regular_times import RegularTimes
 from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, together
 from hybridlog.frames.names import free_name
+from hybridlog.query.answers.remarks import about_names, remarks
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
@@ -66,10 +67,6 @@ class Aligned:
         how: Which message of each.
         tolerance: Greatest distance in time, a duration; None for any.
         clock: The time that is compared.
-        counters: Count what the answer costs.
-
-    Attributes:
-        counters: The cost of the last answer.
 
     Raises:
         UsageError: an unknown way or clock, or a question with limit, every or reverse.
@@ -86,7 +83,6 @@ class Aligned:
         how: str,
         tolerance: DurationLike | None,
         clock: Clock,
-        counters: Counters,
     ) -> None:
         is_regular = isinstance(base, RegularTimes)
         hows = (*HOWS, *AGGREGATES) if is_regular else HOWS
@@ -94,7 +90,6 @@ class Aligned:
             raise UsageError(f"Unknown way {how!r}; choose {', '.join(hows)}.")
         if how in AGGREGATES and tolerance is not None:
             raise UsageError(f"{how} is of the messages between two rows: leave out tolerance.")
-        self.counters = counters
         self._session = session
         self._base = base
         self._others = others
@@ -105,15 +100,42 @@ class Aligned:
     def _partner(self, stream: Stream) -> _Partner | Bins:
         if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
             how: Aggregate = self._how
-            return Bins(self._session, stream, self._base, how=how, counters=self.counters)
+            return Bins(self._session, stream, self._base, how=how)
         return _Partner(
             self._session,
             stream,
             how=self._how,  # type: ignore[arg-type]
             tolerance=self._tolerance,
             clock=self._clock,
-            counters=self.counters,
         )
+
+    @property
+    def _streams(self) -> list[Stream]:
+        """The topics that are read."""
+        own = [self._base.stream] if isinstance(self._base, TopicBase) else []
+        return [*own, *self._others]
+
+    @property
+    def counters(self) -> Counters:
+        """The cost of the last answer."""
+        found = Counters()
+        for stream in self._streams:
+            found.add(stream.counters)
+        return found
+
+    def remarks(self, *names: str) -> list[str]:
+        """Sentences about the last answer, those of `Query.remarks` about each topic.
+
+        Args:
+            names: The topics as they were written; further topics may end with a short name.
+        """
+        streams = self._streams
+        topics = tuple(topic for stream in streams for topic in stream.question.topics)
+        asked = replace(streams[0].question, topics=topics)
+        found = [*about_names(self._session, asked, names)]
+        for stream in streams:
+            found += remarks(self._session, stream.question, stream.counters, (), is_empty=False)
+        return [*dict.fromkeys(found)]
 
     def __repr__(self) -> str:
         names = [name for stream in self._others for name in stream.question.topics]
@@ -124,7 +146,8 @@ class Aligned:
 
         The type of a column may differ between tables if no definition fixes it.
         """
-        self.counters.reset()
+        for stream in self._streams:
+            stream.counters.reset()
         partners = [self._partner(other) for other in self._others]
         several = len(self._session.chosen(self._base.question)) > 1
         given = False
@@ -187,11 +210,11 @@ class TopicBase:
         session: The open store.
         stream: The topic.
         clock: The time of the rows.
-        counters: Count what is read.
     """
 
-    def __init__(self, session: Session, stream: Stream, clock: Clock, counters: Counters) -> None:
-        self._reader = TopicReader(session, stream, clock, counters)
+    def __init__(self, session: Session, stream: Stream, clock: Clock) -> None:
+        self.stream = stream
+        self._reader = TopicReader(session, stream, clock)
 
     @property
     def question(self) -> Question:
@@ -224,9 +247,8 @@ class _Partner:
         how: How,
         tolerance: int | None,
         clock: Clock,
-        counters: Counters,
     ) -> None:
-        self._reader = TopicReader(session, stream, clock, counters)
+        self._reader = TopicReader(session, stream, clock)
         self._how = how
         self._tolerance = tolerance
         self._clock = clock
@@ -425,7 +447,6 @@ def side_by_side(
             f"The rows are the messages of one topic, not of {len(base.topics)}: name one of "
             f"{listed(base.topics)}."
         )
-    counters = Counters()
     chosen: Clock = clock  # type: ignore[assignment]
     taken: set[str] = set()
     streams = [
@@ -433,7 +454,7 @@ def side_by_side(
         for question in (base, *others)
         for topic in question.topics
     ]
-    rows = TopicBase(session, streams[0], chosen, counters)
+    rows = TopicBase(session, streams[0], chosen)
     return Aligned(
         session,
         rows,
@@ -441,7 +462,6 @@ def side_by_side(
         how=how,
         tolerance=tolerance,
         clock=chosen,
-        counters=counters,
     )
 
 
@@ -467,7 +487,6 @@ def resampled(
         how=how,
         tolerance=tolerance,
         clock="log",
-        counters=Counters(),
     )
 
 

@@ -39,7 +39,6 @@ class Bins:
         stream: The topic.
         grid: The times.
         how: What is asked of the messages of a bin.
-        counters: Count what is read.
 
     Raises:
         UsageError: a field has no single number, or the question has limit, every or reverse.
@@ -52,16 +51,15 @@ class Bins:
         grid: RegularTimes,
         *,
         how: Aggregate,
-        counters: Counters,
     ) -> None:
         if how in _OF_NUMBERS:
             fields = _numbers_of(session, stream, how)
             stream = replace(stream, question=replace(stream.question, fields=fields))
-        self._reader = TopicReader(session, stream, "log", counters)
+        self._reader = TopicReader(session, stream, "log")
         self._session = session
         self._grid = grid
         self._how: Aggregate = how
-        self._counters = counters
+        self._counters = stream.counters
         self._none = self._reader.empty()[1] if how != _COUNT else pa.table({})
         self._recording = ""
         self._blocks: Iterator[_Block] = iter(())

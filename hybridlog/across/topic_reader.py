@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
@@ -41,10 +41,12 @@ class Stream:
     Attributes:
         question: The question about the topic.
         prefix: Beginning of its columns' names; empty for none.
+        counters: What reading it costs.
     """
 
     question: Question
     prefix: str
+    counters: Counters = field(default_factory=Counters, compare=False)
 
 
 class TopicReader:
@@ -54,10 +56,9 @@ class TopicReader:
         session: The open store.
         stream: The topic.
         clock: The clock.
-        counters: Count what is read.
     """
 
-    def __init__(self, session: Session, stream: Stream, clock: Clock, counters: Counters) -> None:
+    def __init__(self, session: Session, stream: Stream, clock: Clock) -> None:
         question = stream.question
         if not question.returns_all or question.reverse:
             raise UsageError(
@@ -66,7 +67,7 @@ class TopicReader:
             )
         self.prefix = stream.prefix
         self._session = session
-        self._counters = counters
+        self._counters = stream.counters
         known = session.field_types(question.topics, question.recordings)
         self.quaternions = quaternion_paths(known)
         self._own: str | None = None  # column that only tells the time

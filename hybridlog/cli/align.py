@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options
-from hybridlog.cli.answer_notes import print_cost, print_gaps, print_remarks, print_unreadable
+from hybridlog.cli.answer_notes import print_cost
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.output import notes
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 from hybridlog_storage.errors import TopicError, UsageError
@@ -116,11 +117,7 @@ def command(
         sys.stdout.flush()
         if not quiet:
             print_cost(aligned.counters, time.monotonic() - started, count=False)
-            print_unreadable(aligned.counters.unreadable)
-            for query, name in zip(queries, [base, *topic], strict=False):
-                print_remarks(query, [name], is_empty=False)
-            for query in queries:
-                print_gaps(query, between if clock == "log" else None)
+            notes(aligned.remarks(base, *topic))
 
 
 def _queries(store: Store, topics: Sequence[str], choice: Choice) -> list[Query]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import latched, print_gaps, print_remarks
+from hybridlog.cli.answer_notes import latched, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -96,9 +96,7 @@ def command(
         else:
             _write_directory(query, form, target, force=force, quiet=quiet)
         if not quiet:
-            if form in _EXACT:
-                print_remarks(query, topic)
-            print_gaps(query, between)
+            print_remarks(query, topic, is_empty=None if form in _EXACT else False)
 
 
 def _form(target: Path) -> str:

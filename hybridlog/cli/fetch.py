@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import (
-    print_cost,
-    print_gaps,
-    print_lost,
-    print_reduced,
-    print_remarks,
-    print_unreadable,
-)
+from hybridlog.cli.answer_notes import print_cost, print_lost, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -152,17 +145,14 @@ def command(**parameters: Any) -> None:
     path = _path(choices, form)
     started = time.monotonic()
     with opened_store(choices.store, choices.mongo, quiet=choices.quiet) as store:
-        query = asked = _query(store, choices)
-        between = choices.between if choices.clock == "log" else None
+        query = _query(store, choices)
         if choices.at is not None:
             try:
-                query = asked.at_time(choices.at)
+                query = query.at_time(choices.at)
             except TopicError:
                 if not choices.quiet:
-                    print_gaps(asked, ("start", choices.at))
+                    print_remarks(query.between("start", choices.at), (), is_empty=False)
                 raise
-            begin, _ = query.question.bounds or ("start", None)
-            between = str(begin), choices.at  # what is lost from there on may be later
         count = None
         if choices.strict:
             query.check_complete(payloads=not choices.count)
@@ -179,7 +169,6 @@ def command(**parameters: Any) -> None:
             print_remarks(query, choices.topic)
             if count is not None:
                 print_lost(query, count)
-            print_gaps(asked, between)
 
 
 def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Query:
@@ -194,15 +183,13 @@ def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Qu
         original_times=choices.original_times,
     )
     if path is None:
-        missing = write_answer(query, form, sys.stdout.buffer, front=front, quiet=True)
+        write_answer(query, form, sys.stdout.buffer, front=front, quiet=True)
     else:
         with (
             if_stopped(partial(not_written, path)),
             replacing(path, force=choices.force, is_directory=_is_directory(path, form)),
         ):
-            missing = write_answer(query, form, path, front=front, quiet=choices.quiet)
-    print_unreadable(missing)
-    print_reduced(query.counters.reduced)
+            write_answer(query, form, path, front=front, quiet=choices.quiet)
     return query
 
 

@@ -17,7 +17,7 @@ from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
-from hybridlog.losses import losses_of
+from hybridlog.losses import line_of, losses_of
 from hybridlog.wording import MOST_LISTED
 from hybridlog_storage.errors import SegmentError
 
@@ -211,7 +211,7 @@ def _print_recording(
         ("messages", str(entry.messages) if has_content else "-"),
         ("stored", held if has_content else "-"),
         *_coverage(entry, coverage.describe(entry, losses)),
-        *(("", coverage.line_of(loss)) for loss in losses),
+        *(("", line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
         *_cut("attachment", [f"{a.name} ({_content(a)})" for a in attachments]),

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.coverage import line_of
 from hybridlog.cli.live_table import closing_rows
-from hybridlog.losses import Cause
+from hybridlog.losses import Cause, line_of
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_gaps, print_remarks
+from hybridlog.cli.answer_notes import print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written
 from hybridlog.cli.query_options import asked
@@ -113,7 +113,6 @@ def command(
                 write(query, path)
         if not quiet:
             print_remarks(query, topic, is_empty=False)
-            print_gaps(query, between)
             output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[viewer].options, path.absolute()], check=False

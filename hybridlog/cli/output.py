@@ -11,12 +11,16 @@ from dataclasses import asdict, is_dataclass
 from itertools import islice, zip_longest
 from typing import TYPE_CHECKING, Literal
 
+from hybridlog import wording
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from hybridlog_storage.catalog import ChannelEntry
+
+counted = wording.counted
+unfit = wording.unfit
 
 Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
@@ -201,6 +205,12 @@ def note(text: str) -> None:
     print(printable(text), file=sys.stderr)  # noqa: T201
 
 
+def notes(lines: Iterable[str]) -> None:
+    """Lines for the person, on standard error."""
+    for line in lines:
+        note(line)
+
+
 def size(count: float) -> str:
     """Bytes for people: `12.3 MB`."""
     value = float(count)
@@ -209,11 +219,6 @@ def size(count: float) -> str:
             break
         value /= 1000
     return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-
-
-def counted(number: int, what: str, plural: str | None = None) -> str:
-    """`1 message`, `2 messages`."""
-    return f"{number} {what if number == 1 else plural or what + 's'}"
 
 
 def stored(messages: int) -> str:
@@ -225,12 +230,6 @@ def without_documents(messages: int) -> str:
     """The end of a line that names messages of topics recorded with `--no-index`, if any."""
     verb = "has" if messages == 1 else "have"
     return f"; {counted(messages, 'message')} {verb} no documents (--no-index)" if messages else ""
-
-
-def unfit(messages: int) -> str:
-    """A number of unreadable messages: `1 message does not fit its definition`."""
-    verb = "does not fit its" if messages == 1 else "do not fit their"
-    return f"{counted(messages, 'message')} {verb} definition"
 
 
 def surpluses(channels: Sequence[ChannelEntry]) -> Iterator[str]:

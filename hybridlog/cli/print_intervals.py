@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
-from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
+from hybridlog.cli.answer_notes import print_cost, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked
 
@@ -69,12 +69,7 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
         if not len(found) and not choices.count:
             output.note("No interval.")
         print_cost(query.counters, time.monotonic() - started, count=True)
-        print_left_out(query, query.counters)
         print_remarks(query, [choices.topic], is_empty=not len(found))
-        lost = query.lost()
-        if lost:
-            output.note(f"{lost.told} in this range: intervals may be others.")
-        print_gaps(query, choices.between)
 
 
 def _as_dict(row: Interval, labels: Mapping[str, str]) -> dict[str, object]:

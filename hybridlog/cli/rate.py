@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options
-from hybridlog.cli.answer_notes import print_cost, print_gaps, print_remarks
+from hybridlog.cli.answer_notes import print_cost, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
@@ -55,4 +55,3 @@ def command(
         if not quiet:
             print_cost(query.counters, time.monotonic() - started, count=True)
             print_remarks(query, topic, is_empty=False)
-            print_gaps(query, between)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options
-from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
+from hybridlog.cli.answer_notes import print_cost
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.output import notes
 from hybridlog.cli.query_options import asked
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 
@@ -75,7 +76,4 @@ def command(
         sys.stdout.flush()
         if not quiet:
             print_cost(rows.counters, time.monotonic() - started, count=False)
-            query.counters.add(rows.counters)
-            print_left_out(query, rows.counters)
-            print_remarks(query, topic, is_empty=False)
-            print_gaps(query, between)
+            notes(rows.remarks(*topic))

@@ -8,7 +8,6 @@ from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
-from hybridlog.cli.answer_notes import print_reduced, print_unreadable
 from hybridlog.frames.cells import cells
 
 if TYPE_CHECKING:
@@ -32,8 +31,7 @@ def print_answer(query: Query) -> Query:
     limit = query.question.limit
     # One more than is shown tells whether there is more.
     answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
-    rows = print_rows(answered.to_tables(), limit, answered.topics)
-    missing = answered.counters.messages - answered.counters.reduced - rows
+    print_rows(answered.to_tables(), limit, answered.topics)
     if not answered.counters.messages:
         output.note("No message.")
     if limit is None and answered.counters.messages > SCREEN_ROWS:
@@ -42,8 +40,6 @@ def print_answer(query: Query) -> Query:
             "gives all."
         )
         answered.counters.messages = SCREEN_ROWS
-    print_unreadable(missing)
-    print_reduced(answered.counters.reduced)
     return answered
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_gaps
+from hybridlog.cli.answer_notes import print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked
 from hybridlog.cli.signals import SIGNALS
@@ -96,7 +96,7 @@ def command(
         how = PlaybackOptions(port=port, speed=speed, loops=loop, is_paused=paused, origins=origins)
         server = PlaybackServer(log, name, how, output.note)
         if not quiet:
-            print_gaps(query, between)
+            print_remarks(query, topic, is_empty=False)
             _print_undefined(log)
         asyncio.run(_until_signal(server, quiet=quiet))
 

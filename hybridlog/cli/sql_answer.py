@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hybridlog.cli.coverage import gaps
-from hybridlog.cli.output import counted, note, unfit
+from hybridlog.cli.output import notes
 from hybridlog.cli.table_output import TableChoices, write_tables
 
 if TYPE_CHECKING:
@@ -30,13 +29,4 @@ def _tables(answer: SqlAnswer) -> Iterator[pa.Table]:
 
 def print_remarks(answer: SqlAnswer) -> None:
     """Print what an answer may lack."""
-    remarks = answer.remarks
-    for topic, reason in remarks.undefined.items():
-        note(f"{topic} has no columns of fields: {reason}.")
-    for topic, count in remarks.unreadable.items():
-        note(f"{topic}: {unfit(count)}; the fields are null, and error says why.")
-    for topic, count in remarks.reduced.items():
-        have = "has" if count == 1 else "have"
-        note(f"{topic}: {counted(count, 'message')} {have} no fields: reduced under pressure.")
-    for line in gaps(list(remarks.recordings.values()), remarks.topics, None):
-        note(line)
+    notes(answer.told())

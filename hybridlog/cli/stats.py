@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost, print_gaps, print_left_out, print_remarks
+from hybridlog.cli.answer_notes import print_cost, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked, parse_fields
 
@@ -71,9 +71,7 @@ def command(
         sys.stdout.flush()
         if not quiet:
             print_cost(query.counters, time.monotonic() - started, count=True)
-            print_left_out(query, query.counters)
             print_remarks(query, topic)
-            print_gaps(query, between)
 
 
 def _print(found: Sequence[FieldStatistics]) -> None:

@@ -437,7 +437,13 @@ class Query:
         found = self.at(moment)
         time = found.log_time_ns
         question = just_before(self.question, found.recording, time, time)
-        return Query(self._session, question, self.conditions)
+        # What is lost between the message and the moment may have been the current one.
+        snapshot = self._session.snapshot()
+        place = snapshot.by_id[found.recording]
+        start, end = int(snapshot.begin[place]), int(snapshot.end[place])
+        latest = max(parse_time(moment, start=start, end=end), time)
+        since = Query(self._session, replace(question, bounds=(time, latest + 1)))
+        return Query(self._session, question, (*self.conditions, since))
 
     # Answers.
 
@@ -918,8 +924,9 @@ class Query:
     def remarks(self, *names: str, is_empty: bool | None = None) -> list[str]:
         """Sentences about the last answer.
 
-        They tell how many messages the predicate could not be asked of, which topics lack its
-        fields, header stamps of another epoch, and likely causes of an empty answer.
+        They tell what it lacks: messages that could not be read or asked, those without their
+        payload, losses in its range, and recordings that go on. And topics that lack fields of
+        the predicate, header stamps of another epoch, likely causes of an empty answer.
 
         Args:
             names: The topics as they were written; further topics may end with a short name.
@@ -931,7 +938,7 @@ class Query:
             is_empty = not self.counters.messages
         found: list[str] = []
         for one in self.conditions:
-            nothing = not self.question.during
+            nothing = self.question.during is not None and not self.question.during
             found += remarks(self._session, one.question, one.counters, (), is_empty=nothing)
         found += remarks(self._session, self.question, self.counters, names, is_empty=is_empty)
         return [*dict.fromkeys(found)]

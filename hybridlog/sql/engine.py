@@ -10,6 +10,7 @@ from difflib import get_close_matches
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from hybridlog.query.question import Question
 from hybridlog.sql.content import StoreContent, current_content
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb
 from hybridlog.sql.names import TABLES
@@ -18,6 +19,7 @@ from hybridlog.sql.source import source_of
 from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
+from hybridlog.wording import counted, unfit
 from hybridlog_storage.errors import (
     HybridlogError,
     TopicError,
@@ -275,6 +277,24 @@ class SqlAnswer:
     def remarks(self) -> Remarks:
         """Messages and topics that it may lack."""
         return self._reading.remarks
+
+    def told(self) -> list[str]:
+        """What it may lack, in sentences; it has been computed."""
+        from hybridlog.query.answers.remarks import completeness
+
+        found = self.remarks
+        lines = []
+        for topic, reason in found.undefined.items():
+            lines.append(f"{topic} has no columns of fields: {reason}.")
+        for topic, count in found.unreadable.items():
+            lines.append(f"{topic}: {unfit(count)}; the fields are null, and error says why.")
+        for topic, count in found.reduced.items():
+            have = "has" if count == 1 else "have"
+            lines.append(
+                f"{topic}: {counted(count, 'message')} {have} no fields: reduced under pressure."
+            )
+        question = Question(tuple(found.topics), tuple(found.recordings))
+        return [*lines, *completeness(self._connection.engine.session, question)]
 
     def run(self) -> None:
         """Compute a statement that changes something; the answer is its result."""

@@ -89,6 +89,7 @@ def test_numbers_that_nobody_knows() -> None:
     assert Lost(1, True, 0, ()).told == "1 message is lost"
     assert Lost(1, False, 0, ()).told == "at least 1 messages are lost"
     assert unknown.told == "an unknown number of messages are lost"
+    assert Lost(0, True, 5, ()).told == "no message is lost"
 
 
 def seconds(found: Intervals) -> list[tuple[float, float, int]]:
@@ -161,4 +162,38 @@ def test_the_commands(damaged: Damaged) -> None:
     states = ("intervals", "-t", "n", "-r", "part", "--where", "v == 1", "--json")
     rows = run(*states, "--state", "not-held", store=damaged.path)
     assert [(r["begin_ns"] - BASE) // SECOND for r in rows.json] == [2, 9]
-    assert "3 messages are lost in this range" in rows.err
+    assert "this answer may not be: 3 messages lost in 3 places;" in rows.err
+
+
+def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
+    store, path = damaged.store, damaged.path
+    topic = store.topic("n").in_recording("part")
+    lack = "part is not complete, so this answer may not be: {}; `hybridlog info part` says where."
+    whole = [lack.format("3 messages lost in 3 places")]
+    for remarks, command in (
+        (lambda: topic.count() and topic.remarks(), ("fetch", "--count", "-t", "n")),
+        (lambda: topic.to_arrow() and topic.remarks(), ("fetch", "-t", "n")),
+        (lambda: topic.rate() and topic.remarks(), ("rate", "-t", "n")),
+        (lambda: topic.stats("v") and topic.remarks(), ("stats", "-t", "n", "--fields", "v")),
+        (lambda: topic.intervals() and topic.remarks(), ("intervals", "-t", "n")),
+        (topic.resample("1s").remarks, ("resample", "-t", "n", "--step", "1s")),
+        (store.align(topic, []).remarks, ("align", "--to", "n", "-t", "n")),
+    ):
+        assert remarks() == whole
+        assert whole[0] in run(*command, "-r", "part", store=path).err.splitlines()
+    answer = store.sql("select v from n where recording = 'part'")
+    answer.to_arrow()
+    assert answer.told() == whole
+    # Only what is lost in the range.
+    for begin, end, said in (
+        ("+0s", "+4s", []),
+        ("+8s", "+9s", [lack.format("1 message lost in 1 place")]),
+    ):
+        asked = topic.between(begin, end)
+        assert (asked.remarks(is_empty=False), bool(asked.lost())) == (said, bool(said))
+    # The message that was lost may have been the current one.
+    assert topic.at_time("+4.5s").remarks() == [lack.format("1 message lost in 1 place")]
+    assert topic.at_time("+4.5s").lost()
+    assert topic.at_time("+3.5s").remarks() == []
+    with pytest.raises(IncompleteError):
+        topic.at_time("+4.5s").check_complete()

@@ -11,7 +11,7 @@ import numpy as np
 from hybridlog.losses import CRASH, Cause, losses_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.ranges import RangeResolver
-from hybridlog_storage.times import END, span_of
+from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
-_EVERYTHING = np.array([[0, END]], np.int64)
+JOURNAL_LOST = "journal lost"
+"""Cause of a row for what may have been lost with a journal."""
+_EVERYTHING = np.array([[BEGIN, END]], np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,8 @@ class Lost:
     @property
     def told(self) -> str:
         """The losses in words: `4 messages are lost`."""
+        if not self:
+            return "no message is lost"
         if not self.messages:
             return "an unknown number of messages are lost"
         is_one = self.messages == 1 and self.is_exact
@@ -82,8 +86,10 @@ def lost_in(session: Session, question: Question) -> Lost:
     messages = reduced = 0
     is_exact = True
     found = []
-    for entry, row in _rows(session, question):
+    for entry, row in losses_in(session, question):
         count = row["count"]
+        if row["cause"] == Cause.THROTTLE:
+            continue  # the user wished it
         if row["cause"] == Cause.DEGRADE:
             reduced += count or 0
             continue
@@ -96,18 +102,22 @@ def lost_in(session: Session, question: Question) -> Lost:
 def lost_times(session: Session, question: Question) -> Intervals:
     """Log time in which messages were lost, cut to nothing; ends are included."""
     parts = []
-    for entry, row in _rows(session, question):
-        if row["cause"] == Cause.DEGRADE:
+    for entry, row in losses_in(session, question):
+        if row["cause"] in {Cause.DEGRADE, Cause.THROTTLE}:
             continue
-        low, end = span_of(*(_span_of(entry, row) or (0, END)))
+        low, end = span_of(*(_span_of(entry, row) or (BEGIN, END)))
         parts.append((entry.id, np.array([[low, end, 0]], np.int64)))
     return Intervals.of(parts)
 
 
-def _rows(
+def losses_in(
     session: Session, question: Question
 ) -> Iterator[tuple[RecordingEntry, Mapping[str, Any]]]:
-    """Rows of the ledger about topics and times of a question, not those a user wished for."""
+    """Rows of the ledger about topics and times of a question, those of a recording together.
+
+    Raises:
+        TimeError: the range is empty, or outside all recordings.
+    """
     doubtful = {entry.id: entry for entry in session.doubtful(question)}
     if not doubtful:
         return
@@ -117,7 +127,7 @@ def _rows(
             continue
         asked = _asked(bounds if question.clock == "log" else None, windows)
         for row in _ledger(entry):
-            if row["cause"] == Cause.THROTTLE or row["count"] == 0:
+            if row["count"] == 0:
                 continue
             if row.get("topic") is not None and row["topic"] not in question.topics:
                 continue
@@ -135,7 +145,7 @@ def _asked(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np
 
 def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
     """The loss ledger of a recording, with a row for what a lost journal leaves open."""
-    unproven = {"cause": "journal lost", "count": None, "topic": None}
+    unproven = {"cause": JOURNAL_LOST, "count": None, "topic": None}
     return losses_of(entry) + [unproven] * (entry.status == "unproven")
 
 

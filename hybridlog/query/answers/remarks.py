@@ -1,14 +1,18 @@
-"""Remarks on an answer: messages that a predicate could not see, likely causes of no answer."""
+"""Remarks on an answer: messages that it lacks, and likely causes of an empty one."""
 
 from __future__ import annotations
 
 import difflib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
+from itertools import groupby, islice
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.losses import Cause, in_words, line_of
+from hybridlog.query.answers.lost import JOURNAL_LOST, losses_in
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
@@ -16,12 +20,13 @@ from hybridlog.query.question import field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time
 from hybridlog.query.topics import namesakes
-from hybridlog.wording import listed
-from hybridlog_storage.errors import TimeError
+from hybridlog.wording import counted, listed, unfit
+from hybridlog_storage.errors import HybridlogError, TimeError
 
 if TYPE_CHECKING:
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
 
 _MOST = 100  # recordings looked at
 _SHOWN = 5  # names in a remark
@@ -45,38 +50,89 @@ def remarks(
         names: The topics as they were written.
         is_empty: The answer has no messages or intervals.
     """
-    asks_fields = question.predicate is not None and question.predicate.asks_fields
-    if question.predicate is not None and asks_fields and counters.unreadable:
-        yield _unasked(counters.unreadable, is_opaque=question.predicate.is_opaque)
-    for name in names:
-        yield from _about_name(session, question, name)
+    if counters.unreadable:
+        yield _unreadable(counters.unreadable, question)
+    if counters.reduced:
+        has = "has" if counters.reduced == 1 else "have"
+        yield (
+            f"{counted(counters.reduced, 'message')} {has} no payload, which was dropped under "
+            "pressure: not in this answer; --where and --fields find the fields."
+        )
+    yield from about_names(session, question, names)
     if question.clock == "header" and question.bounds is not None:
         yield from _about_stamps(session, question)
     yield from _missing_fields(session, question, is_empty=is_empty)
     if is_empty and question.limit != 0:
         yield from _causes(session, question)
+    yield from completeness(session, question)
 
 
-def _unasked(messages: int, *, is_opaque: bool) -> str:
-    one = messages == 1
-    subject = "1 message" if one else f"{messages} messages"
-    if is_opaque:
-        # Only documents were asked.
-        return f"{subject} could not be asked: {'it has' if one else 'they have'} no fields there."
-    fit = "it does not fit its" if one else "they do not fit their"
-    return f"{subject} could not be asked: {fit} definition, or {'has' if one else 'have'} none."
+def completeness(session: Session, question: Question) -> Iterator[str]:
+    """Sentences about what the recordings of a question may lack in its range."""
+    for entry in session.doubtful(question):
+        if entry.status == "open":
+            yield from _about_running(session, entry)
+    with suppress(TimeError):  # nothing is in the range
+        for entry, rows in groupby(losses_in(session, question), itemgetter(0)):
+            yield from _about_losses(entry.label, [row for _, row in rows])
 
 
-def _about_name(session: Session, question: Question, name: str) -> Iterator[str]:
+def _about_running(session: Session, entry: RecordingEntry) -> Iterator[str]:
+    from hybridlog.live.control_server import request
+
+    yield f"{entry.label} is still being recorded; later messages are not in this answer."
+    try:
+        messages = request(session.directory.path, entry.label, "state").get("lag")
+    except HybridlogError:  # it has just ended, or belongs to another user
+        return
+    if isinstance(messages, int) and messages:
+        are = "is" if messages == 1 else "are"
+        yield f"{entry.label}: {counted(messages, 'recorded message')} {are} not indexed yet."
+
+
+def _about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    if any(row["cause"] == JOURNAL_LOST for row in rows):
+        yield f"{label} has lost its journal, so this answer may not be complete."
+    for row in rows:
+        if row["cause"] == Cause.THROTTLE:
+            yield f"{label}: {line_of(row)} while it was recorded."
+    others = {JOURNAL_LOST, Cause.THROTTLE, Cause.DEGRADE}
+    lost = [row for row in rows if row["cause"] not in others]
+    if lost:
+        yield (
+            f"{label} is not complete, so this answer may not be: {in_words(lost)}; "
+            f"`hybridlog info {label}` says where."
+        )
+
+
+def _unreadable(messages: int, question: Question) -> str:
+    """A number of messages whose fields could not be read."""
+    one, predicate = messages == 1, question.predicate
+    if predicate is None or not predicate.asks_fields:
+        return (
+            f"{unfit(messages)} and {'is' if one else 'are'} not in this answer; --format raw, "
+            "mcap or bag gives the payloads."
+        )
+    if predicate.is_opaque:  # only documents were asked
+        why = "it has no fields there" if one else "they have no fields there"
+    elif one:
+        why = "it does not fit its definition, or has none"
+    else:
+        why = "they do not fit their definition, or have none"
+    return f"{counted(messages, 'message')} could not be asked: {why}."
+
+
+def about_names(session: Session, question: Question, names: Sequence[str]) -> Iterator[str]:
     """Further topics that end with a short name, in the recordings of the question."""
-    others = namesakes(name, session.topics())
-    if others:
-        snapshot = session.snapshot()
-        places = set(session.chosen(question).tolist())
-        others = [t for t in others if not places.isdisjoint(snapshot.having([t]).tolist())]
-    others = [topic for topic in others if topic not in question.topics]
-    if others:
-        yield f"{name!r} is the whole name of a topic; not asked: {listed(others, _SHOWN)}."
+    for name in names:
+        others = namesakes(name, session.topics())
+        if others:
+            snapshot = session.snapshot()
+            places = set(session.chosen(question).tolist())
+            others = [t for t in others if not places.isdisjoint(snapshot.having([t]).tolist())]
+        others = [topic for topic in others if topic not in question.topics]
+        if others:
+            yield f"{name!r} is the whole name of a topic; not asked: {listed(others, _SHOWN)}."
 
 
 def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hybridlog.drawing.matches import Matches
-    from hybridlog.sql.engine import SqlAnswer
     from hybridlog.sql.topic_view import Remarks
     from hybridlog.view.asked import Asked
     from hybridlog.view.question import PageQuestion
@@ -61,15 +60,10 @@ def ask(context: Context, asked: Asked) -> dict[str, Any]:
     query = question.query()
     count = query.count()
     lost = query.lost()
-    remarks = query.remarks(*query.topics)
-    if question.recording.status == "open":
-        remarks.append(
-            f"{question.recording.label} is being recorded; the latest messages may be missing."
-        )
     return {
         "count": count,
         "lost": lost.describe(count) if lost else None,
-        "remarks": remarks,
+        "remarks": query.remarks(*query.topics),
         "python": question.python(),
         "command": question.command(),
     }
@@ -174,7 +168,7 @@ def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, A
             )
             return found | {
                 "more": is_cut,
-                "remarks": _remarks(context, answer),
+                "remarks": answer.told(),
                 "python": program(context.store, body),
             }
         finally:
@@ -234,27 +228,6 @@ def _sql_turn(stopped: threading.Event) -> Iterator[None]:
         yield
     finally:
         _sql_turns.release()
-
-
-def _remarks(context: Context, answer: SqlAnswer) -> list[str]:
-    """Remarks about values that an answer lacks."""
-    remarks = answer.remarks
-    found = [
-        f"{topic} has no columns of fields: {why}." for topic, why in remarks.undefined.items()
-    ]
-    for state, counts in (("unreadable", remarks.unreadable), ("reduced", remarks.reduced)):
-        found += [
-            f"Fields of {count} {state} messages of {topic} are null."
-            for topic, count in counts.items()
-        ]
-    # Topics of a running recording that are in no sealed segment yet have no losses either.
-    entries = remarks.recordings.values()
-    topics = remarks.topics & {one.topic for entry in entries for one in entry.channels}
-    if topics:
-        lost = context.store.query(sorted(topics), [*remarks.recordings]).lost()
-        if lost:
-            found.append(f"Of what was read, {lost.told}; the table losses says where.")
-    return found
 
 
 routes = [
