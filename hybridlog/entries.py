@@ -212,9 +212,10 @@ def _whole_digest(summary: SegmentSummary) -> str:
 
 
 def _is_listed(inventory: Inventory, state: JournalState, number: int) -> bool:
-    """True if the journal lists a valid segment as its file is now."""
-    stored = inventory.stored.get(number)
-    return number in state.sealed and (stored is None or stored in state.thinned.get(number, ()))
+    """True if the journal lists a valid segment as its file is now, and what that needs."""
+    files = (inventory.summaries[number].compacted or {}).get("files", ())
+    is_thinned = inventory.stored.get(number) in (None, *state.thinned.get(number, ()))
+    return number in state.sealed and is_thinned and {f.file for f in files} <= {*state.payloads}
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:

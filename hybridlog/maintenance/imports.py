@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.journal import JournalState
+    from hybridlog_storage.journal import PayloadFile
 
 _PIECE = 8 << 20  # bytes copied at once
 
@@ -122,17 +123,32 @@ def _import_one(
                 f"Another process is importing {entry.label!r}. Wait until it is done."
             )
         clear_away(target, hidden)
+        # An interrupted import may have copied what the source does not list any more.
+        for number, name in target.listing(hidden).sealed.items():
+            if number not in inventory.summaries:
+                files.unlink(path / name)
         _copy_segments(source, path, inventory, report, progress)
-        if inventory.state is not None:
-            _copy_payloads(source.recording(inventory.label), path, inventory.state, report)
-        data = files.read_file(source.recording(entry.label) / JOURNAL, journal.MAX_JOURNAL)
-        whole = data[: data.rfind(b"\n") + 1]
-        durability.write_new(path / JOURNAL, whole, depth=files.IN_RECORDING)
+        _copy_payloads(source.recording(inventory.label), path, inventory, report)
+        durability.write_new(path / JOURNAL, _journal(source, inventory), depth=files.IN_RECORDING)
         Journal(path).append(journal.event(journal.ADOPTED, store=target.settings.store_id))
         with target.alone():
             label = target.free_label(entry.label)
             target.move(hidden, label)
     return label
+
+
+def _journal(source: StoreDirectory, inventory: Inventory) -> bytes:
+    """The lines of a journal by which the copies were checked.
+
+    Raises:
+        StoreError: They have changed since.
+    """
+    path, state = source.recording(inventory.label) / JOURNAL, inventory.state
+    assert state is not None  # it is proven
+    data = files.read_file(path, journal.MAX_JOURNAL)[: state.length]
+    if replace(journal.parse(data), torn=state.torn) != state:
+        raise StoreError(f"{path} has changed meanwhile. Run the import again.")
+    return data
 
 
 def _copy_segments(
@@ -146,76 +162,95 @@ def _copy_segments(
     done = 0
     for number, summary in inventory.summaries.items():
         name = inventory.listing.sealed[number]
+        file = source.recording(inventory.label) / name
         digest, size = inventory.stored_file(number)
-        if not _is_there(path / name, digest, size):
-            _copy(source.recording(inventory.label) / name, path / name)
-            report.bytes_copied += summary.size
-            if not _is_there(path / name, digest, size):
-                raise StoreError(
-                    f"{source.recording(inventory.label) / name} is damaged: what was copied "
-                    "does not match its checksums. `hybridlog verify` shows where."
-                )
+        is_whole = partial(_is_segment, path / name, digest, size)
+        report.bytes_copied += _bring(file, path / name, size, is_whole)
         done += summary.size
         if progress is not None:
             progress(inventory.label, done, total)
 
 
-def _copy_payloads(source: Path, path: Path, state: JournalState, report: ImportReport) -> None:
-    """Copy the columns of payloads that the journal lists, and nothing else.
+def _copy_payloads(source: Path, path: Path, inventory: Inventory, report: ImportReport) -> None:
+    """Copy the columns of payloads that journal and segments list, and nothing else.
 
     Raises:
         StoreError: A file is damaged.
     """
-    listed = state.payloads
-    if not listed:
-        return
-    from hybridlog.payloads.reader import PayloadReader
-
+    folder, listed = path / PAYLOADS, inventory.payloads
     try:
         for name in payload_names(path):
             if name not in listed:  # an import was interrupted
-                files.unlink(path / PAYLOADS / name, depth=IN_PAYLOADS)
+                files.unlink(folder / name, depth=IN_PAYLOADS)
         for file in listed.values():
-            target = path / PAYLOADS / file.file
+            target = folder / file.file
             files.make_folders(target.parent, depth=IN_PAYLOADS - 1)
-            if not _is_file(target):
-                _copy(source / PAYLOADS / file.file, target, depth=IN_PAYLOADS)
-                report.bytes_copied += file.bytes
-            PayloadReader(path / PAYLOADS, file).check()
+            is_whole = partial(_is_payload_file, folder, file)
+            report.bytes_copied += _bring(
+                source / PAYLOADS / file.file, target, file.bytes, is_whole, depth=IN_PAYLOADS
+            )
             files.sync_folder(target.parent, depth=IN_PAYLOADS - 1)
-        files.sync_folder(path / PAYLOADS)
+        if listed:
+            files.sync_folder(folder)
     except OSError as error:
-        raise durability.explain(error, path / PAYLOADS, "importing into") from error
+        raise durability.explain(error, folder, "importing into") from error
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        files.status(path, depth=IN_PAYLOADS)
-    except FileNotFoundError:
-        return False
-    return True
+def _bring(
+    source: Path,
+    target: Path,
+    size: int,
+    is_whole: Callable[[], bool],
+    *,
+    depth: int = files.IN_RECORDING,
+) -> int:
+    """Copy a file unless the copy is there and whole; return the number of bytes copied.
+
+    Raises:
+        StoreError: The source is damaged or cannot be read.
+        DiskFullError: There is no room.
+    """
+    if is_whole():
+        return 0
+    _copy(source, target, size, depth=depth)
+    if not is_whole():
+        raise StoreError(
+            f"{source} is damaged: what was copied does not match its checksums. "
+            "`hybridlog verify` shows where."
+        )
+    return size
 
 
-def _is_there(path: Path, digest: str, size: int) -> bool:
-    """True if a copy is complete, byte for byte."""
+def _is_segment(path: Path, digest: str, size: int) -> bool:
+    """True if a copy of a segment is complete, byte for byte."""
     try:
         with SegmentCheck(path) as check:
-            if check.summary is None or (check.summary.digest, check.summary.size) != (
-                digest,
-                size,
-            ):
+            found = check.summary
+            if found is None or (found.digest, found.size) != (digest, size):
                 return False
             return not any(True for _ in check.problems())
     except SegmentError:
         return False
 
 
-def _copy(source: Path, target: Path, *, depth: int = files.IN_RECORDING) -> None:
-    """Copy a file, which gets its name when it is complete and on the disk.
+def _is_payload_file(folder: Path, file: PayloadFile) -> bool:
+    """True if a copy of a file of columns is complete, byte for byte."""
+    from hybridlog.payloads.reader import PayloadReader
+
+    try:
+        PayloadReader(folder, file).check()
+    except StoreError:
+        return False
+    return True
+
+
+def _copy(source: Path, target: Path, size: int, *, depth: int) -> None:
+    """Copy the first bytes of a file; the copy gets its name when it is on the disk.
 
     Args:
         source: The file.
         target: Its copy.
+        size: Number of bytes; fewer if the file is shorter.
         depth: Parts of both paths that lie inside their stores.
 
     Raises:
@@ -228,7 +263,7 @@ def _copy(source: Path, target: Path, *, depth: int = files.IN_RECORDING) -> Non
         raise durability.explain(error, source, "reading") from error
     try:
         with durability.new_file(target, depth=depth) as out:
-            while piece := os.read(fd, _PIECE):
-                durability.write_all(out, [piece])
+            while piece := os.read(fd, min(size, _PIECE)):
+                size -= durability.write_all(out, [piece])
     finally:
         os.close(fd)

@@ -1,0 +1,129 @@
+"""`import` of recordings with columns: what is listed, and nothing else; again after a mending."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance import imports
+from hybridlog_storage import journal
+from hybridlog_storage.errors import StoreError
+from hybridlog_storage.journal import Journal
+from tests.payloads.logs import messages, recording_of
+
+NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
+
+
+@pytest.fixture(scope="module")
+def thin(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store whose scans and clouds are in columns alone."""
+    path = tmp_path_factory.mktemp("thin") / "store"
+    shutil.copytree(plain, path)
+    with hl.open(path, mongo=NOWHERE) as store:
+        store.compact(drop_mcap=True)
+    return path
+
+
+@pytest.fixture
+def source(thin: Path, tmp_path: Path) -> Path:
+    shutil.copytree(thin, tmp_path / "source")
+    return tmp_path / "source"
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "mine", mongo=NOWHERE, create=True) as store:
+        yield store
+
+
+def files_of(store: Path) -> dict[str, int]:
+    """Sizes of the segments and columns of the recording."""
+    recording = recording_of(store)
+    found = [*recording.glob("*.mcap"), *recording.glob("payloads/*/*")]
+    return {str(path.relative_to(recording)): path.stat().st_size for path in found}
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+@pytest.mark.parametrize("fault", [flip, cut, Path.unlink])
+@pytest.mark.parametrize("name", ["payloads/topic=cloud/*", "payloads/topic=scan/*", "000001.mcap"])
+def test_a_source_that_was_mended_is_imported(
+    source: Path, mine: hl.Store, thin: Path, name: str, fault: Callable[[Path], None]
+) -> None:
+    (path,) = recording_of(source).glob(name)
+    whole = path.read_bytes()
+    fault(path)
+    for _ in range(2):
+        with pytest.raises(StoreError, match=r"damaged|incomplete|[Nn]o such file"):
+            mine.import_from(source)
+        assert not mine.recordings()
+    path.write_bytes(whole)
+    assert mine.import_from(source).imported == ["log"]
+    assert mine.recordings()[0].status == "complete"
+    assert files_of(mine.directory.path) == files_of(thin)
+    with hl.open(thin, mongo=NOWHERE) as store:
+        assert messages(mine) == messages(store)
+
+
+def test_only_what_is_listed_is_copied(source: Path, mine: hl.Store, thin: Path) -> None:
+    recording = recording_of(source)
+    (columns,) = recording.glob("payloads/topic=scan/*")
+    for name in ("secret", "000000.mcap.old", "payloads/loose", "payloads/topic=scan/more.parquet"):
+        (recording / name).write_bytes(b"not listed")
+    (recording / "payloads" / "topic=other").mkdir()
+    (recording / "payloads" / "topic=other" / "link").symlink_to("/etc/passwd")
+    with columns.open("ab") as file:
+        file.write(b"behind its end" * 1000)
+    report = mine.import_from(source)
+    assert report.imported == ["log"]
+    assert report.bytes_copied == sum(files_of(thin).values())
+    assert files_of(mine.directory.path) == files_of(thin)
+    names = {path.name for path in recording_of(mine.directory.path).iterdir()}
+    segments = {name for name in files_of(thin) if name.endswith(".mcap")}
+    assert names == {"journal", "payloads", "writer.lock", *segments}
+    assert mine.recordings()[0].status == "complete"
+    assert not mine.verify().findings
+
+
+def test_what_an_earlier_import_left_is_checked(source: Path, mine: hl.Store, thin: Path) -> None:
+    with hl.open(source, mongo=NOWHERE) as store:
+        hidden = mine.directory.recording(f".importing-{store.recordings()[0].id}")
+    shutil.copytree(recording_of(source), hidden)
+    shutil.copy(hidden / "000000.mcap", hidden / "000077.mcap")
+    (hidden / "payloads" / "topic=scan" / "stale.parquet").write_bytes(b"stale")
+    for path in hidden.glob("payloads/topic=cloud/*"):
+        flip(path)
+    cut(hidden / "000001.mcap")
+    mine.import_from(source)
+    assert files_of(mine.directory.path) == files_of(thin)
+    assert mine.recordings()[0].status == "complete"
+    assert not mine.verify().findings
+
+
+def test_a_source_that_changes_meanwhile_is_refused(
+    source: Path, mine: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = imports._copy_payloads
+
+    def changed(place: Path, *rest: object) -> None:
+        lines = [line for _, line in journal.read_lines((place / "journal").read_bytes()) if line]
+        Journal(place).replace([*lines[:-1], {**lines[-1], "event": "noted", "text": "x"}])
+        copy(place, *rest)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(imports, "_copy_payloads", changed)
+        with pytest.raises(StoreError, match="changed meanwhile"):
+            mine.import_from(source)
+    assert not mine.recordings()
