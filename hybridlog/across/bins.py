@@ -14,6 +14,7 @@ from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import FieldTypes
+from hybridlog.schema.summary import Totals
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import placed
@@ -221,7 +222,8 @@ class _Column:
     def __init__(self, how: Aggregate, size: int) -> None:
         self._how = how
         self._count = np.zeros(size, np.int64)
-        self._value: NDArray[Any] = np.zeros(size, np.float64 if how == "mean" else np.uint8)
+        self._totals = Totals(size if how == "mean" else 0)
+        self._value: NDArray[Any] = np.zeros(size, np.uint8)
         self._kind: Any = None
 
     def add(
@@ -246,8 +248,7 @@ class _Column:
         begins = run_starts(row)
         bins = row[begins]
         if self._how == "mean":
-            with np.errstate(over="ignore"):
-                self._value[bins] += np.add.reduceat(chosen.astype(np.float64), begins)
+            self._totals.add(chosen.astype(np.float64), begins, bins)
         else:
             choose = np.minimum if self._how == "min" else np.maximum
             found = choose.reduceat(chosen, begins).astype(self._value.dtype)
@@ -259,7 +260,7 @@ class _Column:
         """The aggregate of each bin; null without any value."""
         missing = self._count == 0
         if self._how == "mean":
-            return pa.array(self._value / np.maximum(self._count, 1), mask=missing)
+            return pa.array(self._totals.means(self._count), mask=missing)
         return pa.array(self._value, mask=missing).cast(self._kind)
 
 

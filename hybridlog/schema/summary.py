@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 _LONG = 4096  # elements of a row from which a loop over rows is faster
 _BLOCK = 16384
 _TABLE = 65536  # elements of equally long rows summed at once, limited by the cache
+_LARGE = 2.0**900  # smaller doubles do not overflow when they are added
 _LANES = 256  # number of 8-bit values that fit into a 16-bit sum, or 16-bit values into 32 bits
 
 
@@ -37,6 +38,42 @@ class Summary:
     max: NDArray[Any]
     mean: NDArray[np.float64]
     has: NDArray[np.bool_]
+
+
+class Totals:
+    """Sums of finite doubles at some places. They do not overflow, so each has a mean.
+
+    Args:
+        size: Number of places.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._sums, self._large = np.zeros((2, size), np.float64)
+
+    def add(
+        self, values: NDArray[np.float64], begins: NDArray[np.intp], places: NDArray[np.intp]
+    ) -> None:
+        """Add the sums of runs of values.
+
+        Args:
+            values: The values, run after run.
+            begins: Where each run begins.
+            places: The place of each run, each once.
+        """
+        is_large = np.abs(values) >= _LARGE
+        if is_large.any():
+            large = np.where(is_large, values, 0.0) / _LARGE
+            self._large[places] += np.add.reduceat(large, begins)
+            values = np.where(is_large, 0.0, values)
+        self._sums[places] += np.add.reduceat(values, begins)
+
+    def means(self, counts: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The sums divided by these numbers of values; by 1 instead of 0."""
+        counts = np.maximum(counts, 1)
+        most = np.finfo(np.float64).max
+        with np.errstate(over="ignore"):  # all are the greatest, and their mean is rounded up
+            large = np.clip(self._large / counts * _LARGE, -most, most)
+            return np.clip(self._sums / counts + large, -most, most)
 
 
 def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
@@ -135,10 +172,10 @@ def _floats(
         high[has] = np.maximum.reduceat(elements, begin) + elements.dtype.type(0)
         wide = elements.astype(np.float64, copy=False)
         mean[has] = np.add.reduceat(wide, begin) / kept[has] + 0.0
-        for row in np.flatnonzero(~np.isfinite(mean)):
-            # The sum overflows a double, the mean cannot.
-            part = wide[offset[row] : offset[row + 1]]
-            mean[row] = np.clip(np.add.reduce(part / kept[row]), low[row], high[row])
+        if not np.isfinite(mean).all():
+            total = Totals(len(begin))
+            total.add(wide, begin, np.arange(len(begin)))
+            mean[has] = np.where(np.isfinite(mean[has]), mean[has], total.means(kept[has]))
     return Summary(counts, low, high, mean, has)
 
 

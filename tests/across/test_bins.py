@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import random
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -174,3 +175,28 @@ def test_the_command(logs: Logs) -> None:
     want = logs.store.topic("*/pose").fields("ticks").resample("200ms", how="max").to_arrow()
     assert [row["left/pose.ticks"] for row in lines] == want["left/pose.ticks"].to_pylist()
     assert [row["right/pose.count"] for row in lines] == want["right/pose.count"].to_pylist()
+
+
+def test_means_of_large_doubles(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    values = [1.7e308, 1.7e308, 1.6e308, 1e308, -1e308, 3.0, 1.5, 2.5]
+    with log.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros1")
+        schema = writer.register_schema("demo/Large", "ros1msg", b"float64 v\nfloat64[] a")
+        channel = writer.register_channel("/n", "ros1", schema)
+        for n, value in enumerate(values):
+            data = struct.pack("<dIdd", value, 2, value, 1.75e308)
+            writer.add_message(channel, BASE + n * MS, data, BASE)
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(log)
+        query = store.topic("/n")
+        found = query.resample("3ms", how="mean").to_arrow()["v"].to_pylist()
+        assert found == pytest.approx([1.7e308 / 3 * 2 + 1.6e308 / 3, 1.0, 2.0])
+        (v,) = query.stats("v")
+        assert v.mean == pytest.approx(1.7e308 / 4 + 1.6e308 / 8)
+        assert v.std == pytest.approx(float(np.std(np.array(values) / 1e200, ddof=1)) * 1e200)
+        means = query.fields("a.mean").to_arrow()["a.mean"].to_pylist()
+        assert means == pytest.approx([value / 2 + 1.75e308 / 2 for value in values])
+        assert query.where("a.mean > 1.7e308").count() == 2

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import statistics
+import sys
 from collections.abc import Iterator
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
@@ -318,3 +322,36 @@ def test_the_commands(logs: Logs) -> None:
         "mean",
         "std",
     ]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(
+        st.lists(
+            st.floats(allow_nan=False, allow_infinity=False)
+            | st.sampled_from([1.7e308, -1.7e308, 1e300, 5e-324, 0.0]),
+            min_size=1,
+            max_size=4,
+        ),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_means_and_deviations_do_not_overflow(blocks: list[list[float]]) -> None:
+    running = _Running()
+    for block in blocks:
+        running.add(pa.chunked_array([pa.array(block)]))
+    found = running.result("/n", "v")
+    exact = [Fraction(value) for block in blocks for value in block]
+    mean = sum(exact) / len(exact)
+    near = max(map(abs, exact)) / 10**12 + Fraction(5e-323)
+    assert found.mean is not None
+    assert abs(Fraction(found.mean) - mean) <= near
+    if len(exact) > 1:
+        squares = sum((value - mean) ** 2 for value in exact) / (len(exact) - 1)
+        assert found.std is not None
+        if squares < Fraction(sys.float_info.max) ** 2:
+            assert math.isfinite(found.std)
+            assert abs(Fraction(found.std) ** 2 - squares) <= near * max(map(abs, exact)) * 10**4
+        else:
+            assert math.isinf(found.std)

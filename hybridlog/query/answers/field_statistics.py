@@ -12,6 +12,7 @@ import numpy as np
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.schema.summary import Totals
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ class _Running:
         self.count = self.nan = self.infinite = 0
         self.least: int | float | None = None
         self.most: int | float | None = None
-        self._mean = self._squares = 0.0
+        self._total = Totals(1)
+        self._squares, self._exponent = 0.0, -1074  # squares of numbers divided by 2**exponent
 
     def add(self, column: pa.ChunkedArray[Any]) -> None:
         values = column.drop_null().to_numpy()
@@ -76,17 +78,30 @@ class _Running:
         low, high = values.min().item(), values.max().item()
         self.least = low if self.least is None else min(self.least, low)
         self.most = high if self.most is None else max(self.most, high)
-        numbers = values.astype(np.float64)
-        count = len(numbers)
-        with np.errstate(invalid="ignore", over="ignore"):
-            mean = float(numbers.mean())
-            squares = float(np.square(numbers - mean).sum())
-            total = self.count + count
-            step = mean - self._mean if self.count else 0.0
-            self._mean = self._mean if self.count else mean
-            self._mean += step * count / total
-            self._squares += squares + step * step * self.count * count / total
-        self.count = total
+        numbers, count = values.astype(np.float64), len(values)
+        before, own, first = self._mean, Totals(1), np.zeros(1, np.intp)
+        for totals in (own, self._total):
+            totals.add(numbers, first, first)
+        mean = float(own.means(np.array([count]))[0])
+        size = max(abs(low), abs(high))
+        exponent = max(math.frexp(size)[1] if size else self._exponent, self._exponent)
+        self._squares = math.ldexp(self._squares, 2 * (self._exponent - exponent))
+        self._exponent = exponent
+        self._squares += float(
+            np.square(np.ldexp(numbers, -exponent) - math.ldexp(mean, -exponent)).sum()
+        )
+        step = math.ldexp(mean, -exponent) - math.ldexp(before, -exponent)
+        self._squares += step * step * self.count * count / (self.count + count)
+        self.count += count
+
+    @property
+    def _std(self) -> float:
+        with np.errstate(over="ignore"):  # it may be greater than the greatest double
+            return float(np.ldexp(math.sqrt(self._squares / (self.count - 1)), self._exponent))
+
+    @property
+    def _mean(self) -> float:
+        return float(self._total.means(np.array([self.count]))[0])
 
     def result(self, topic: str, field: str) -> FieldStatistics:
         few = self.count < 2
@@ -99,7 +114,7 @@ class _Running:
             self.least,
             self.most,
             self._mean if self.count else None,
-            None if few else math.sqrt(self._squares / (self.count - 1)),
+            None if few else self._std,
         )
 
 
