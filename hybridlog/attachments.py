@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.open_segment import Flushed
     from hybridlog_storage.segment_reader import SegmentSummary
 
 
@@ -191,9 +192,12 @@ def _metadata_records(
                 yield partial(_read, session, entry.id, number, summary.table, index)
 
 
-def _summaries(session: Session, entry: RecordingEntry) -> Iterator[tuple[int, SegmentSummary]]:
+def _summaries(
+    session: Session, entry: RecordingEntry
+) -> Iterator[tuple[int, SegmentSummary | Flushed]]:
     for number in sorted(map(int, entry.digests)):
         yield number, session.segment(entry.id, number).summary()
+    yield from sorted(entry.flushed.items())
 
 
 def _open(

@@ -64,6 +64,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
             raise _NothingLeftError("The store is empty: `hybridlog record FILE` fills it.")
         if choice.name:
             choosing.by_name(choice.name)
+        choosing.look()
         for key, value in choice.tag:
             choosing.by_tag(key, value)
         for topic in choice.has:
@@ -111,6 +112,12 @@ class _Choosing:
         self._snapshot = session.snapshot()
         self.places = np.arange(len(self._snapshot), dtype=np.intp)
         self.conditions: list[str] = []
+
+    def look(self) -> None:
+        """See what those that go on have flushed."""
+        ids = [self._snapshot.summaries[place].id for place in self.places.tolist()]
+        self._snapshot = self._session.look(ids)
+        self.places = np.sort(np.array([self._snapshot.by_id[one] for one in ids], np.intp))
 
     def _keep(self, places: Collection[int] | NDArray[np.intp], condition: str) -> bool:
         """Keep those at some positions; true if any is left."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, overload
 
+import numpy as np
+
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.topics import resolve
@@ -102,9 +104,10 @@ class Recordings(Sequence["RecordingEntry"]):
 
     def topics(self) -> list[str]:
         """Names of their topics, sorted; includes those whose messages are all lost."""
-        snapshot = self._session.snapshot()
-        sets = {summary.topics: summary for summary in self.summaries}
-        return sorted({name for summary in sets.values() for name in snapshot.topics_of(summary)})
+        ids = [summary.id for summary in self.summaries]
+        snapshot = self._session.look(ids)
+        places = (snapshot.by_id.get(recording) for recording in ids)
+        return snapshot.topics_at(np.array([p for p in places if p is not None], np.intp))
 
     def topic(self, *names: str) -> Query:
         """Make a query about topics of these recordings.

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from collections.abc import (
+    Callable,
+    Collection,
+    Generator,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from contextlib import closing, contextmanager, suppress
+from functools import lru_cache, partial, wraps
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
 from hybridlog.connection import Connection
-from hybridlog.entries import channels_of, take_inventory
+from hybridlog.entries import channels_of, summary_of, take_inventory
 from hybridlog.maintenance.opening import (
     current_entry,
     open_catalog,
@@ -25,6 +33,7 @@ from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
+from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import listed
 from hybridlog_storage import files
 from hybridlog_storage.catalog import ChannelStats
@@ -53,6 +62,7 @@ if TYPE_CHECKING:
     from hybridlog.payloads.reader import PayloadReader
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
+    from hybridlog.running import RunningRecording
     from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
@@ -66,12 +76,70 @@ _MAX_OPEN_SEGMENTS = 256
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
 _TRIES = 5  # to connect, while the connection breaks
 _PAUSE_S = 0.1  # before the second try; doubles each time
+_LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
+_LOOK_SHARE = 0.1  # but for this share of it,
+_MAX_BETWEEN_LOOKS_S = 1.0  # and at least so often
 _REST_S = 10.0
 """Seconds after a failure in which questions do not try to connect again."""
 
 
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+_Owner = TypeVar("_Owner", bound="HasSession")
+
+
+class HasSession(Protocol):
+    """Something that asks an open store."""
+
+    @property
+    def session(self) -> Session:
+        """The open store."""
+
+
+def of_one_moment(
+    work: Callable[Concatenate[_Owner, _P], _T],
+) -> Callable[Concatenate[_Owner, _P], _T]:
+    """Let a method see the recordings of one moment, see `Session.at_one_moment`.
+
+    Files that were sealed, rewritten or removed meanwhile are looked for once more.
+    """
+
+    @wraps(work)
+    def pinned(self: _Owner, /, *args: _P.args, **options: _P.kwargs) -> _T:
+        with self.session.at_one_moment():
+            try:
+                return work(self, *args, **options)
+            except StoreError:
+                if not self.session.has_changed():
+                    raise
+                self.session.invalidate()
+                return work(self, *args, **options)
+
+    return pinned
+
+
+class _Moment:
+    """The recordings of a store at one moment.
+
+    Args:
+        snapshot: All recordings; running ones as they were at the last look. None if they are
+            not read yet.
+
+    Attributes:
+        snapshot: As above.
+        running: Entries of running recordings that were looked at in this moment, by id.
+    """
+
+    def __init__(self, snapshot: Snapshot | None = None) -> None:
+        self.snapshot = snapshot
+        self.running: dict[str, RecordingEntry] = {}
+
+
 class Session:
     """The state of one open store. Thread safe for reading.
+
+    Questions see the recordings of one moment, see `at_one_moment`. What running recordings have
+    flushed by then is read when a question is about them.
 
     Args:
         directory: The store's directory.
@@ -107,12 +175,17 @@ class Session:
         self._is_indexed = False  # the index has all recordings of the snapshot
         self._indexed: set[str] = set()  # ids of those that it has in any case
         self._doubted: set[str] = set()  # recordings that the index may lack
-        self._snapshot: Snapshot | None = None
+        self._latest = _Moment()
+        self._pinned = threading.local()  # the moment that this thread asks about
+        self._changed = 0  # when `recordings` was changed last, as of the snapshot
+        self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
+        self._running: dict[str, RunningRecording] = {}
+        self._following = threading.RLock()
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
         self._belief: Belief | None = None
         self._places: TopicPlaces | None = None
         self._schemas: dict[str, Schema] = {}
-        self._channels: dict[str, list[RecordedChannel]] = {}
+        self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._contents: dict[Path, MovedContents] = {}
         self._chunk_lists = ChunkLists()
@@ -332,6 +405,120 @@ class Session:
         found = self._belief = Belief.of(database, keys, None if anew else self._belief)
         return found
 
+    # The moment.
+
+    @contextmanager
+    def at_one_moment(self) -> Iterator[None]:
+        """Let all questions of this thread see the recordings of one moment.
+
+        It begins now, or with the block around it. A running recording is as it was when the
+        first question looked at it.
+        """
+        if getattr(self._pinned, "moment", None) is not None:
+            yield
+            return
+        self._pinned.moment = self.renew()
+        try:
+            yield
+        finally:
+            self._pinned.moment = None
+
+    def all_at_one_moment(self, steps: Generator[_T, None, None]) -> Generator[_T, None, None]:
+        """Let a generator see the recordings of one moment, whichever threads its steps run on.
+
+        The moment begins with the first step, or with the block around it.
+        """
+        moment = self.renew()
+        with closing(steps):
+            while True:
+                before = getattr(self._pinned, "moment", None)
+                self._pinned.moment = moment
+                try:
+                    step = next(steps)
+                except StopIteration:
+                    return
+                finally:
+                    moment, self._pinned.moment = self._pinned.moment, before
+                yield step
+
+    def renew(self) -> _Moment:
+        """Begin a new moment, unless this thread asks about an earlier one."""
+        pinned: _Moment | None = getattr(self._pinned, "moment", None)
+        if pinned is not None:
+            return pinned
+        snapshot = self._latest.snapshot
+        if snapshot is None:
+            return self._latest
+        has_changed = self.directory.changed() != self._changed
+        if has_changed and time.monotonic() >= self._looks_at:
+            self.invalidate()
+        elif snapshot.is_open.any():
+            self._latest = _Moment(snapshot)
+        return self._latest
+
+    def has_changed(self) -> bool:
+        """True if files of recordings that were read look different by now."""
+        if self.directory.changed() != self._changed:
+            return True
+        read = self._entries.keys() | self._moment.running.keys()
+        summaries = [one for one in self.snapshot().summaries if one.id in read]
+        looks = self.directory.looks([one.label for one in summaries])
+        return any(looks.get(one.label) != one.look for one in summaries)
+
+    @property
+    def _moment(self) -> _Moment:
+        return getattr(self._pinned, "moment", None) or self._latest
+
+    def look(self, recordings: Collection[str] | None = None) -> Snapshot:
+        """See what running recordings have flushed.
+
+        Args:
+            recordings: Their ids; None for all.
+
+        Returns:
+            All recordings of the moment.
+        """
+        moment = self._moment
+        snapshot = self._snapshot_of(moment)
+        for place in np.flatnonzero(snapshot.is_open).tolist():
+            recording = snapshot.summaries[place].id
+            if recordings is None or recording in recordings:
+                self._follow(moment, recording)
+        return self._snapshot_of(moment)
+
+    def _follow(self, moment: _Moment, recording: str) -> RecordingEntry | None:
+        """The entry of a running recording with what is flushed; None if it is gone."""
+        with self._following:
+            if recording in moment.running:
+                return moment.running[recording]
+            snapshot = self._snapshot_of(moment)
+            summary = snapshot.summaries[snapshot.by_id[recording]]
+            running = self._running.get(recording)
+            if running is None:
+                from hybridlog.running import RunningRecording
+
+                running = self._running[recording] = RunningRecording(
+                    self.directory, summary.label, partial(self._read_entry, summary)
+                )
+            running.follow()
+            entry = running.entry
+            if entry is None or entry.status not in UNFINISHED or entry.label != summary.label:
+                del self._running[recording]
+            if entry is None:
+                return None
+            moment.running[recording] = entry
+            self._schemas |= running.schemas
+            now = summary_of(entry, summary.look)
+            if now != summary:
+                moment.snapshot = snapshot.with_summary(now, running.topics)
+                if now.topics != summary.topics:
+                    self._remember_meanings()
+                if entry.status not in UNFINISHED:
+                    self._forget_tables(entry)
+                if self._latest.snapshot is snapshot:
+                    self._latest = _Moment(moment.snapshot)
+            return entry
+
     # The catalog.
 
     @lazy
@@ -340,8 +527,13 @@ class Session:
         return open_catalog(self.directory)
 
     def snapshot(self) -> Snapshot:
-        """All recordings in short."""
-        if self._snapshot is None:
+        """All recordings in short, at the moment."""
+        return self._snapshot_of(self._moment)
+
+    def _snapshot_of(self, moment: _Moment) -> Snapshot:
+        if moment.snapshot is None:
+            begun = time.monotonic()
+            self._changed = self.directory.changed()
             try:
                 found = repair_on_open(self.directory, self.catalog, self.repairs)
             except DiskFullError as error:
@@ -350,8 +542,12 @@ class Session:
                 self.catalog.close()
                 self.catalog = open_catalog(self.directory, in_memory=True)
                 found = repair_on_open(self.directory, self.catalog, self.repairs)
-            self._snapshot = found
-        return self._snapshot
+            moment.snapshot = found
+            ended = time.monotonic()
+            self._looks_at = ended
+            if ended - begun > _LONG_LOOK_S:  # in a store of thousands
+                self._looks_at += min((ended - begun) / _LOOK_SHARE, _MAX_BETWEEN_LOOKS_S)
+        return moment.snapshot
 
     def recordings(self) -> list[RecordingEntry]:
         """All recordings, oldest first. Reads the whole catalog; see `snapshot`."""
@@ -377,7 +573,16 @@ class Session:
         return found
 
     def _entry_of(self, summary: RecordingSummary) -> RecordingEntry | None:
-        found = self._entries.get(summary.id)
+        moment = self._moment
+        snapshot = self._snapshot_of(moment)
+        place = snapshot.by_id.get(summary.id)
+        if place is not None and (snapshot.is_open[place] or summary.id in moment.running):
+            return self._follow(moment, summary.id)
+        return self._read_entry(summary)
+
+    def _read_entry(self, summary: RecordingSummary) -> RecordingEntry | None:
+        """The entry of what is sealed of a recording."""
+        found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
         if found is None:
             entry = self._current(summary)
             if entry is None or entry.id != summary.id:
@@ -385,8 +590,8 @@ class Session:
                 now = repair_on_open(self.directory, self.catalog, self.repairs)
                 place = now.by_id.get(summary.id)
                 entry = None if place is None else self._current(now.summaries[place])
-            if entry is None:
-                return None
+            if entry is None or entry.status in UNFINISHED:
+                return entry
             found = self._entries.setdefault(summary.id, entry)
         return found
 
@@ -430,7 +635,7 @@ class Session:
         Raises:
             TopicError: a recording does not exist any more.
         """
-        snapshot = self.snapshot()
+        snapshot = self.look(question.recordings)
         if question.recordings is None:
             return snapshot.having(question.topics)
         places = [snapshot.by_id.get(recording, -1) for recording in question.recordings]
@@ -489,7 +694,7 @@ class Session:
 
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
-        return self.snapshot().topics
+        return self.look().topics
 
     def channels(self, recording: RecordingEntry) -> list[RecordedChannel]:
         """The channels of a recording, with their codecs.
@@ -497,19 +702,18 @@ class Session:
         Where a topic has messages, its channels without any are left out: they must not change
         the columns of an answer.
         """
-        found = self._channels.get(recording.id)
+        known = self._channels.get(recording.id)
+        found = known[1] if known is not None and known[0] is recording else None
         if found is None:
             by_id = self.definitions(recording)
-            known = {c.id: (c.stats, c.reason) for c in recording.channels}
+            stats = {c.id: (c.stats, c.reason) for c in recording.channels}
             counts = recording.messages_by_topic()
             found = [
-                RecordedChannel(recording, i, channel, *known.get(i, (ChannelStats(), None)))
+                RecordedChannel(recording, i, channel, *stats.get(i, (ChannelStats(), None)))
                 for i, channel in sorted(by_id.items())
-                if recording.status == "open"
-                or not counts[channel.topic]
-                or (i in known and known[i][0].messages)
+                if not counts[channel.topic] or (i in stats and stats[i][0].messages)
             ]
-            self._channels[recording.id] = found
+            self._channels[recording.id] = recording, found
         return found
 
     def field_types(
@@ -521,7 +725,7 @@ class Session:
             topics: Full names.
             recordings: Ids; None for all.
         """
-        snapshot = self.snapshot()
+        snapshot = self.look(recordings)
         places = snapshot.having(topics)
         if recordings is not None:
             own = (snapshot.by_id.get(recording, -1) for recording in recordings)
@@ -551,10 +755,15 @@ class Session:
         Raises:
             TopicError: no recording has any of the topics.
         """
-        snapshot = self.snapshot()
-        places = snapshot.having(topics)
+        ids = None
         if recordings is not None:
-            places = np.intersect1d(places, np.array(self.named(recordings), np.intp))
+            known = self.snapshot().summaries
+            ids = [known[place].id for place in self.named(recordings)]
+        snapshot = self.look(ids)
+        places = snapshot.having(topics)
+        if ids is not None:
+            own = [snapshot.by_id.get(recording, -1) for recording in ids]
+            places = np.intersect1d(places, np.array(own, np.intp))
         if topics and not len(places):
             raise TopicError(f"No recording chosen has {', '.join(sorted(set(topics)))}.")
         if recordings is None:
@@ -584,6 +793,7 @@ class Session:
         Raises:
             TopicError: a pattern matches no topic, or several; lists the candidates.
         """
+        self.look()
         return self._resolved(names)
 
     def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
@@ -692,8 +902,12 @@ class Session:
             return self.catalog.table(recording, number)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
-        """The reader of a sealed segment of a recording, by id or label. Thread safe."""
+        """The reader of a segment of a recording, by its id. Thread safe."""
         key = (recording, number)
+        running = self._running.get(recording)
+        opened = running.reader(number) if running is not None else None
+        if opened is not None:
+            return opened
         with self._lock:
             reader = self._segments.get(key)
             if reader is None:
@@ -731,6 +945,8 @@ class Session:
         """The table of a topic, created again if it is missing; None if there can be none."""
         from hybridlog.maintenance.tables import made_for
 
+        if recording.status in UNFINISHED:
+            return None
         key = recording.id, topic
         if key in self._tables_tried:
             return self.tables.of(recording, topic)
@@ -742,17 +958,28 @@ class Session:
         self.tables.reject(recording, topic)
         self._tables_tried.discard((recording.id, topic))
 
+    def _forget_tables(self, recording: RecordingEntry) -> None:
+        """Look for the tables of a recording again, now that it has ended."""
+        for topic in {channel.topic for channel in recording.channels}:
+            self._tables_tried.discard((recording.id, topic))
+            if "tables" in vars(self):
+                self.tables.forget(recording, topic)
+
     # Closing.
 
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
-        self._snapshot = None
+        self._latest = _Moment()
+        if getattr(self._pinned, "moment", None) is not None:
+            self._pinned.moment = self._latest
         self._entries = {}
         self._is_indexed = False
         self._indexed.clear()
         self._belief = None
         self._places = None
         self._schemas = {}
+        for running in [*self._running.values()]:
+            self._schemas |= running.schemas
         self._channels.clear()
         with self._lock:
             self._contents.clear()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import copy
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,10 @@ UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
 _MAX_CACHED = 128  # sets of topics
 _LATEST = np.iinfo(np.int64).max
+
+
+def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str]:
+    return one.span is None, one.span or (0, 0), one.label
 
 
 class Snapshot:
@@ -46,9 +51,7 @@ class Snapshot:
         summaries: Iterable[RecordingSummary],
         topics: Mapping[str, Sequence[TopicType]],
     ) -> None:
-        self.summaries = sorted(
-            summaries, key=lambda one: (one.span is None, one.span or (0, 0), one.label)
-        )
+        self.summaries = sorted(summaries, key=_order)
         self._topics = topics
         numbers = {digest: number for number, digest in enumerate(topics)}
         extents = [summary.extent for summary in self.summaries]
@@ -62,6 +65,39 @@ class Snapshot:
 
     def __len__(self) -> int:
         return len(self.summaries)
+
+    def with_summary(self, summary: RecordingSummary, topics: Collection[TopicType]) -> Snapshot:
+        """All recordings, one of them as it is now.
+
+        Args:
+            summary: Its summary; a recording with its id is there.
+            topics: Its topics and their types.
+        """
+        place = self.by_id[summary.id]
+        known = self._topics
+        if summary.topics not in known:
+            known = {**known, summary.topics: sorted(topics)}
+        around = self.summaries[max(place - 1, 0) : place + 2]
+        now = [summary if one.id == summary.id else one for one in around]
+        if now != sorted(now, key=_order) or self.summaries[place].label != summary.label:
+            rest = (one for one in self.summaries if one.id != summary.id)
+            return Snapshot([*rest, summary], known)
+        found = copy(self)  # in the same order: nothing else is worked out again
+        found.summaries = self.summaries.copy()
+        found.summaries[place] = summary
+        found.begin, found.end = self.begin.copy(), self.end.copy()
+        found.is_open = self.is_open.copy()
+        found.begin[place], found.end[place] = summary.extent
+        found.is_open[place] = summary.status in UNFINISHED
+        if summary.tags != self.summaries[place].tags:
+            vars(found).pop("tags", None)
+        if summary.topics != self.summaries[place].topics:
+            sets = self._set.copy()
+            sets[place] = list(known).index(summary.topics)
+            vars(found).update(_topics=known, _set=sets, _having={})
+            for name in ("topics", "schemas"):
+                vars(found).pop(name, None)
+        return found
 
     @lazy
     def by_id(self) -> dict[str, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeAlias, TypeVar, cast
@@ -24,7 +24,7 @@ from hybridlog.maintenance.report import (
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
-from hybridlog.session import Session
+from hybridlog.session import Session, of_one_moment
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.directory import StoreDirectory
@@ -264,6 +264,14 @@ class Store:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
         self.session.invalidate()
 
+    def at_one_moment(self) -> AbstractContextManager[None]:
+        """A block whose questions all see the recordings of one moment.
+
+        Without it each call sees what running recordings have flushed by then. A running
+        recording is as it was when the first question of the block asked about it.
+        """
+        return self.session.at_one_moment()
+
     def close(self) -> None:
         """Close files and connections. May be called more than once."""
         if self._sql is not None:
@@ -304,26 +312,30 @@ class Store:
         """
         return self.choose(Choice.of(name, tag=tag, has=has, type=type, during=during, where=where))
 
+    @of_one_moment
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
         from hybridlog.choosing import choose
         from hybridlog.recordings import Recordings
 
         chosen = choose(self.session, choice)
-        summaries = self.session.snapshot().summaries
+        summaries = self.session.look().summaries
         found = (summaries[place] for place in chosen.places.tolist())
         return Recordings(self.session, found, chosen.problem)
 
+    @of_one_moment
     def summaries(self) -> list[RecordingSummary]:
         """All recordings in short, oldest first; much faster than `recordings`."""
-        return list(self.session.snapshot().summaries)
+        return list(self.session.look().summaries)
 
+    @of_one_moment
     def is_one(self, names: Sequence[str]) -> bool:
         """True if a choice by these names is of one recording, whatever the store holds."""
         from hybridlog.choosing import is_exact
 
         return len(names) == 1 and is_exact(self.session, names[0])
 
+    @of_one_moment
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its label.
 
@@ -332,6 +344,7 @@ class Store:
         """
         return self.session.entry(recording)
 
+    @of_one_moment
     def select(self, names: Names | None) -> list[RecordingEntry]:
         """Recordings by label, name, id, or the beginning of one of these; None for all.
 
@@ -342,10 +355,12 @@ class Store:
         """
         return self.session.select(names)
 
+    @of_one_moment
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
         return self.session.topics()
 
+    @of_one_moment
     def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
         """The attachments of a recording's log, in their order.
 
@@ -360,6 +375,7 @@ class Store:
 
         return [each for e in self.select([recording]) for each in attachments_of(self.session, e)]
 
+    @of_one_moment
     def metadata(self, recording: str | RecordingEntry) -> list[StoredMetadata]:
         """The metadata records of a recording's log, in their order.
 
@@ -376,6 +392,7 @@ class Store:
 
     # Questions.
 
+    @of_one_moment
     def topic(self, *names: str) -> Query:
         """Make a query about one or several topics.
 
@@ -392,6 +409,7 @@ class Store:
         """Make a query about all topics."""
         return self.query(self.topics())
 
+    @of_one_moment
     def query(self, topics: Sequence[str], recordings: Names | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all.
 
@@ -403,6 +421,7 @@ class Store:
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
         return Query(self.session, Question(*self.session.having(topics, recordings)))
 
+    @of_one_moment
     def align(
         self,
         base: str | Query,
@@ -448,6 +467,7 @@ class Store:
             self.session, questions[0], questions[1:], how=how, tolerance=tolerance, clock=clock
         )
 
+    @of_one_moment
     def sync(
         self,
         topics: Sequence[str | Query],
@@ -481,6 +501,7 @@ class Store:
         again = partial(open_store, self.directory.path.absolute())
         return Synced(self.session, again, questions, tolerance, cast("Clock", clock))
 
+    @of_one_moment
     def rehearse(
         self,
         trigger: str,
@@ -529,6 +550,7 @@ class Store:
             self._sql = SqlEngine(self.session)
         return self._sql
 
+    @of_one_moment
     def sql(
         self,
         query: str,
@@ -718,6 +740,7 @@ class Store:
         return field_indexes.of_topics(database, names)
 
     @_again_if_lost
+    @of_one_moment
     def sizes(self, recordings: Names | None = None) -> Sizes:
         """Bytes of recordings and topics in segments, tables and MongoDB.
 

@@ -59,7 +59,6 @@ ALLOWED = {
     "pyarrow": (
         "hybridlog.across",
         "hybridlog.cli",
-        "hybridlog.drawing.flushed",
         "hybridlog.drawing.series",
         "hybridlog.drawing.track",
         "hybridlog.drawing.tree",

@@ -1000,8 +1000,6 @@ def test_words_mean_what_is_in_the_store_now(tmp_path: Path) -> None:
         with hl.open(tmp_path / "store") as other, other.start("strings") as recording:
             recording.write(Channel("/b/talk", "ros1", string), b"\x05\0\0\0seven")
             recording.write(Channel("/a/talk", "ros1", string), b"\x05\0\0\0seven")
-        assert store.topic("talk").where("data == 7").count() == 1
-        store.refresh()
         for _ in range(2):
             with pytest.raises(TopicError, match="/b/talk"):
                 store.topic("talk")

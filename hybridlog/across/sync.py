@@ -84,7 +84,7 @@ class Synced(Sequence[tuple["Message", ...]]):
         self._open_again = open_again
         self._session: Session | None = session
         limit = None if tolerance is None else parse_duration(tolerance)
-        snapshot = session.snapshot()
+        snapshot = session.look()
         shared = [set(session.chosen(question).tolist()) for question in questions]
         labels: list[str] = []
         found: list[list[_Found]] = []

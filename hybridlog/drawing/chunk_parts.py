@@ -1,15 +1,12 @@
-"""Counts and times of the messages in each chunk, from chunk tables; also of running recordings."""
+"""Counts and times of the messages in each chunk, from chunk tables."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.open_segment import OpenSegment, open_segment
 from hybridlog_storage.segment_reader import places_of
 
 if TYPE_CHECKING:
@@ -17,6 +14,7 @@ if TYPE_CHECKING:
 
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.segment_reader import ChunkPlace
 
 _CHANNELS = 1 << 16  # ids of channels
@@ -48,22 +46,6 @@ class Parts(NamedTuple):
         return Parts(*(column[rows] for column in self))
 
 
-class RunningTopic(NamedTuple):
-    """Messages of a topic that are flushed and not in a sealed segment yet.
-
-    Attributes:
-        type: Name of their type; empty if unknown.
-        messages: Number of them.
-        first: Least log time, ns.
-        last: Greatest log time, ns.
-    """
-
-    type: str
-    messages: int
-    first: int
-    last: int
-
-
 class RecordedChunks:
     """The chunks of a recording, read segment by segment when a span needs them.
 
@@ -77,12 +59,11 @@ class RecordedChunks:
     def __init__(self, session: Session, recording: RecordingEntry) -> None:
         self._session = session
         self._recording = recording
-        self._topics = {channel.id: channel.topic for channel in recording.channels}
-        self._sealed: dict[int, list[ChunkPlace] | None] = {}
-        self._open: dict[int, OpenSegment] = {}
+        self._known: dict[int, int] = {}  # chunks of each segment whose parts are known
+        self._sealed: set[int] = set()  # segments with no other chunks
+        self._places: dict[int, list[ChunkPlace]] = {}
         self._rows: list[NDArray[np.int64]] = []
         self._size = 0
-        self.follow(recording)
 
     @property
     def size(self) -> int:
@@ -91,7 +72,7 @@ class RecordedChunks:
 
     def topics(self) -> list[str]:
         """Names of all topics, sorted."""
-        return sorted(set(self._topics.values()))
+        return sorted({channel.topic for channel in self._recording.channels})
 
     def follow(self, recording: RecordingEntry) -> bool:
         """See what was flushed since.
@@ -103,63 +84,53 @@ class RecordedChunks:
             False if what was read before does not hold any more.
         """
         before, self._recording = self._recording, recording
-        is_same = recording.status == before.status and all(
-            before.digests.get(number) in {None, recording.digests.get(number)}
-            for number in map(str, self._sealed)
+        return (
+            recording.status == before.status
+            and all(
+                before.digests.get(number) in {None, recording.digests.get(number)}
+                for number in map(str, self._known)
+            )
+            and all(
+                self._has_grown(number, flushed.table)
+                for number, flushed in before.flushed.items()
+                if number in self._known
+            )
         )
-        if is_same and recording.status == "open":
-            self._topics |= {channel.id: channel.topic for channel in recording.channels}
-            self._follow_open()
-        return is_same
 
-    def _follow_open(self) -> None:
-        folder = self._session.directory.recording(self._recording.label)
-        listing = self._session.directory.listing(self._recording.label)
-        # A segment that was sealed since the entry was made is read like an open one.
-        for number, name in sorted({**listing.open, **listing.sealed}.items()):
-            if number in self._open or str(number) in self._recording.digests:
-                continue
-            found = open_segment(folder / name, number)
-            if found is not None and number not in self._sealed:
-                self._open[number] = found
-                self._add_flushed(found, 0)
-        for segment in self._open.values():
-            known = len(segment.chunks)
-            with suppress(SegmentError):
-                segment.advance()
-            self._add_flushed(segment, known)
-
-    def _add_flushed(self, segment: OpenSegment, known: int) -> None:
-        self._topics |= {number: channel.topic for number, channel in segment.channels.items()}
-        rows = []
-        for place in segment.chunks[known:]:
-            with suppress(SegmentError):  # it is in the ledger when its segment is sealed
-                for channel, times in sorted(segment.read_times(place).items()):
-                    span = int(times[0]), int(times[-1])
-                    rows.append((segment.number, place.number, channel, len(times), *span))
-        self._add(np.array(rows, np.int64).reshape(-1, 6))
-
-    def _add(self, rows: NDArray[np.int64]) -> None:
-        if len(rows):
-            self._rows.append(rows)
-            self._size += len(rows)
+    def _has_grown(self, number: int, before: ChunkTable) -> bool:
+        """Whether a segment has its chunks of before, and maybe more; it may be sealed now."""
+        recording = self._recording
+        if number not in recording.flushed and str(number) not in recording.digests:
+            return False
+        count = len(before.chunks)
+        now = self._session.chunk_table(recording, number).chunks[:count]
+        return len(now) == count and all(
+            np.array_equal(now[name][-1:], before.chunks[name][-1:])
+            for name in ("offset", "length", "trailer_crc")
+        )
 
     def load(self, span: tuple[int, int]) -> None:
-        """Read the chunk tables of sealed segments that may have messages in a span.
+        """Read the chunk tables of segments that may have messages in a span.
 
         Args:
             span: Log time `[begin, end)`, ns.
         """
+        names = ("channel", "messages", "first", "last")
         for number, first, last in self._recording.spans:
-            known = number in self._sealed or number in self._open
-            if known or first >= span[1] or last < span[0]:
+            if number in self._sealed or first >= span[1] or last < span[0]:
                 continue
             table = self._session.chunk_table(self._recording, number)
-            chunk = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-            names = ("channel", "messages", "first", "last")
-            columns = [table.parts[name].astype(np.int64) for name in names]
-            self._add(np.stack([np.full_like(chunk, number), chunk, *columns], axis=1))
-            self._sealed[number] = None
+            known, count = self._known.get(number, 0), len(table.chunks)
+            counts = table.chunks["parts"]
+            new = table.parts[int(counts[:known].sum()) :]
+            chunk = np.repeat(np.arange(known, count), counts[known:])
+            columns = [new[name].astype(np.int64) for name in names]
+            if len(new):
+                self._rows.append(np.stack([np.full_like(chunk, number), chunk, *columns], axis=1))
+                self._size += len(new)
+            self._known[number] = count
+            if not table.is_flushed:
+                self._sealed.add(number)
 
     def parts(self, span: tuple[int, int], topics: Sequence[str], since: int = 0) -> Parts:
         """The parts of some topics that may have messages in a span.
@@ -175,8 +146,8 @@ class RecordedChunks:
         rows = self._rows[0][since:] if self._rows else np.empty((0, 6), np.int64)
         places = {topic: place for place, topic in enumerate(topics)}
         topic_of = np.full(_CHANNELS, -1, np.intp)
-        for channel, topic in self._topics.items():
-            topic_of[channel] = places.get(topic, -1)
+        for channel in self._recording.channels:
+            topic_of[channel.id] = places.get(channel.topic, -1)
         wanted = (rows[:, 4] < span[1]) & (rows[:, 5] >= span[0]) & (topic_of[rows[:, 2]] >= 0)
         segment, chunk, channel, messages, first, last = np.ascontiguousarray(rows[wanted].T)
         return Parts(segment, chunk, channel, topic_of[channel], messages, first, last)
@@ -187,31 +158,8 @@ class RecordedChunks:
         Raises:
             SegmentError: They are missing or damaged.
         """
-        running = self._open.get(segment)
-        if running is not None:
-            return running.read_times(running.chunks[chunk])
-        places = self._sealed[segment]
-        if places is None:
-            table = self._session.chunk_table(self._recording, segment)
-            places = self._sealed[segment] = places_of(table)
+        places = self._places.get(segment, [])
+        if chunk >= len(places):
+            places = places_of(self._session.chunk_table(self._recording, segment))
+            self._places[segment] = places
         return self._session.segment(self._recording.id, segment).read_times(places[chunk])
-
-    def running(self) -> dict[str, RunningTopic]:
-        """Flushed messages that the recording's entry does not count yet, by topic."""
-        found: dict[str, RunningTopic] = {}
-        numbers = [n for n in self._open if str(n) not in self._recording.digests]
-        for number in numbers:
-            for channel in self._open[number].channels.values():
-                kind = channel.schema.name if channel.schema is not None else ""
-                found.setdefault(channel.topic, RunningTopic(kind, 0, 0, 0))
-        rows = np.concatenate([np.empty((0, 6), np.int64), *self._rows])
-        rows = rows[np.isin(rows[:, 0], np.array(numbers, np.int64))]
-        for channel_id in np.unique(rows[:, 2]).tolist():
-            own = rows[rows[:, 2] == channel_id]
-            topic = self._topics[channel_id]
-            kind, messages, first, last = found[topic]
-            least, greatest = int(own[:, 4].min()), int(own[:, 5].max())
-            if messages:
-                least, greatest = min(first, least), max(last, greatest)
-            found[topic] = RunningTopic(kind, messages + int(own[:, 3].sum()), least, greatest)
-        return found

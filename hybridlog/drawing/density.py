@@ -61,7 +61,7 @@ def density(
 
     Args:
         session: The open store.
-        recording: The recording; what has been flushed counts if it goes on.
+        recording: The recording.
         span: Log time `[begin, end)`, ns.
         pixels: Number of parts of the span; their lengths differ by one nanosecond at most.
         topics: Full names; None for all topics of the recording.

@@ -24,7 +24,6 @@ from hybridlog_storage.errors import TopicError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.chunk_parts import RunningTopic
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -74,7 +73,7 @@ class DensityCache:
         """Counts of messages by bin.
 
         Args:
-            recording: The recording; what has been flushed counts if it goes on.
+            recording: The recording.
             span: Log time `[begin, end)`, ns.
             pixels: Most bins that fit into the span.
             topics: Full names.
@@ -103,12 +102,6 @@ class DensityCache:
         recorded = self._of(recording)
         with recorded.lock:
             return [recorded.period(recording, span, topic) for topic in topics]
-
-    def running(self, recording: RecordingEntry) -> dict[str, RunningTopic]:
-        """Flushed messages that the recording's entry does not count yet, by topic."""
-        recorded = self._of(recording)
-        with recorded.lock:
-            return recorded.follow(recording).running()
 
     def _of(self, recording: RecordingEntry) -> _Recorded:
         with self._lock:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.drawing.flushed import END
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
-    from hybridlog.drawing.flushed import Flushed
     from hybridlog.message import Message
     from hybridlog.query.query import Query
-    from hybridlog.query.question import Span
 
 LEVELS: Final = ("debug", "info", "warning", "error", "fatal")
 """From the least to the greatest."""
@@ -91,25 +87,21 @@ class Log:
     """The lines of a log that pass some filters.
 
     Attributes:
-        query: About one topic of one recording; None for none but `flushed`.
+        query: About one topic of one recording.
         kind: Its kind of messages.
         level: Least level, one of `LEVELS`; empty for all lines.
         text: Characters that the text or the sender has, in any case; no regular expression.
-        flushed: Later messages of the topic, of a recording that goes on.
     """
 
-    query: Query | None
+    query: Query
     kind: Kind
     level: str = ""
     text: str = ""
-    flushed: Flushed | None = None
 
     @lazy
-    def filtered(self) -> Query | None:
+    def filtered(self) -> Query:
         """The query for these lines."""
         query, kind = self.query, self.kind
-        if query is None:
-            return None
         if self.level and kind.levels:
             query = query.where(f"level >= {kind.levels[LEVELS.index(self.level)]}")
         if self.text:
@@ -127,34 +119,17 @@ class Log:
             seq: Arrival number of that line; -1 for all lines of that time, too.
             count: Most lines.
         """
-        found: list[Line] = []
-        if self.filtered is not None:
-            beside = self.filtered.between(time, time + 1).where(f"_meta.seq > {seq}")
-            found = self._read((beside, self.filtered.between(time + 1)), count)
-        if self.flushed is not None:
-            lines = self._flushed((time, END), reverse=False)
-            found += islice((one for one in lines if (one.time, one.seq) > (time, seq)), count)
-        return sorted(found, key=_place)[:count]
+        beside = self.filtered.between(time, time + 1).where(f"_meta.seq > {seq}")
+        return self._read((beside, self.filtered.between(time + 1)), count)
 
     def before(self, time: int, seq: int, count: int) -> list[Line]:
         """The lines before one, in order; see `after`."""
-        found: list[Line] = []
-        if self.filtered is not None:
-            beside = self.filtered.between(time, time + 1).where(f"_meta.seq < {seq}").reverse()
-            found = self._read((beside, self.filtered.between(None, time).reverse()), count)
-        if self.flushed is not None:
-            lines = self._flushed((0, time + 1), reverse=True)
-            found += islice((one for one in lines if (one.time, one.seq) < (time, seq)), count)
-        return sorted(found, key=_place)[-count:] if count else []
+        beside = self.filtered.between(time, time + 1).where(f"_meta.seq < {seq}").reverse()
+        return self._read((beside, self.filtered.between(None, time).reverse()), count)[::-1]
 
-    def count(self) -> int | None:
-        """Number of lines; None if it is not known without reading what was flushed."""
-        found = 0
-        with suppress(TimeError):
-            found = 0 if self.filtered is None else self.filtered.count()
-        if self.flushed is None:
-            return found
-        return None if self.level or self.text else found + self.flushed.count
+    def count(self) -> int:
+        """Number of lines."""
+        return self.filtered.count()
 
     def _read(self, queries: tuple[Query, ...], count: int) -> list[Line]:
         found: list[Line] = []
@@ -163,23 +138,6 @@ class Log:
                 limited = query.limit(count - len(found))
                 found += [_line(message, self.kind) for message in limited]
         return found
-
-    def _flushed(self, span: Span, *, reverse: bool) -> Iterator[Line]:
-        assert self.flushed is not None
-        levels = LEVELS[LEVELS.index(self.level) :] if self.level and self.kind.levels else ()
-        text = self.text.lower()
-        for message in self.flushed.messages(span, reverse=reverse):
-            line = _line(message, self.kind)
-            if levels and line.level not in levels:
-                continue
-            if text and not any(text in part.lower() for part in (line.text, line.name)):
-                continue
-            if line.is_readable or not (levels or text):
-                yield line
-
-
-def _place(line: Line) -> tuple[int, int]:
-    return line.time, line.seq
 
 
 def _line(message: Message, kind: Kind) -> Line:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
 from hybridlog.frames.names import FIELD
-from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, lengths_of
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.drawing.asked import Asked
-    from hybridlog.drawing.flushed import Flushed
     from hybridlog.query.question import Span
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
@@ -96,12 +93,7 @@ class Series:
 
 
 def series(
-    query: Asked | None,
-    fields: Sequence[str],
-    *,
-    pixels: int,
-    span: Span | None = None,
-    flushed: Flushed | None = None,
+    query: Asked, fields: Sequence[str], *, pixels: int, span: Span | None = None
 ) -> list[Series]:
     """Fields of the messages of a query over log time.
 
@@ -109,12 +101,11 @@ def series(
     counters of the query are set to the cost.
 
     Args:
-        query: About one topic of one recording; None for none but `flushed`.
+        query: About one topic of one recording.
         fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
             (`twist.linear`), which give a series for each.
         pixels: Width of the picture. Up to twice as many messages are returned exactly.
         span: Log time `[begin, end)` of the picture, ns; None for that of the messages.
-        flushed: Later messages of the topic, of a recording that goes on.
 
     Raises:
         TopicError: no such field exists.
@@ -125,26 +116,13 @@ def series(
     if pixels < 1:
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
     wanted = [_Wanted.of(text) for text in fields]
-    extents, tables = [], []
-    counters, cost = Counters(), Counters()
-    if query is not None:
-        asked, extent = _asked(query, wanted, span)
-        counters, cost = query.counters, asked.counters
-        extents.append(extent)
-        tables.append(asked.to_tables())
-    if flushed is not None and flushed.span is not None:
-        begin, end = flushed.span
-        extents.append((begin, end) if span is None else (max(begin, span[0]), min(end, span[1])))
-        tables.append(flushed.tables([one.path for one in wanted], extents[-1]))
-    present = [n for n, (begin, end) in enumerate(extents) if begin < end]
-    if not present:
+    asked, (begin, end) = _asked(query, wanted, span)
+    if begin >= end:
         none = np.empty(0)
         return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
-    whole = min(extents[n][0] for n in present), max(extents[n][1] for n in present)
-    with counters.timed():
-        rows = chain.from_iterable(tables[n] for n in present)
-        found = _read(rows, wanted, _Grid.over(span or whole, pixels))
-        counters.add(cost)
+    with query.counters.timed():
+        found = _read(asked.to_tables(), wanted, _Grid.over(span or (begin, end), pixels))
+        query.counters.add(asked.counters)
     return found
 
 
@@ -344,16 +322,13 @@ def _exact(
     paths: Sequence[str],
 ) -> list[Series]:
     times = np.concatenate([times for times, _ in held])
-    # A late message may be flushed after later ones were sealed.
-    order = np.argsort(times, kind="stable")
-    times = times[order]
     steps = np.diff(times)
     gaps = np.flatnonzero(steps > GAP_PERIODS * usual_period(steps)) + 1
     middles = times[gaps - 1] + steps[gaps - 1] // 2
     found = []
     for path in paths:
         values = np.concatenate([c.get(path, np.full(len(t), np.nan)) for t, c in held])
-        values = np.insert(values[order], gaps, np.nan)
+        values = np.insert(values, gaps, np.nan)
         found.append(Series(path, np.insert(times, gaps, middles), values, values, True))
     return found
 

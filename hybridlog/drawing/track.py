@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,9 +11,7 @@ import numpy as np
 
 from hybridlog.drawing.series import GAP_PERIODS, usual_period
 from hybridlog.frames.names import FIELD
-from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.question import field_types
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import UsageError
 
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.flushed import Flushed
     from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
@@ -172,23 +169,16 @@ def position_of(known: Mapping[str, str] | None) -> Position | None:
     return None
 
 
-def track(
-    query: Query | None,
-    *,
-    pixels: int,
-    span: Span | None = None,
-    flushed: Flushed | None = None,
-) -> Track:
+def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     """The positions of a topic, such as NavSatFix or Odometry, over log time.
 
     A message has a fix if its position is one and its `status.status`, if there is one, is not
     negative. The counters of the query are set to the cost.
 
     Args:
-        query: About one topic of one recording; None for none but `flushed`.
+        query: About one topic of one recording.
         pixels: Steps of time. Up to six times as many messages are returned exactly.
         span: Log time `[begin, end)`, ns; None for that of the messages.
-        flushed: Later messages of the topic, of a recording that goes on.
 
     Raises:
         UsageError: several topics or recordings, no positions, `reverse`, or no pixel.
@@ -196,35 +186,19 @@ def track(
     """
     if pixels < 1:
         raise UsageError("A track has at least one pixel.")
-    known: Mapping[str, str] | None = None
-    if query is not None:
-        known = query.field_types()
-    elif flushed is not None:
-        known = field_types(tuple(flushed.channels))
+    known = query.field_types()
     position = position_of(known)
     if position is None:
         raise UsageError("These messages have no latitude and longitude, and no pose.")
     paths = list(position.paths)
     if position.is_geographic and (known is None or _STATUS in known):
         paths.append(_STATUS)
-    parts: list[tuple[Span, Iterable[pa.Table]]] = []
-    counters, cost = Counters(), Counters()
-    if query is not None:
-        asked, extent = _asked(query, paths, span)
-        counters, cost = query.counters, asked.counters
-        parts.append((extent, asked.to_tables()))
-    if flushed is not None and flushed.span is not None:
-        extent = _common(flushed.span, span)
-        parts.append((extent, flushed.tables(paths, extent)))
-    parts = [(extent, tables) for extent, tables in parts if extent[0] < extent[1]]
-    begin = min((extent[0] for extent, _ in parts), default=0)
-    end = max((extent[1] for extent, _ in parts), default=0)
+    asked, (begin, end) = _asked(query, paths, span)
     made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
-    with counters.timed():
-        for _, tables in parts:
-            for table in tables:
-                made.add(table, paths)
-        counters.add(cost)
+    with query.counters.timed():
+        for table in asked.to_tables() if begin < end else ():
+            made.add(table, paths)
+        query.counters.add(asked.counters)
     return made.track()
 
 
@@ -291,12 +265,8 @@ class _Builder:
         xy = np.full((len(has_fix), 2), np.nan)
         xy[has_fix] = self._metres(first[has_fix], second[has_fix])
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
-        is_sorted = not len(self._times) or not len(times) or times[0] >= self._times[-1]
         self._times = np.concatenate([self._times, times])
         self._xy = np.concatenate([self._xy, xy])
-        if not is_sorted:  # what is flushed may begin before the last message of a query
-            order = np.argsort(self._times, kind="stable")
-            self._times, self._xy = self._times[order], self._xy[order]
         if len(self._times) > self._limit:
             self._thin()
 
@@ -311,7 +281,6 @@ class _Builder:
 
     def _thin(self) -> None:
         self._exact = False
-        # Of messages of a running recording that are later than its known end, too.
         pixel = (self._times - self._begin) // self._width
         has_fix = ~np.isnan(self._xy[:, 0])
         kept = np.zeros(len(pixel), np.bool_)

@@ -26,7 +26,7 @@ Windows: TypeAlias = Callable[[Near], Intervals]
 
 def everything(session: Session, question: Question) -> Intervals:
     """All log time of the recordings of a question."""
-    snapshot = session.snapshot()
+    snapshot = session.look(question.recordings)
     places = session.chosen(question).tolist()
     whole = np.array([[0, TIME_LIMIT - 1, 0]], np.int64)
     return Intervals.of((snapshot.summaries[place].id, whole) for place in places)
@@ -47,8 +47,8 @@ def question_about(
     Raises:
         TopicError: no such topic exists in the recordings.
     """
-    snapshot = session.snapshot()
-    known: Collection[str] = session.topics()
+    snapshot = session.look(question.recordings)
+    known: Collection[str] = snapshot.topics
     if question.recordings is not None:
         places = session.chosen(question).tolist()
         known = {t for place in places for t in snapshot.topics_of(snapshot.summaries[place])}

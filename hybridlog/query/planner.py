@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
-from hybridlog.query.engines.base import Need, UndecidedError
+from hybridlog.query.engines.base import Checking, Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.statistics import Statistics
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.column import STAMP
+from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from hybridlog.query.engines.base import Engine, Objects, Outcomes, Values
     from hybridlog.query.engines.mongo import Mongo
     from hybridlog.query.engines.payload_columns import PayloadColumns
+    from hybridlog.query.engines.running import RunningTables
     from hybridlog.query.engines.tables import TablesEngine
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.predicate.tree import Predicate
@@ -106,8 +108,17 @@ class Planner:
 
         return PayloadColumns(self.session, self.counters)
 
+    @lazy
+    def _running(self) -> RunningTables:
+        from hybridlog.query.engines.running import RunningTables
+
+        return RunningTables(self.session, self.counters)
+
     def _files(self, part: Part, need: Need) -> tuple[Engine, ...]:
         """The engines that need no server."""
+        if part.recording.status in UNFINISHED:
+            is_plain = part.predicate is None and need is not Need.VALUES
+            return *self._catalog, *(() if is_plain else (self._running,)), self._scan
         if part.predicate is None and need is Need.OUTCOMES:
             return *self._catalog, self._tables, self._scan
         if part.predicate is None and need is not Need.VALUES:
@@ -148,7 +159,7 @@ class Planner:
         predicate = self.question.predicate
         asks_fields = predicate is not None and predicate.asks_fields
         for topic, channels in by_topic.items():
-            if recording.status != "open" and not any(c.stats.messages for c in channels):
+            if not any(c.stats.messages for c in channels):
                 continue  # nothing was sent on the topic
             blind = [c for c in channels if asks_fields and _has_no_fields(c)]
             yield Part(
@@ -164,8 +175,8 @@ class Planner:
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
-        summaries = self.session.snapshot().summaries
         places = self.session.chosen(self.question).tolist()
+        summaries = self.session.snapshot().summaries
         return self._channels_of(summaries[place] for place in places)
 
     @lazy
@@ -408,9 +419,9 @@ class Planner:
     def _selecting(self, part: Part) -> Engine:
         """The engine that finds the matching messages of a part."""
         for engine in self._choose(part, Need.SELECTION):
-            if engine is self._tables:
+            if isinstance(engine, Checking):
                 try:
-                    self._tables.check(part)
+                    engine.check(part)
                 except _RETRIED:
                     continue
             return engine

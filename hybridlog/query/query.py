@@ -27,6 +27,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import parse_duration, parse_time
+from hybridlog.session import of_one_moment
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -84,7 +85,7 @@ class Query:
         self.question = question
         self.counters = Counters()
         self.conditions = conditions
-        self._session = session
+        self.session = session
 
     def __repr__(self) -> str:
         return f"<Query {'; '.join(self._described().values())}>"
@@ -104,11 +105,11 @@ class Query:
         question = self.question
         found = {"topics": listed(self.topics, 3)}
         try:
-            places = self._session.chosen(question).tolist()
+            places = self.session.chosen(question).tolist()
         except HybridlogError as error:
             found["recordings"] = str(error)
         else:
-            summaries = self._session.snapshot().summaries
+            summaries = self.session.snapshot().summaries
             labels = listed((summaries[place].label for place in places[:4]), 3)
             several = f"{len(places)} recordings"
             found["recordings"] = several if len(places) != 1 else f"recording {labels}"
@@ -141,11 +142,11 @@ class Query:
         """True if both are the same question to the same open store."""
         if not isinstance(other, Query):
             return NotImplemented
-        return self._session is other._session and self.question == other.question
+        return self.session is other.session and self.question == other.question
 
     def __hash__(self) -> int:
         """Hash of the question."""
-        return hash((id(self._session), self.question))
+        return hash((id(self.session), self.question))
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -155,7 +156,7 @@ class Query:
     @property
     def directory(self) -> Path:
         """The store's directory."""
-        return self._session.directory.path
+        return self.session.directory.path
 
     @property
     def recordings(self) -> tuple[str, ...]:
@@ -174,7 +175,7 @@ class Query:
 
     def copy(self) -> Query:
         """The same question with separate counters."""
-        return Query(self._session, self.question, self.conditions)
+        return Query(self.session, self.question, self.conditions)
 
     def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
         """Only messages with `begin <= time < end`.
@@ -205,6 +206,7 @@ class Query:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         return self._with(clock=cast(Clock, clock))
 
+    @of_one_moment
     def where(
         self,
         predicate: str | Mapping[str, object],
@@ -232,7 +234,7 @@ class Query:
 
                 if names_topics(predicate):
                     return self._near(predicate, within)
-            checked = self._session.predicate(predicate, self.topics, self.question.recordings)
+            checked = self.session.predicate(predicate, self.topics, self.question.recordings)
         else:
             from hybridlog.query.predicate.from_mongo import from_mongo
 
@@ -269,17 +271,17 @@ class Query:
         asked: list[Query] = []
 
         def windows(condition: Near) -> Intervals:
-            question = question_about(self._session, query.question, condition.topic, before, after)
-            events = Query(self._session, question)
+            question = question_about(self.session, query.question, condition.topic, before, after)
+            events = Query(self.session, question)
             if condition.predicate:
                 events = events.where(condition.predicate)
             asked.append(events)
             return events.windows(before, after)
 
-        whole = everything(self._session, self.question)
+        whole = everything(self.session, self.question)
         for condition in others:
             query = query.during(intervals_of(condition, windows, whole))
-        return Query(self._session, query.question, (*self.conditions, *asked))
+        return Query(self.session, query.question, (*self.conditions, *asked))
 
     def limit(self, count: int) -> Query:
         """At most this many messages.
@@ -305,6 +307,7 @@ class Query:
         """Latest message first."""
         return self._with(reverse=not self.question.reverse)
 
+    @of_one_moment
     def fields(self, *paths: str) -> Query:
         """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
 
@@ -324,6 +327,7 @@ class Query:
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(fields=tuple(paths))
 
+    @of_one_moment
     def tags(self, *keys: str) -> Query:
         """Tags of the recordings as columns of tables, behind `topic` and `recording`.
 
@@ -333,8 +337,8 @@ class Query:
         Raises:
             TopicError: no recording of the query has such a tag.
         """
-        snapshot = self._session.snapshot()
-        places = self._session.chosen(self.question).tolist()
+        places = self.session.chosen(self.question).tolist()
+        snapshot = self.session.snapshot()
         known = {key for place in places for key in snapshot.summaries[place].tags}
         for key in keys:
             if key not in known:
@@ -344,6 +348,7 @@ class Query:
                 )
         return self._with(tags=tuple(dict.fromkeys(keys)))
 
+    @of_one_moment
     def in_recording(
         self,
         *names: str,
@@ -361,21 +366,23 @@ class Query:
         from hybridlog.choosing import choose
 
         choice = Choice.of(names, tag=tag, has=has, type=type, during=during, where=where)
-        chosen = choose(self._session, choice)
+        chosen = choose(self.session, choice)
         if chosen.problem:
             raise TopicError(chosen.problem)
-        summaries = self._session.snapshot().summaries
+        summaries = self.session.snapshot().summaries
         return self._on(self.topics, [summaries[n].id for n in chosen.places.tolist()])
 
+    @of_one_moment
     def with_topic(self, *names: str) -> Query:
         """The same question about one or some of its topics, by their full names.
 
         If the question is about several recordings, tables of each topic name them.
         """
-        several = self.question.names_recording or len(self._session.chosen(self.question)) > 1
-        topics, chosen = self._session.having(names, self.question.recordings)
+        several = self.question.names_recording or len(self.session.chosen(self.question)) > 1
+        topics, chosen = self.session.having(names, self.question.recordings)
         return self._with(topics=topics, recordings=chosen, names_recording=several)
 
+    @of_one_moment
     def during(self, intervals: Intervals) -> Query:
         """Only messages whose log time is in one of some intervals of their recording.
 
@@ -388,7 +395,7 @@ class Query:
         Raises:
             TopicError: an interval is of a recording that is not in the store.
         """
-        known = self._session.snapshot().summaries
+        known = self.session.snapshot().summaries
         ids = {one.label: one.id for one in known} | {one.id: one.id for one in known}
         intervals = intervals.by_id(ids)
         if self.question.during is not None:
@@ -423,7 +430,7 @@ class Query:
         """
         events = events.copy()
         query = self.during(events.windows(before, after))
-        return Query(self._session, query.question, (*query.conditions, events))
+        return Query(self.session, query.question, (*query.conditions, events))
 
     def at_time(self, moment: TimeLike) -> Query:
         """Only the message that was current at a time: the last one not after it.
@@ -438,12 +445,12 @@ class Query:
         time = found.log_time_ns
         question = just_before(self.question, found.recording, time, time)
         # What is lost between the message and the moment may have been the current one.
-        snapshot = self._session.snapshot()
+        snapshot = self.session.snapshot()
         place = snapshot.by_id[found.recording]
         start, end = int(snapshot.begin[place]), int(snapshot.end[place])
         latest = max(parse_time(moment, start=start, end=end), time)
-        since = Query(self._session, replace(question, bounds=(time, latest + 1)))
-        return Query(self._session, question, (*self.conditions, since))
+        since = Query(self.session, replace(question, bounds=(time, latest + 1)))
+        return Query(self.session, question, (*self.conditions, since))
 
     # Answers.
 
@@ -458,6 +465,7 @@ class Query:
         """The first message; None if the answer is empty."""
         return next(iter(self.limit(1)), None)
 
+    @of_one_moment
     def at(self, moment: TimeLike) -> Message:
         """The message of `at_time`. Its arrays are read-only: copy to change them.
 
@@ -473,7 +481,7 @@ class Query:
         from hybridlog.query.answers.last_message import message_at
 
         with self.counters.timed():
-            found = message_at(self._session, self.question, self.counters, moment)
+            found = message_at(self.session, self.question, self.counters, moment)
         if found is None:
             raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
         return found
@@ -490,6 +498,7 @@ class Query:
             if len(batch):
                 yield batch, run.channels
 
+    @of_one_moment
     def latched(
         self, *, original_times: bool = False
     ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
@@ -504,8 +513,9 @@ class Query:
         from hybridlog.query.answers.latched import in_force
 
         self.counters.reset()
-        return in_force(self._session, self.question, self.counters, original_times=original_times)
+        return in_force(self.session, self.question, self.counters, original_times=original_times)
 
+    @of_one_moment
     def extras(self) -> Extras:
         """Attachments and metadata records that belong to the answer as a slice.
 
@@ -514,23 +524,25 @@ class Query:
         """
         from hybridlog.attachments import extras_of
 
-        return extras_of(self._session, self.question)
+        return extras_of(self.session, self.question)
 
+    @of_one_moment
     def count(self) -> int:
         """Number of messages."""
         with self.counters.timed():
             try:
-                found = Planner(self._session, self.question, self.counters).count()
+                found = Planner(self.session, self.question, self.counters).count()
             except IndexChangedError:
                 # Another process has changed the index: query its new state once.
                 asked = self.question.recordings
-                if asked is not None and not self._session.snapshot().by_id.keys() >= set(asked):
+                if asked is not None and not self.session.snapshot().by_id.keys() >= set(asked):
                     raise
                 self.counters.reset()
-                found = Planner(self._session, self.question, self.counters).count()
+                found = Planner(self.session, self.question, self.counters).count()
             self.counters.messages = found
         return found
 
+    @of_one_moment
     def intervals(
         self,
         at_least: DurationLike | None = None,
@@ -598,8 +610,9 @@ class Query:
         from hybridlog.query.answers.match_times import match_times
 
         self.counters.reset()
-        return match_times(self._session, self.question, self.counters)
+        return match_times(self.session, self.question, self.counters)
 
+    @of_one_moment
     def changes(
         self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
     ) -> Intervals:
@@ -630,6 +643,7 @@ class Query:
         with self.counters.timed():
             return self._intervals().changes(fields, pause, tolerance)
 
+    @of_one_moment
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Time around each message: `t - before <= time < t + after`, within its recording.
 
@@ -649,8 +663,9 @@ class Query:
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries
 
-        return IntervalQueries(self._session, self.question, self.counters)
+        return IntervalQueries(self.session, self.question, self.counters)
 
+    @of_one_moment
     def gaps(
         self, longer_than: DurationLike | None = None, periods: float | None = None
     ) -> Intervals:
@@ -675,8 +690,9 @@ class Query:
         from hybridlog.query.answers.rates import Rates
 
         with self.counters.timed():
-            return Rates(self._session, self.question, self.counters).gaps(longer_than, periods)
+            return Rates(self.session, self.question, self.counters).gaps(longer_than, periods)
 
+    @of_one_moment
     def rate(self, window: DurationLike | None = None) -> pa.Table:
         """Number and rate of the messages of each topic.
 
@@ -697,8 +713,9 @@ class Query:
         from hybridlog.query.answers.rates import Rates
 
         with self.counters.timed():
-            return Rates(self._session, self.question, self.counters).rate(window)
+            return Rates(self.session, self.question, self.counters).rate(window)
 
+    @of_one_moment
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
 
@@ -715,8 +732,9 @@ class Query:
 
         query = self.fields(*fields) if fields else self
         with self.counters.timed():
-            return statistics(self._session, query.question, self.counters)
+            return statistics(self.session, query.question, self.counters)
 
+    @of_one_moment
     def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Test which spans of log time of a recording contain any message.
 
@@ -742,14 +760,16 @@ class Query:
         from hybridlog.query.answers.index_documents import index_documents
 
         self.counters.reset()
-        return index_documents(self._session, self.question, self.counters)
+        return index_documents(self.session, self.question, self.counters)
 
+    @of_one_moment
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
         from hybridlog.frames.answer import to_arrow
 
         return to_arrow(self._planner())
 
+    @of_one_moment
     def to_pandas(self) -> pd.DataFrame:
         """A frame of the same columns, indexed by log time (UTC, ns)."""
         from hybridlog.frames.answer import to_pandas
@@ -764,12 +784,14 @@ class Query:
 
         return stream(self._planner())
 
+    @of_one_moment
     def schema(self) -> pa.Schema | None:
         """Columns of the tables where only messages determine them; None where definitions do."""
         from hybridlog.frames.answer import schema_of
 
-        return schema_of(Planner(self._session, self.question, Counters()))
+        return schema_of(Planner(self.session, self.question, Counters()))
 
+    @of_one_moment
     def plot(self, *fields: str, ax: Axes | None = None) -> Axes:
         """Draw fields over time with matplotlib, a line for each topic and recording.
 
@@ -796,6 +818,7 @@ class Query:
         plot(axes, self, fields)
         return axes
 
+    @of_one_moment
     def resample(
         self,
         step: DurationLike,
@@ -822,7 +845,7 @@ class Query:
         """
         from hybridlog.across.align import resampled
 
-        return resampled(self._session, self.question, step, how, tolerance)
+        return resampled(self.session, self.question, step, how, tolerance)
 
     def to_json_lines(self) -> Iterator[list[str]]:
         """The answer in order as lines of JSON, many at a time."""
@@ -830,6 +853,7 @@ class Query:
 
         return lines(self._planner())
 
+    @of_one_moment
     def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked if all are alike.
 
@@ -865,25 +889,29 @@ class Query:
             return None
         self.counters.reset()
         question = replace(self.question, fields=FIELDS, tags=())
-        found = scans_in(Planner(self._session, question, self.counters))
+        found = scans_in(Planner(self.session, question, self.counters))
         return None if self.counters.unreadable or self.counters.reduced else found
 
     # Known without reading messages.
 
+    @of_one_moment
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
-        return Planner(self._session, self.question, self.counters).channels()
+        return Planner(self.session, self.question, self.counters).channels()
 
+    @of_one_moment
     def encodings(self) -> set[str]:
         """The encodings of the messages."""
-        examples = Planner(self._session, self.question, self.counters).examples
+        examples = Planner(self.session, self.question, self.counters).examples
         spoken = [channel for channel in examples if channel.stats.messages]
         return {channel.channel.message_encoding for channel in spoken or examples}
 
+    @of_one_moment
     def doubtful(self) -> list[RecordingEntry]:
         """The recordings that have losses, have not ended, or are not proved to be whole."""
-        return self._session.doubtful(self.question)
+        return self.session.doubtful(self.question)
 
+    @of_one_moment
     def lost(self) -> Lost:
         """The messages that are missing from the asked range, as the loss ledger knows.
 
@@ -894,11 +922,12 @@ class Query:
         """
         from hybridlog.query.answers.lost import Lost, lost_in
 
-        found = lost_in(self._session, self.question)
-        if any(lost_in(self._session, one.question) for one in self.conditions):
+        found = lost_in(self.session, self.question)
+        if any(lost_in(self.session, one.question) for one in self.conditions):
             found = Lost(found.messages, False, found.reduced, found.rows)
         return found
 
+    @of_one_moment
     def check_complete(self, *, payloads: bool = False) -> None:
         """Check that no message of the asked range is lost.
 
@@ -921,6 +950,7 @@ class Query:
                 "--strict the rest is given."
             )
 
+    @of_one_moment
     def remarks(self, *names: str, is_empty: bool | None = None) -> list[str]:
         """Sentences about the last answer.
 
@@ -939,19 +969,22 @@ class Query:
         found: list[str] = []
         for one in self.conditions:
             nothing = self.question.during is not None and not self.question.during
-            found += remarks(self._session, one.question, one.counters, (), is_empty=nothing)
-        found += remarks(self._session, self.question, self.counters, names, is_empty=is_empty)
+            found += remarks(self.session, one.question, one.counters, (), is_empty=nothing)
+        found += remarks(self.session, self.question, self.counters, names, is_empty=is_empty)
         return [*dict.fromkeys(found)]
 
+    @of_one_moment
     def field_types(self) -> dict[str, str] | None:
         """Paths that can be queried and their types; None when a topic has no fixed fields."""
-        return self._session.field_types(self.topics, self.question.recordings)
+        return self.session.field_types(self.topics, self.question.recordings)
 
+    @of_one_moment
     def summaries(self) -> list[RecordingSummary]:
         """The recordings in short, oldest first; some may have no message in the answer."""
-        summaries = self._session.snapshot().summaries
-        return [summaries[place] for place in self._session.chosen(self.question).tolist()]
+        places = self.session.chosen(self.question).tolist()
+        return [self.session.snapshot().summaries[place] for place in places]
 
+    @of_one_moment
     def spans(self) -> dict[str, Span]:
         """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
 
@@ -962,53 +995,58 @@ class Query:
             TimeError: the range is empty, or outside all recordings.
         """
         found: dict[str, Span] = {}
-        for part in Planner(self._session, self.question, Counters()).parts():
+        for part in Planner(self.session, self.question, Counters()).parts():
             extent = part.extent
             if extent is not None:
                 low, high = found.get(part.recording.id, extent)
                 found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
         return found
 
+    @of_one_moment
     def fingerprint(self) -> str:
         """A digest of the question and of the state of its recordings, in hexadecimal digits.
 
         As long as it is the same, so is the answer.
         """
-        snapshot = self._session.snapshot()
-        places = self._session.chosen(self.question).tolist()
+        places = self.session.chosen(self.question).tolist()
+        snapshot = self.session.snapshot()
         chosen = [snapshot.summaries[place] for place in places]
         states = [(one.id, one.look, one.status, one.messages, one.extent) for one in chosen]
         return hashlib.sha256(pickle.dumps((self.question, states), protocol=5)).hexdigest()
 
+    @of_one_moment
     def check_range(self) -> None:
         """Check that the time range overlaps a recording.
 
         Raises:
             TimeError: the range is empty, or outside all recordings.
         """
-        RangeResolver(self._session, self.question).resolve()
+        RangeResolver(self.session, self.question).resolve()
 
+    @of_one_moment
     def size_hint(self) -> int:
         """Approximate bytes of payload, for a progress bar."""
         question = self.question
         if not question.is_by_log_time:
             question = replace(question, bounds=None)
-        parts = Planner(self._session, question, Counters()).parts()
+        parts = Planner(self.session, question, Counters()).parts()
         return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
 
     # Helpers.
 
     def _with(self, **changes: Any) -> Query:
-        return Query(self._session, replace(self.question, **changes), self.conditions)
+        return Query(self.session, replace(self.question, **changes), self.conditions)
 
     def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Query:
         """The same conditions on other topics and recordings."""
-        topics, chosen = self._session.having(topics, recordings)
+        topics, chosen = self.session.having(topics, recordings)
         return self._with(topics=topics, recordings=chosen)
 
     def _planner(self) -> Planner:
+        """A planner for an answer, of a moment that begins now."""
+        self.session.renew()
         self.counters.reset()
-        return Planner(self._session, self.question, self.counters)
+        return Planner(self.session, self.question, self.counters)
 
 
 def _is_field(path: str, known: Mapping[str, str]) -> bool:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from hybridlog.losses import extent_of
 from hybridlog.query.times import TimeLike
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import REDUCED
@@ -206,8 +205,6 @@ class Part:
         Bounds of another clock do not restrict it.
         """
         whole = self.span
-        if self.recording.status == "open" and self.recording.span is not None:
-            whole = extent_of(self.recording)
         if whole is None:
             return None
         cut = np.clip(self.log_windows, *whole)

@@ -103,8 +103,9 @@ class RangeResolver:
         Raises:
             TimeError: the range is empty, or outside all recordings.
         """
-        question, snapshot = self._question, self._session.snapshot()
+        question = self._question
         places = self._session.chosen(question)
+        snapshot = self._session.snapshot()
         if question.during is not None:
             places = self._in_intervals(places, question.during)
         shared, each = None, None

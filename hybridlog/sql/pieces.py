@@ -20,7 +20,6 @@ from hybridlog.sql.columns import whole_message
 from hybridlog.sql.counts import Paths, ScanCounts
 from hybridlog.tables.fields import without
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
-from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from hybridlog.tables.reader import TablePart, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.open_segment import OpenSegment
     from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 
 _FIXED: Final = frozenset({"ros1", "cdr"})
@@ -95,42 +93,23 @@ class TopicOfRecording:
         session: The open store.
         entry: The recording.
         topic: Full name.
-        open_segments: Segments of the recording that are not sealed.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        entry: RecordingEntry,
-        topic: str,
-        open_segments: Sequence[OpenSegment] = (),
-    ) -> None:
+    def __init__(self, session: Session, entry: RecordingEntry, topic: str) -> None:
         self.session = session
         self.entry = entry
         self.topic = topic
-        self._open = open_segments
         self._read: dict[tuple[int, int], StoredChunk] = {}
         self._lock = threading.Lock()
 
     @lazy
     def channels(self) -> dict[int, RecordedChannel]:
         """Channels of the topic, by id."""
-        found = {
+        return {
             channel.channel_id: channel
             for channel in self.session.channels(self.entry)
             if channel.channel.topic == self.topic
         }
-        for segment in self._open:
-            for number, channel in segment.channels.items():
-                if channel.topic == self.topic and number not in found:
-                    stats = ChannelStats()
-                    found[number] = RecordedChannel(self.entry, number, channel, stats, None)
-        return found
-
-    @property
-    def flushed(self) -> int:
-        """Number of its messages in segments that are not sealed."""
-        return sum(segment.messages[channel] for segment in self._open for channel in self.channels)
 
     @lazy
     def arrays(self) -> PayloadArrays:
@@ -166,7 +145,7 @@ class TopicOfRecording:
     @lazy
     def table(self) -> TopicTable | None:
         """Its table; None if it can have none."""
-        if self.entry.status == "open" or any(True for _ in lost_spans(self.entry)):
+        if any(True for _ in lost_spans(self.entry)):
             return None  # rows of lost messages must not answer
         found = self.session.table(self.entry, self.topic)
         if found is None or self.is_fixed or all(len(f.about.topics) == 1 for f in found.files):
@@ -181,7 +160,7 @@ class TopicOfRecording:
         found: list[RowSource] = []
         covered: frozenset[int] = frozenset()
         chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
-        if self.entry.status == "open":
+        if self.entry.flushed:
             messages: dict[int, int] = {}
             for chunk in chunks:
                 count = sum(stats.messages for stats in chunk.stats_of(self.channels))
@@ -195,29 +174,17 @@ class TopicOfRecording:
             for chunk in chunks
             if chunk.segment not in covered
         ]
-        found += [
-            _ChunkRows(self, segment.number, place, (place.first, place.last))
-            for segment in self._open
-            for place in segment.chunks
-            if not self.channels.keys().isdisjoint(place.channels)
-        ]
         return sorted(found, key=lambda one: (one.first is not None, one.first or 0))
 
     def reader(self, segment: int) -> SegmentReader:
         """The reader of a segment."""
-        for one in self._open:
-            if one.number == segment:
-                return one.reader
         return self.session.segment(self.entry.id, segment)
 
     @lazy
     def places(self) -> dict[tuple[int, int], ChunkPlace]:
         """Positions of its chunks, by segment and number."""
         chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
-        found = {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
-        for segment in self._open:
-            found |= {(segment.number, place.number): place for place in segment.chunks}
-        return found
+        return {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
 
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
         """A chunk; those read last are at hand.

@@ -129,7 +129,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "recording": summary.label,
                 "type": ", ".join(types) or None,
                 "encoding": ", ".join(encodings) or None,
-                "messages": total.messages + found.flushed,
+                "messages": total.messages,
                 "bytes": total.payload_bytes,
                 **_times(total.first, total.last),
                 "problem": "; ".join(problems) or None,

@@ -398,6 +398,8 @@ class Tables:
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
         self._small: OrderedDict[Path, _SmallFile] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
+        # Files of running recordings, by name: each question finds the same ones and a few more.
+        self._sealed: OrderedDict[tuple[str, str], dict[str, list[TablePart]]] = OrderedDict()
         self._generation = 0
         self._lock = threading.Lock()
 
@@ -407,6 +409,7 @@ class Tables:
             self._generation += 1
             self._found.clear()
             self._small.clear()
+            self._sealed.clear()
             self._channels = None
         self._cache.clear()
 
@@ -504,12 +507,19 @@ class Tables:
         if len(schemas) != 1:
             return None
         folder = recording_folder(self._root, recording.id)
+        key = recording.id, topic
+        with self._lock:
+            known = self._sealed.pop(key, {})
         try:
-            found = list(self._own_parts(folder / topic_folder(topic)))
+            found = list(self._own_parts(folder / topic_folder(topic), known))
             for part in found:
                 _confirm(part.file, recording, topic, *schemas)
         except (FileNotFoundError, StoreError):
             return None
+        with self._lock:
+            self._sealed[key] = known
+            while sum(map(len, self._sealed.values())) > files.most_open(_OPEN_FILES):
+                self._sealed.popitem(last=False)
         segments = frozenset(int(number) for part in found for number in part.file.about.segments)
         rows = sum(part.rows for part in found)
         if not found or rows != sum(messages.get(number, 0) for number in segments):
@@ -526,8 +536,15 @@ class Tables:
             found = self._channels = recording, dict(by_topic)
         return found[1].get(topic, [])
 
-    def _own_parts(self, folder: Path) -> Iterator[TablePart]:
-        """Row groups of the files of one topic."""
+    def _own_parts(
+        self, folder: Path, known: dict[str, list[TablePart]] | None = None
+    ) -> Iterator[TablePart]:
+        """Row groups of the files of one topic.
+
+        Args:
+            folder: Its folder.
+            known: Row groups of files that are open already, by name; gets the others.
+        """
         try:
             found = files.names(folder, depth=IN_TOPIC - 1)
         except FileNotFoundError:
@@ -538,13 +555,20 @@ class Tables:
         for name in sorted(found):
             if not name.endswith(SUFFIX):
                 continue
+            if known is not None and name in known:
+                yield from known[name]
+                continue
             file = ParquetFileReader(folder / name)
             segment = max(map(int, file.about.segments), default=0)
             if not name.startswith(topic_file(file.about.schema, segment).removesuffix(SUFFIX)):
                 raise StoreError(f"The table {folder / name} has the name of another one.")
-            for group, (rows, *keys) in enumerate(file.about.bounds):
-                first, last = (keys[0], keys[1]), (keys[2], keys[3])
-                yield TablePart(file, group, 0, rows, first, last)
+            parts = [
+                TablePart(file, group, 0, rows, (keys[0], keys[1]), (keys[2], keys[3]))
+                for group, (rows, *keys) in enumerate(file.about.bounds)
+            ]
+            if known is not None:
+                known[name] = parts
+            yield from parts
 
     def _small_parts(self, path: Path, topic: str) -> Iterator[TablePart]:
         """Rows of a topic in a file of several topics."""

@@ -17,6 +17,7 @@ from starlette.routing import Route
 from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.export.slice_cache import SliceCache
+from hybridlog.losses import extent_of
 from hybridlog.view.asked import Asked
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.lazy import lazy
@@ -24,7 +25,6 @@ from hybridlog_storage.lazy import lazy
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-    from hybridlog.drawing.flushed import FlushedMessages
     from hybridlog.query.query import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
@@ -69,17 +69,13 @@ class Context:
         """MCAP files of selections."""
         return SliceCache()
 
-    @lazy
-    def flushed(self) -> FlushedMessages:
-        """Flushed messages of running recordings."""
-        from hybridlog.drawing.flushed import FlushedMessages
-
-        return FlushedMessages(self.store.session)
-
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Wait until few enough answers are being worked out, and be one of them."""
-        with self._working:
+        """Wait until few enough answers are being worked out, and be one of them.
+
+        The answer is about the recordings of one moment.
+        """
+        with self._working, self.store.at_one_moment():
             yield
 
     def refresh(self) -> None:
@@ -110,16 +106,30 @@ class Context:
         known = {channel.topic for channel in recording.channels}
         for topic in topics:
             if topic not in known:
-                is_open = recording.status == "open"
-                yet = " yet: it is being recorded, so ask again soon" if is_open else ""
-                raise TopicError(f"{recording.label} has no topic {topic!r}{yet}.")
+                raise TopicError(f"{recording.label} has no topic {topic!r}.")
         return self.store.query(topics, [recording.id])
+
+    def topic(self, asked: Asked) -> tuple[RecordingEntry, Query]:
+        """The recording, and a query about its topic that the parameter `topic` names.
+
+        Raises:
+            TopicError: No such recording or topic exists.
+            UsageError: A parameter is missing or out of bounds.
+        """
+        recording = self.recording(asked)
+        return recording, self.query(recording, asked.text("topic"))
 
 
 def start_of(recording: RecordingEntry) -> int:
     """The time that offsets count from, ns: of the first message, else of the recording."""
     span = recording.span
     return recording.created if span is None else span[0]
+
+
+def extent(recording: RecordingEntry) -> tuple[int, int]:
+    """Log time `[begin, end)` of a recording, ns; empty when it was made if it has no messages."""
+    begin, end = extent_of(recording)
+    return (begin, end) if begin < end else (recording.created, recording.created)
 
 
 Answer: TypeAlias = "Callable[[Context, Asked], Any]"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog.view.topic import Topic
+from hybridlog.query.answers.next_time import next_time
+from hybridlog.view.context import start_of
+from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
@@ -49,14 +52,17 @@ def current(context: Context, asked: Asked) -> Current:
         TopicError: No such recording or topic exists.
         UsageError: A parameter is missing or out of bounds.
     """
-    topic = Topic(context, asked)
-    moment = asked.moment(topic.start)
-    message = topic.at(moment)
+    recording, query = context.topic(asked)
+    start = start_of(recording)
+    moment = asked.moment(start)
+    message = None
+    with suppress(TopicError):  # there is none yet
+        message = query.at(moment)
     # Of messages with the same time, the last one is current: the next one is later.
     later = moment if message is None else message.log_time_ns + 1
-    until = topic.next_time(later)
+    until = next_time(context.store.session, recording, query.topics[0], later)
     return Current(
         message,
-        None if message is None else str(message.log_time_ns - topic.start),
-        None if until is None else str(until - topic.start),
+        None if message is None else str(message.log_time_ns - start),
+        None if until is None else str(until - start),
     )

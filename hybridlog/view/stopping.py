@@ -39,13 +39,17 @@ def stoppable_route(path: str, answer: Answer) -> Route:
         answer: Works out the answer. It waits for its turn by itself.
     """
 
+    def answered(context: Context, asked: Asked, stopped: threading.Event) -> Any:
+        with context.store.at_one_moment():
+            return answer(context, asked, stopped)
+
     async def endpoint(request: Request) -> Response:
         stopped = threading.Event()
         context: Context = request.app.state.context
         watching = asyncio.create_task(_wait_until_gone(request, stopped))
         try:
             asked = Asked(request.query_params)
-            return json_response(await run_in_threadpool(answer, context, asked, stopped))
+            return json_response(await run_in_threadpool(answered, context, asked, stopped))
         except HybridlogError as error:
             return error_response(error)
         finally:

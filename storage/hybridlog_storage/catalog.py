@@ -53,6 +53,8 @@ from hybridlog_storage.times import BEGIN, END, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog_storage.open_segment import Flushed
+
 CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""
 _JOURNAL: Final = f"{CATALOG}-journal"
@@ -216,6 +218,8 @@ class RecordingEntry:
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
         payloads: Files with columns of payloads: `file`, `bytes`, `digest`, `topic`, `messages`.
+        flushed: Content of segments that are not sealed, by number, at one moment; the
+            catalog's file does not have it.
     """
 
     id: str
@@ -238,6 +242,7 @@ class RecordingEntry:
     digests: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
     payloads: list[dict[str, Any]] = field(default_factory=list)
+    flushed: dict[int, Flushed] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<Recording {self.label}; {len(self.channels)} channels, {self.messages} messages>"
@@ -282,8 +287,9 @@ class RecordingEntry:
             }
             for channel in self.channels
         ]
-        rest = replace(self, channels=[])
-        return {**asdict(rest), "channels": channels}
+        values = asdict(replace(self, channels=[], flushed={}))
+        del values["flushed"]
+        return {**values, "channels": channels}
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> RecordingEntry:
@@ -308,7 +314,7 @@ class ChunkEntry:
         length: Bytes of the chunk record.
         trailer: Bytes of message indexes and arrival numbers behind it.
         crc: CRC-32 of the stored chunk record; None while the segment is open.
-        trailer_crc: CRC-32 of the trailer; None while the segment is open.
+        trailer_crc: CRC-32 of the trailer; None if unknown.
         first: Least log time, ns.
         last: Greatest log time, ns.
         stats: By channel id.
@@ -412,7 +418,7 @@ def channel_totals(
             last=int(rows["last"].max()),
             longest=int((rows["last"] - rows["first"]).max()),
         )
-        if channel not in silent:
+        if channel not in silent and not table.is_flushed:
             stats.first_publish = int(rows["first_publish"].min())
             stats.last_publish = int(rows["last_publish"].max())
         if stamps is not None:
@@ -1004,6 +1010,8 @@ class Catalog:
     def _table(
         self, entry: RecordingEntry, number: int
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
+        if number in entry.flushed:
+            return entry.flushed[number].table, None
         key = entry.id, number, entry.digests.get(str(number), "")
         with self._reading() as db:
             cached = self._tables.get(key)
@@ -1085,7 +1093,8 @@ def chunk_entries(
         return []
     chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
     edges = table.part_bounds().tolist()
-    silent = {c.id for c in entry.channels if not c.has_publish_time}
+    # The publish times of flushed chunks stand in their messages only.
+    silent = {c.id for c in entry.channels if table.is_flushed or not c.has_publish_time}
     found = []
     for number in distinct(chunk_of[wanted]).tolist():
         chunk = table.chunks[number]
@@ -1099,7 +1108,7 @@ def chunk_entries(
                 int(chunk["offset"]),
                 int(chunk["length"]),
                 int(chunk["trailer"]),
-                int(chunk["crc"]),
+                None if table.is_flushed else int(chunk["crc"]),
                 int(chunk["trailer_crc"]),
                 int(chunk["first"]),
                 int(chunk["last"]),

@@ -78,11 +78,14 @@ class ChunkTable:
         chunks: `CHUNK`[n], in file order; the row is the chunk's number.
         parts: `PART`[m], chunk by chunk, by channel id within one.
         others: `OTHER`[k], in file order.
+        is_flushed: The segment is not sealed yet: CRC-32 of chunks are 0, publish times are
+            unknown, and the table covers chunks and indexed records only.
     """
 
     chunks: NDArray[np.void]
     parts: NDArray[np.void]
     others: NDArray[np.void]
+    is_flushed: bool = False
 
     @property
     def end(self) -> int:
@@ -162,7 +165,7 @@ class ChunkTable:
         for count, size, dtype in zip(counts, sizes, _DTYPES, strict=True):
             arrays.append(np.frombuffer(raw, dtype, count, at))
             at += size
-        table = cls(*arrays)
+        table = cls(arrays[0], arrays[1], arrays[2])
         problem = _problem(table)
         if problem is not None:
             raise SegmentError(f"the chunk table is damaged: {problem}")

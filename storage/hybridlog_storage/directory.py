@@ -19,6 +19,7 @@ import os
 import re
 import secrets
 import stat
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -41,6 +42,7 @@ REMOVED: Final = ".removed-"
 IMPORTING: Final = ".importing-"
 """Prefix of the directory of a recording that is being imported."""
 _RECORDINGS: Final = "recordings"
+_TICK_NS: Final = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +181,17 @@ class StoreDirectory:
             return []
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
+
+    def changed(self) -> int:
+        """When a recording got or lost its name last, ns; 0 if that was just now, or is unknown.
+
+        Within a tick of the file system's clock another change would show the same time.
+        """
+        try:
+            changed = files.status(self.recordings, depth=files.IN_STORE).st_mtime_ns
+        except OSError:
+            return 0
+        return 0 if abs(time.time_ns() - changed) < _TICK_NS else changed
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
         """The look of each recording's directory, by label.

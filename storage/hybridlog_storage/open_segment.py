@@ -1,179 +1,283 @@
 """Reads a segment while another process writes it.
 
-Its chunks follow one another, each with its message indexes and arrival numbers behind it.
-What a writer has not finished yet is left out: a chunk counts once its arrival numbers are
-in the file.
+Its chunks follow one another, each with its message indexes and arrival numbers behind it. A
+chunk counts once its arrival numbers are in the file; what the writer has not finished yet is
+left out. The chunks become rows of a `ChunkTable`, as those of a sealed segment are.
 """
 
 from __future__ import annotations
 
-import struct
-from collections import Counter
-from contextlib import suppress
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numpy as np
 from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Metadata, MetadataIndex
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema as SchemaRecord
 
+from hybridlog_storage.attachments import MAX_HEAD, parse_attachment
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable, parts_of
+from hybridlog_storage.compression import FilePart
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import RECORD_HEAD, read_record
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, read_record
 from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segment_format import (
     ARRIVAL_OPCODE,
+    CHUNK_HEAD,
+    LOSSES_METADATA,
     MAGIC,
+    OUR_NAMES,
     PADDING_OPCODE,
     channel_of,
-    message_times,
+    index_order,
+    json_of,
+    split_trailer,
 )
-from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader, loss_rows
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
-_SPAN: Final = struct.Struct("<QQ")  # first and last log time, at the beginning of a chunk
-_INDEX: Final = struct.Struct("<HI")  # channel and size, at the beginning of a message index
-_ENTRY: Final = 16  # bytes of a message in an index
-_AROUND: Final = frozenset(
-    {
-        Opcode.HEADER,
-        Opcode.METADATA,
-        Opcode.METADATA_INDEX,
-        Opcode.ATTACHMENT,
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        PADDING_OPCODE,
-    }
-)
+_WINDOW: Final = 4096  # bytes read at once around the heads of records
+_UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
+_PASSED: Final = frozenset({Opcode.HEADER, Opcode.METADATA_INDEX, PADDING_OPCODE})
+
+
+class Flushed(NamedTuple):
+    """What a segment has at one moment, as the summary of a sealed one says it.
+
+    Attributes:
+        table: Its chunks.
+        attachments: Attachments of the source, in file order.
+        metadata: Metadata records of the source, in file order.
+    """
+
+    table: ChunkTable
+    attachments: Sequence[AttachmentIndex]
+    metadata: Sequence[MetadataIndex]
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A flushed record that cannot be read.
+
+    Attributes:
+        offset: Byte of the file where it starts.
+        length: Its bytes.
+        reason: The damage.
+    """
+
+    offset: int
+    length: int
+    reason: str
 
 
 class OpenSegment:
-    """The chunks that a segment has at this moment.
+    """The content that a segment has at this moment.
 
     Args:
-        path: The file; it may be sealed meanwhile.
-        number: Its number in the recording.
+        recording: The recording's directory.
+        number: Number of the segment; it may be sealed meanwhile.
 
     Attributes:
         number: Its number in the recording.
         reader: Reads its chunks.
         channels: Channels by id, as far as they are defined.
-        messages: Number of messages in its chunks, by channel id.
-        chunks: Its chunks, in file order. Their checksums are unknown, so `read_chunk`
-            compares everything with the checked content.
+        losses: Rows of the loss ledger written so far.
+        damaged: Chunks and other records that cannot be read.
+        end: Bytes that are read.
 
     Raises:
         SegmentError: It cannot be opened, or is no segment.
     """
 
-    def __init__(self, path: Path, number: int) -> None:
+    def __init__(self, recording: Path, number: int) -> None:
         self.number = number
-        self.reader = SegmentReader(path, number)
-        self.channels: dict[int, Channel] = {}
-        self.messages: Counter[int] = Counter()
-        self.chunks: list[ChunkPlace] = []
-        self._schemas: dict[int, SchemaRecord] = {}
-        self._chunk: tuple[int, int, int, int] | None = None  # start, length, first, last
-        self._indexed: dict[int, int] = {}  # messages of the last chunk, by channel
-        self._at = len(MAGIC)
-        self.advance()
+        try:
+            self.reader = SegmentReader(recording / f"{number:06d}{OPEN_SUFFIX}", number)
+        except SegmentError:  # it may have been sealed just now
+            self.reader = SegmentReader(recording / sealed_name(number), number)
+        self._begin()
 
-    def advance(self) -> None:
-        """Find the chunks that were written since, also if the segment was sealed meanwhile.
+    def _begin(self) -> None:
+        self.channels: dict[int, Channel] = {}
+        self.losses: list[dict[str, Any]] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self.damaged: list[Damage] = []
+        self.end = len(MAGIC)
+        self._schemas: dict[int, SchemaRecord] = {}
+        self._chunk: tuple[int, int] | None = None  # offset and length of the last chunk record
+        self._chunks: list[tuple[int, ...]] = []
+        self._parts: list[NDArray[np.void]] = []
+        self._others: list[tuple[int, int, int]] = []
+        self._flushed: Flushed | None = None
+
+    @property
+    def flushed(self) -> Flushed:
+        """What it has so far."""
+        if self._flushed is None:
+            parts = np.concatenate([np.empty(0, PART), *self._parts])
+            self._parts = [parts]
+            chunks, others = np.array(self._chunks, CHUNK), np.array(self._others, OTHER)
+            table = ChunkTable(chunks, parts, others, is_flushed=True)
+            self._flushed = Flushed(table, tuple(self._attachments), tuple(self._metadata))
+        return self._flushed
+
+    def follow(self) -> bool:
+        """Read what was flushed since, also if the segment was sealed meanwhile.
+
+        Returns:
+            True if there is anything new.
 
         Raises:
             SegmentError: The file cannot be read.
         """
         self.reader.grow()
-        size = self.reader.size
-        while self._at + RECORD_HEAD.size <= size:
-            opcode, length = RECORD_HEAD.unpack(self.reader.read(self._at, RECORD_HEAD.size))
-            end = self._at + RECORD_HEAD.size + length
-            if end > size or not self._take(opcode, self._at, length):
-                return
-            self._at = end
-
-    def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
-        """Log times of the messages of one of `chunks` by channel, without its messages.
-
-        Message indexes have no checksum before the segment is sealed. They are compared with
-        the head of the chunk; if they contradict it, the checked content is read instead.
-
-        Returns:
-            int64[n], ns, ascending, by channel id.
-
-        Raises:
-            SegmentError: The chunk is damaged.
-        """
-        with suppress(SegmentError):
-            times = message_times(self.reader.read(place.offset + place.length, place.trailer))
-            if _is_plausible(times, place):
-                return times
-        return self.reader.read_times(place)
+        size, before = self.reader.size, self.end
+        if size < before:  # the writer took its last chunks back, on a full disk
+            self._begin()
+        window, start = memoryview(b""), 0
+        at = self.end if self._chunk is None else self._chunk[0] + self._chunk[1]
+        while at + RECORD_HEAD.size <= size:
+            if at + CHUNK_HEAD.size > start + len(window):
+                try:
+                    start, window = at, self.reader.read(at, min(_WINDOW, size - at))
+                except SegmentError:  # the writer has just cut the padding behind its last block
+                    self.reader.grow()
+                    if self.reader.size >= size:
+                        raise
+                    size = self.reader.size
+                    continue
+            opcode, length = RECORD_HEAD.unpack_from(window, at - start)
+            behind = at + RECORD_HEAD.size + length
+            if behind > size:
+                break
+            try:
+                if not self._take(opcode, at, behind - at):
+                    break
+            except SegmentError as error:
+                self.damaged.append(Damage(at, behind - at, str(error)))
+            at = behind
+            if self._chunk is None:
+                self.end = at
+        return self.end != before
 
     def _take(self, opcode: int, at: int, length: int) -> bool:
-        """Take a record; False for one that no open segment has."""
-        content = at + RECORD_HEAD.size
-        if opcode == Opcode.CHUNK and length >= _SPAN.size:
-            first, last = _SPAN.unpack(self.reader.read(content, _SPAN.size))
-            self._chunk = at, RECORD_HEAD.size + length, first, last
-            self._indexed = {}
-        elif opcode == Opcode.MESSAGE_INDEX and length >= _INDEX.size:
-            channel, size = _INDEX.unpack(self.reader.read(content, _INDEX.size))
-            self._indexed[channel] = size // _ENTRY
+        """Take a whole record; False for one that no open segment has."""
+        if opcode == Opcode.CHUNK and length > CHUNK_HEAD.size:
+            self._chunk = at, length
+        elif opcode == Opcode.MESSAGE_INDEX and self._chunk is not None:
+            pass  # read with the arrival numbers
         elif opcode == ARRIVAL_OPCODE and self._chunk is not None:
-            start, size, first, last = self._chunk
-            self._chunk = None
-            self.messages.update(self._indexed)
-            self.chunks.append(
-                ChunkPlace(
-                    number=len(self.chunks),
-                    offset=start,
-                    length=size,
-                    trailer=content + length - start - size,
-                    first=first,
-                    last=last,
-                    channels=tuple(self._indexed),
-                )
-            )
-        elif opcode not in _AROUND:
-            return False
-        if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            self._define(opcode, self.reader.read(content, length))
+            (offset, size), self._chunk = self._chunk, None
+            self._add_chunk(offset, size, at + length - offset - size)
+        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            record, _ = read_record(opcode, self._content(at, length))
+            if isinstance(record, SchemaRecord):
+                self._schemas[record.id] = record
+            elif isinstance(record, ChannelRecord):
+                self.channels[record.id] = channel_of(record, self._schemas)
+        elif opcode == Opcode.METADATA:
+            self._add_metadata(at, length)
+        elif opcode == Opcode.ATTACHMENT:
+            self._add_attachment(at, length)
+        else:
+            return opcode in _PASSED
         return True
 
-    def _define(self, opcode: int, content: memoryview) -> None:
-        record, _ = read_record(opcode, content)
-        if isinstance(record, SchemaRecord):
-            self._schemas[record.id] = record
-        elif isinstance(record, ChannelRecord):
-            self.channels[record.id] = channel_of(record, self._schemas)
+    def _content(self, at: int, length: int) -> memoryview:
+        return self.reader.read(at + RECORD_HEAD.size, length - RECORD_HEAD.size)
+
+    def _add_chunk(self, offset: int, length: int, trailer: int) -> None:
+        """Add a chunk, by its message indexes; if they are damaged, by its messages."""
+        head = CHUNK_HEAD.unpack(self.reader.read(offset, CHUNK_HEAD.size))
+        behind = self.reader.read(offset + length, trailer)
+        first, last, size = int(head[2]), int(head[3]), int(head[4])
+        parts = _parts_by_index(behind, (first, last), size)
+        if parts is None:
+            place = ChunkPlace(
+                number=len(self._chunks),
+                offset=offset,
+                length=length,
+                trailer=trailer,
+                first=first,
+                last=last,
+                channels=(),
+            )
+            try:
+                batch = self.reader.read_chunk(place).batch
+                order = index_order(batch.channel, batch.log_time)
+                parts, first, last = parts_of(batch, order)
+            except SegmentError as error:
+                self.damaged.append(Damage(offset, length, str(error)))
+                parts, first, last = np.empty(0, PART), 0, 0
+        row = (offset, length, trailer, 0, crc32(behind), first, last, len(parts))
+        self._chunks.append(row)
+        self._parts.append(parts)
+        self._flushed = None
+
+    def _add_metadata(self, at: int, length: int) -> None:
+        record, _ = read_record(Opcode.METADATA, self._content(at, length))
+        assert isinstance(record, Metadata)
+        if record.name == LOSSES_METADATA:
+            self.losses += loss_rows(json_of(record))
+        elif not record.name.startswith(OUR_NAMES):
+            self._metadata.append(MetadataIndex(offset=at, length=length, name=record.name))
+            self._add_other(at, length)
+
+    def _add_attachment(self, at: int, length: int) -> None:
+        head = self._content(at, min(length, MAX_HEAD))
+        start, size = at + RECORD_HEAD.size, length - RECORD_HEAD.size
+        with self.reader.stream() as file:
+            found, _ = parse_attachment(head, FilePart(file, start, size))
+        self._attachments.append(found.index(at, length))
+        self._add_other(at, length)
+
+    def _add_other(self, at: int, length: int) -> None:
+        self._others.append((at, length, self.reader.checksum(at, length)))
+        self._flushed = None
 
 
-def _is_plausible(times: dict[int, NDArray[np.int64]], place: ChunkPlace) -> bool:
-    """True if log times are in order and have the span that the head of the chunk says."""
-    columns = list(times.values())
-    if not columns or not all(len(t) and bool((t[1:] >= t[:-1]).all()) for t in columns):
-        return False
-    first, last = min(int(t[0]) for t in columns), max(int(t[-1]) for t in columns)
-    return (first, last) == (place.first, place.last)
-
-
-def open_segment(path: Path, number: int) -> OpenSegment | None:
-    """The chunks of an open segment; None if it was sealed or removed meanwhile.
+def _parts_by_index(
+    trailer: memoryview, span: tuple[int, int], size: int
+) -> NDArray[np.void] | None:
+    """Statistics of each channel in a chunk, from its message indexes.
 
     Args:
-        path: The file.
-        number: Its number in the recording.
+        trailer: The message indexes and the arrival numbers.
+        span: First and last log time, ns, by the head of the chunk.
+        size: Bytes of its content.
 
-    Raises:
-        SegmentError: It cannot be read.
+    Returns:
+        `PART`[c], by channel id; None if the indexes contradict the head.
     """
     try:
-        return OpenSegment(path, number)
+        indexes, _ = split_trailer(trailer)
     except SegmentError:
-        if path.exists():
-            raise
         return None
+    if not indexes or not all(len(rows) for _, rows in indexes):
+        return None
+    times = [rows["log_time"].astype(np.int64) for _, rows in indexes]
+    starts = np.concatenate([rows["offset"] for _, rows in indexes]).astype(np.int64)
+    counts = np.array([len(rows) for _, rows in indexes])
+    order = np.argsort(starts, kind="stable")
+    sizes = np.empty(len(starts), np.int64)
+    sizes[order] = np.diff(starts[order], append=size) - MESSAGE_HEAD.itemsize
+    channels = [channel for channel, _ in indexes]
+    is_whole = starts[order[0]] == 0 and (sizes >= 0).all() and channels == sorted(set(channels))
+    if not is_whole or not all((t[1:] >= t[:-1]).all() for t in times):
+        return None
+    parts = np.empty(len(indexes), PART)
+    parts["channel"], parts["messages"] = channels, counts
+    parts["payload_bytes"] = np.add.reduceat(sizes, np.cumsum(counts) - counts)
+    parts["first"], parts["last"] = [t[0] for t in times], [t[-1] for t in times]
+    parts["first_publish"], parts["last_publish"] = _UNKNOWN.min, _UNKNOWN.max
+    if (int(parts["first"].min()), int(parts["last"].max())) != span:
+        return None
+    return parts

@@ -649,7 +649,7 @@ def places_of(table: ChunkTable) -> list[ChunkPlace]:
             first=first,
             last=last,
             channels=tuple(channels[bounds[number] : bounds[number + 1]]),
-            crc=crc,
+            crc=None if table.is_flushed else crc,
             trailer_crc=trailer_crc,
         )
         for number, (offset, length, trailer, first, last, crc, trailer_crc) in enumerate(

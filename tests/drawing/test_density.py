@@ -6,7 +6,9 @@ import random
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +22,10 @@ from hybridlog.drawing import density_cache
 from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog.drawing.density import count, density, reading_work
 from hybridlog.drawing.density_cache import DensityCache
-from hybridlog_storage.errors import SegmentError, TopicError
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.open_segment import OpenSegment
+from hybridlog_storage.open_segment import Flushed
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segment_writer import SegmentSettings
 
@@ -267,9 +270,17 @@ A, B = (Channel(name, "json", None) for name in ("/a", "/b"))
 
 
 def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is flushed counts, and sealing changes nothing."""
+    """What is flushed counts once, and sealing changes nothing."""
     settings = SegmentSettings(chunk_size=4096, segment_size=30_000, compression="none")
     span = BASE, BASE + 1000
+    added: list[int] = []
+    count = density_cache.count
+
+    def counted(chunks: RecordedChunks, *args: Any, since: int = 0) -> Any:
+        added.append(chunks.size - since)
+        return count(chunks, *args, since=since)
+
+    monkeypatch.setattr(density_cache, "count", counted)
     with (
         hl.open(tmp_path / "store", create=True) as writing,
         writing.start("live", settings=settings, flush_interval_s=0.05) as recording,
@@ -280,10 +291,7 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             cache.density(store.entry("live"), span, 10, ["/a"])
 
         def ask() -> NDArray[np.int64]:
-            return cache.density(store.entry("live"), span, 2000, ["/a", "/b"]).counts
-
-        def running() -> int:
-            return sum(one.messages for one in cache.running(store.entry("live")).values())
+            return cache.density(store.entry("live"), span, 1000, ["/a", "/b"]).counts
 
         written = 0
         for channel, messages in ((A, 100), (B, 60), (A, 1500)):
@@ -291,60 +299,64 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
                 recording.write(channel, b"[1, 2, 3]", log_time=BASE + written // 2)
                 written += 1
             until = time.monotonic() + 60
-            while running() + store.entry("live").messages != written:
+            while (entry := store.entry("live")).messages != written:
                 assert time.monotonic() < until
                 time.sleep(0.02)
+                if written > 160:
+                    ask()  # segments are sealed meanwhile
             if channel is B:
                 assert ask().sum() == 160
         found = ask()
         assert found.sum() == written
         assert found[0][:50].tolist() == [2] * 50
         assert found[1][50:80].tolist() == [2] * 30
-        assert running() == written
-        b = cache.running(store.entry("live"))["/b"]
-        assert (b.messages, b.first, b.last) == (60, BASE + 50, BASE + 79)
-        assert store.directory.listing("live").sealed
-        store.refresh()
+        entry = store.entry("live")
+        assert entry.flushed
+        assert entry.digests
+        parts = sum(len(store.session.chunk_table(entry, n).parts) for n, _, _ in entry.spans)
+        # All topics are counted together, but for /b, which came later.
+        assert sum(added) <= 2 * parts
+        added.clear()
         assert (ask() == found).all()
-        sealed = store.entry("live").messages
-        assert 0 < sealed == written - running()
-        chunks = RecordedChunks(store.session, store.entry("live"))
-        assert not set(map(str, chunks._open)) & store.entry("live").digests.keys()
-        plain = density(store.session, store.entry("live"), span, 1000, ["/a", "/b"])
+        assert not added
+        plain = density(store.session, entry, span, 1000, ["/a", "/b"])
         assert (plain.counts == found).all()
         recording.close()
-        store.refresh()
         assert store.entry("live").status == "complete"
-        assert running() == 0
         assert (ask() == found).all()
 
 
-def test_indexes_of_open_segments_are_compared_with_their_chunks(
-    store: hl.Store, tmp_path: Path
+def test_a_segment_that_was_written_again_is_counted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry = store.entry("a")
-    path = store.directory.recording("a") / "000000.mcap"
-    whole = OpenSegment(path, 0)
-    assert len(whole.chunks) == len(store.session.chunk_table(entry, 0).chunks)
-    place = whole.chunks[3]
-    right = whole.reader.read_times(place)
-    assert {c: t.tolist() for c, t in whole.read_times(place).items()} == {
-        c: t.tolist() for c, t in right.items()
-    }
-    at = place.offset + place.length + 15  # the first log time in its indexes
-    for by in (-LENGTH, LENGTH):  # still in order, and not
-        content = bytearray(path.read_bytes())
-        wrong = int.from_bytes(content[at : at + 8], "little") + by
-        content[at : at + 8] = wrong.to_bytes(8, "little")
-        (tmp_path / "000000.mcap.open").write_bytes(content)
-        with pytest.raises(SegmentError, match="damaged"):
-            OpenSegment(tmp_path / "000000.mcap.open", 0).read_times(place)
-    # A segment that grows is read on, not again.
-    growing_path = tmp_path / "000001.mcap.open"
-    growing_path.write_bytes(path.read_bytes()[: place.offset + 5])
-    growing = OpenSegment(growing_path, 1)
-    assert len(growing.chunks) == 3
-    growing_path.write_bytes(path.read_bytes())
-    growing.advance()
-    assert growing.chunks == whole.chunks
-    assert growing.messages == whole.messages
+    """On a full disk a writer takes back what it wrote last."""
+    with hl.open(tmp_path / "store", create=True) as store:
+        table = {}
+        for name in ("one", "other"):
+            with store.start(name, settings=SETTINGS) as recording:
+                for n in range(2000):
+                    by = 500 if name == "other" and n >= 1500 else 0
+                    recording.write(A, b"[1]", log_time=BASE + n + by)
+            table[name] = store.session.chunk_table(store.entry(name), 0)
+        entry = store.entry("one")
+        (segment, first, _) = entry.spans[0]
+
+        def flushed(name: str, count: int) -> RecordingEntry:
+            whole = table[name]
+            parts = whole.parts[: int(whole.chunks["parts"][:count].sum())]
+            now = replace(whole, chunks=whole.chunks[:count], parts=parts, is_flushed=True)
+            span = segment, first, int(parts["last"].max())
+            content = {segment: Flushed(now, (), ())}
+            return replace(entry, status="open", digests={}, flushed=content, spans=[span])
+
+        few = len(table["one"].chunks) - 2
+        chunks = RecordedChunks(store.session, flushed("one", few))
+        chunks.load((BASE, BASE + 10_000))
+        known = chunks.size
+        assert chunks.follow(flushed("one", few + 1))
+        chunks.load((BASE, BASE + 10_000))
+        assert chunks.size == known + 1
+        assert not chunks.follow(flushed("one", few))
+        chunks = RecordedChunks(store.session, flushed("one", few + 1))
+        chunks.load((BASE, BASE + 10_000))
+        assert not chunks.follow(flushed("other", few + 2))

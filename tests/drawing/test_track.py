@@ -16,7 +16,6 @@ from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
-from hybridlog.drawing.flushed import FlushedMessages
 from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
 from hybridlog.query.topics import TopicMatcher
 from hybridlog_storage.errors import UsageError
@@ -168,7 +167,7 @@ def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
 
 
 def test_a_recording_that_goes_on(tmp_path: Path) -> None:
-    """Its track is that of all that is flushed, and in its end that of a query."""
+    """Its track is that of all that is flushed, and stays the same when it ends."""
     path = tmp_path / "store"
     count = 60
     with hl.open(path, create=True) as writing, hl.open(path) as store:
@@ -177,27 +176,24 @@ def test_a_recording_that_goes_on(tmp_path: Path) -> None:
             for at in range(count):
                 place = payload(48 + at / 1000, 11.0, -1 if at == 50 else 0)
                 recorder.write(channel("/fix"), place, log_time=BASE + at * MS)
-            following, until = FlushedMessages(store.session), monotonic() + 60
-            found = 0
-            while found < count:
+            until = monotonic() + 60
+            while not store.topics() or store.topic("fix").count() < count:
                 assert monotonic() < until
                 sleep(0.02)
-                store.refresh()
-                entry = store.entry("live")
-                flushed = following.of(entry, "/fix")
-                found = entry.messages + flushed.count
-            query = store.query(["/fix"], [entry.id]) if entry.messages else None
-            assert flushed.count
-            got = track(query, pixels=1000, flushed=flushed)
-            part = track(query, pixels=1000, flushed=flushed, span=(BASE + 40 * MS, BASE + 55 * MS))
-        store.refresh()
+            assert store.entry("live").flushed
+            assert store.entry("live").digests
+            got = track(store.topic("fix"), pixels=1000)
+            part = track(store.topic("fix"), pixels=1000, span=(BASE + 40 * MS, BASE + 55 * MS))
         whole = track(store.topic("fix"), pixels=1000)
     assert (got.messages, got.fixes, got.exact) == (count, count - 1, True)
     assert got.times.tolist() == whole.times.tolist() == [BASE + at * MS for at in range(count)]
     assert np.array_equal(got.xy, whole.xy, equal_nan=True)
     assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [50]
     assert part.times.tolist() == whole.times[40:55].tolist()
-    nothing = track(None, pixels=5)
+
+
+def test_a_span_without_messages_has_no_track(store: hl.Store) -> None:
+    nothing = track(store.topic("json"), pixels=5, span=(0, 1))
     assert (nothing.messages, nothing.grid) == (0, None)
 
 

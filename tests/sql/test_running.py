@@ -14,8 +14,8 @@ import hybridlog as hl
 from hybridlog.live import LiveRecording
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.open_segment import OpenSegment, open_segment
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.open_segment import OpenSegment
+from hybridlog_storage.segment_reader import SegmentReader, places_of
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.sql.conftest import SCAN, scan
 from tests.tables.logs import BASE, STATE, payload
@@ -132,29 +132,33 @@ def test_a_segment_is_read_up_to_its_last_whole_chunk(
     path = tmp_path / found[0].name
     for cut in (0, 7, ends[0] - 1, ends[0], ends[1] - 1, ends[1], ends[1] + 5, len(data)):
         path.write_bytes(data[:cut])
-        segment = OpenSegment(path, 0)
-        wanted = [place for place, end in zip(summary.chunks, ends, strict=True) if end <= cut]
-        assert [(p.number, p.offset, p.length, p.trailer) for p in segment.chunks] == [
-            (p.number, p.offset, p.length, p.trailer) for p in wanted
-        ]
-        assert [(p.first, p.last) for p in segment.chunks] == [(p.first, p.last) for p in wanted]
+        segment = OpenSegment(tmp_path, 0)
+        segment.follow()
+        count = sum(end <= cut for end in ends)
+        table = segment.flushed.table
+        for name in ("offset", "length", "trailer", "trailer_crc", "first", "last", "parts"):
+            assert (table.chunks[name] == summary.table.chunks[name][:count]).all()
+        parts = int(table.chunks["parts"].sum())
+        for name in ("channel", "messages", "payload_bytes", "first", "last"):
+            assert (table.parts[name] == summary.table.parts[name][:parts]).all()
         known = {number: str(summary.channels[number]) for number in segment.channels}
         assert {n: str(channel) for n, channel in segment.channels.items()} == known
-        assert segment.messages.total() == sum(
-            len(segment.reader.read_chunk(place).batch) for place in wanted
-        )
-        assert not wanted or known.keys() == summary.channels.keys()
-        for place in segment.chunks:
+        assert not count or known.keys() == summary.channels.keys()
+        for place in places_of(table):
             assert len(segment.reader.read_chunk(place).batch) > 0
     path.write_bytes(data[: ends[0]] + bytes(4096))  # room reserved by its writer
-    assert len(OpenSegment(path, 0).chunks) == 1
+    segment = OpenSegment(tmp_path, 0)
+    segment.follow()
+    assert len(segment.flushed.table.chunks) == 1
     flipped = bytearray(data[: ends[0]])
     flipped[summary.chunks[0].offset + 100] ^= 1
     path.write_bytes(flipped)
-    segment = OpenSegment(path, 0)
+    segment = OpenSegment(tmp_path, 0)
+    segment.follow()
     with pytest.raises(SegmentError, match="damaged"):
-        segment.reader.read_chunk(segment.chunks[0])
-    assert open_segment(tmp_path / "000009.mcap.open", 9) is None
+        segment.reader.read_chunk(places_of(segment.flushed.table)[0])
+    with pytest.raises(SegmentError):
+        OpenSegment(tmp_path, 9)
     (tmp_path / "000008.mcap.open").mkdir()
     with pytest.raises(SegmentError):
-        open_segment(tmp_path / "000008.mcap.open", 8)
+        OpenSegment(tmp_path, 8)

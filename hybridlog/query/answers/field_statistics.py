@@ -132,7 +132,7 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
             if not numeric:
                 continue
             one = replace(one, fields=numeric)
-        snapshot = session.snapshot()
+        snapshot = session.look(one.recordings)
         having = {snapshot.summaries[place].id for place in session.chosen(one).tolist()}
         running: dict[str, _Running] = {}
         for recording in recordings:

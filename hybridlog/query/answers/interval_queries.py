@@ -171,8 +171,8 @@ class IntervalQueries:
 
     def _asks(self, recording: str) -> bool:
         """True if a recording belongs to the question."""
-        place = self._session.snapshot().by_id.get(recording, -1)
         places = self._session.chosen(self._question)
+        place = self._session.snapshot().by_id.get(recording, -1)
         row = int(np.searchsorted(places, place))
         return row < len(places) and int(places[row]) == place
 
@@ -357,8 +357,8 @@ def _steps(
 
 
 def _extent(recording: RecordingSummary) -> Span:
-    """Span of log time in which a recording has messages, or may have some by now."""
+    """Span of log time in which a recording has messages."""
     if recording.span is None:
         return 0, END
     begin, end = recording.extent
-    return begin, END if recording.status == "open" else end
+    return begin, end

@@ -30,7 +30,7 @@ def message_at(
     session: Session, question: Question, counters: Counters, moment: TimeLike
 ) -> Message | None:
     """The last message not after a time, in any recording; None if none exists."""
-    snapshot = session.snapshot()
+    snapshot = session.look(question.recordings)
     places = session.chosen(question)
     start, end = snapshot.begin[places], snapshot.end[places]
     latest = np.minimum(_moments(moment, start, end), np.where(end == END, END, end - 1))

@@ -99,8 +99,6 @@ class _LatchedScan:
         self._recording = recording
         self._begin = begin
         self._counters = counters
-        # The statistics of a running recording are not complete.
-        self._has_ended = recording.status != "open"
 
     def read(
         self, channels: Sequence[RecordedChannel]
@@ -109,8 +107,7 @@ class _LatchedScan:
         publishers: dict[Hashable, list[RecordedChannel]] = defaultdict(list)
         for channel in channels:
             first = channel.stats.first
-            is_before = first is not None and first < self._begin
-            if is_before or not self._has_ended:
+            if first is not None and first < self._begin:
                 publishers[publisher_of(channel.channel)].append(channel)
         own: list[RecordedChannel] = []
         cuts: list[_Key] = []
@@ -137,7 +134,7 @@ class _LatchedScan:
     def _first_in_force(self, group: Sequence[RecordedChannel]) -> _Key:
         """The first of the last messages of some publishers that displace one another."""
         left = max(depth_of(channel.channel) for channel in group)
-        if self._has_ended and left >= sum(channel.stats.messages for channel in group):
+        if left >= sum(channel.stats.messages for channel in group):
             return _FIRST
         plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
         cut = _FIRST

@@ -23,7 +23,7 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
 
     Args:
         session: The open store.
-        recording: The recording; its sealed segments count.
+        recording: The recording.
         topic: Full name.
         moment: The time, ns.
     """

@@ -131,7 +131,7 @@ class Rates:
     def _overall(self, stretch: _Stretch) -> tuple[NDArray[Any], ...]:
         """First and last time, messages and mean rate."""
         part = stretch.part
-        if part.predicate is None and part.is_unbounded and stretch.summary.status != "open":
+        if part.predicate is None and part.is_unbounded:
             stats = [s for s in part.stats if s.first is not None and s.last is not None]
             count = part.messages
             first = min((s.first for s in stats if s.first is not None), default=0)

@@ -127,7 +127,7 @@ def about_names(session: Session, question: Question, names: Sequence[str]) -> I
     for name in names:
         others = namesakes(name, session.topics())
         if others:
-            snapshot = session.snapshot()
+            snapshot = session.look(question.recordings)
             places = set(session.chosen(question).tolist())
             others = [t for t in others if not places.isdisjoint(snapshot.having([t]).tolist())]
         others = [topic for topic in others if topic not in question.topics]
@@ -137,7 +137,7 @@ def about_names(session: Session, question: Question, names: Sequence[str]) -> I
 
 def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:
     """The channels of the question with messages, of its first recordings."""
-    summaries = session.snapshot().summaries
+    summaries = session.look(question.recordings).summaries
     wanted = set(question.topics)
     for place in session.chosen(question)[:_MOST].tolist():
         for channel in session.channels(session.entry_of(summaries[place])):
@@ -202,7 +202,7 @@ def _is_near(path: str, name: str) -> bool:
 
 def _fields_in_tables(session: Session, question: Question, topic: str) -> set[str] | None:
     """Fields of messages of a topic that no definition describes; None if they are not known."""
-    summaries = session.snapshot().summaries
+    summaries = session.look(question.recordings).summaries
     places = session.chosen(replace(question, topics=(topic,))).tolist()
     found: set[str] = set()
     for place in places:
@@ -250,8 +250,7 @@ def _topics_beside(session: Session, question: Question) -> Iterator[str]:
             if topic not in wanted or stats.first is None or stats.last is None:
                 continue
             spans[topic].append((stats.first, stats.last))
-            is_open = channel.recording.status == "open"
-            if is_open or bounds is None or (stats.first < bounds[1] and stats.last >= bounds[0]):
+            if bounds is None or (stats.first < bounds[1] and stats.last >= bounds[0]):
                 inside.add(topic)
     for topic, found in spans.items():
         if topic not in inside:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -102,6 +102,19 @@ class Engine(Protocol):
 
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """References to the matching messages in the chunks of some tasks."""
+
+
+@runtime_checkable
+class Checking(Protocol):
+    """An engine that knows only after reading columns whether they can decide."""
+
+    def check(self, part: Part) -> int:
+        """The count of one part.
+
+        Raises:
+            UndecidedError: The columns cannot decide.
+            StoreError: They are damaged.
+        """
 
 
 class Counting:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 _ENTRY_S = 2e-5  # seconds to fetch the entry of a chunk
 _READ_S = 1e-4  # seconds to read the message indexes of a chunk
 _TIME_S = 2e-7  # seconds to sort the log time of a message
-_OPEN_S = 1.0
-"""An open recording is counted here only if MongoDB is unavailable: the catalog lags."""
 
 
 class ChunkIndex:
@@ -53,8 +51,6 @@ class ChunkIndex:
             return None
         if need not in {Need.COUNT, Need.OUTCOMES}:
             return None
-        if part.recording.status == "open":
-            return _OPEN_S
         if need is Need.OUTCOMES:
             return _READ_S * part.chunks + _TIME_S * part.messages * part.share
         return _ENTRY_S * part.chunks

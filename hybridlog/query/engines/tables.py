@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -53,10 +53,17 @@ class TablesEngine:
     Args:
         session: The open store.
         counters: Count the bytes that are read.
+        table_of: Returns the table of a part; None for the one of its whole recording.
     """
 
-    def __init__(self, session: Session, counters: Counters) -> None:
+    def __init__(
+        self,
+        session: Session,
+        counters: Counters,
+        table_of: Callable[[Part], TopicTable | None] | None = None,
+    ) -> None:
         self._session = session
+        self._table_of = table_of or (lambda part: session.table(part.recording, part.topic))
         self._counters = counters
         self._counts: dict[Part, _Count] = {}
         self._told: set[Part] = set()
@@ -86,7 +93,7 @@ class TablesEngine:
         is_lossy = any(True for _ in lost_spans(part.recording))  # lost rows must not answer
         if is_lossy or (need is Need.VALUES and not _are_whole(part, fields)):
             return None
-        table = self._session.table(part.recording, part.topic)
+        table = self._table_of(part)
         is_whole = table is not None and not (table.reduced or part.blind)
         if table is None or not is_whole or (table.unreadable and part.predicate is None):
             return None  # fields of such messages are not in the table
@@ -170,7 +177,7 @@ class TablesEngine:
             UndecidedError: the columns cannot decide.
             StoreError: the table is damaged or missing.
         """
-        table = self._session.tables.of(part.recording, part.topic)
+        table = self._table_of(part)
         if table is None:
             raise StoreError(f"The table of {part.topic} is missing.")
         spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
-from hybridlog.view.context import route
-from hybridlog.view.topic import Topic
+from hybridlog.view.context import route, start_of
 
 if TYPE_CHECKING:
+    from hybridlog.query.query import Query
     from hybridlog.view.asked import Asked
     from hybridlog.view.context import Context
 
@@ -21,29 +21,33 @@ def log(context: Context, asked: Asked) -> dict[str, Any]:
     """Lines before and after a time; with `seq`, before and after the line of that number."""
     before = asked.integer("before", 0, _MAX_LINES, 0)
     after = asked.integer("after", 0, _MAX_LINES, 0)
-    topic = Topic(context, asked)
-    lines = _log(topic, asked)
-    time = asked.moment(topic.start)
+    recording, query = context.topic(asked)
+    start = start_of(recording)
+    lines = _log(query, asked)
+    time = asked.moment(start)
     # A line at the time itself is before the cursor, as it is current there.
     seq = asked.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
     found = lines.before(time, seq, before)
     later = lines.after(time, seq, after)
     return {
-        "lines": [_line(line, topic.start) for line in (*found, *later)],
+        "lines": [_line(line, start) for line in (*found, *later)],
         "first": len(found) < before,
         "last": len(later) < after,
     }
 
 
 def log_count(context: Context, asked: Asked) -> dict[str, Any]:
-    """Number of lines that pass the filters; null while that is not known."""
-    return {"count": _log(Topic(context, asked), asked).count()}
+    """Number of lines that pass the filters."""
+    _, query = context.topic(asked)
+    return {"count": _log(query, asked).count()}
 
 
-def _log(topic: Topic, asked: Asked) -> Log:
+def _log(query: Query, asked: Asked) -> Log:
     level = asked.word("level", ("", *LEVELS), "")
     text = asked.text("text", "", longest=_MAX_FILTER)
-    return Log(topic.query, kind_of(topic.type), level, text, topic.flushed)
+    schemas = (channel.channel.schema for channel in query.channels())
+    type_name = next((schema.name for schema in schemas if schema is not None), "")
+    return Log(query, kind_of(type_name), level, text)
 
 
 def _line(line: Line, start: int) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from hybridlog.choice import Choice
 from hybridlog.drawing.coverage import lost_parts
-from hybridlog.losses import extent_of, losses_of
-from hybridlog.view.context import Context, route, start_of
+from hybridlog.losses import losses_of
+from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
     from hybridlog.view.asked import Asked
@@ -24,7 +24,7 @@ _MAX_PARTS: Final = 64
 
 
 def _start(summary: RecordingSummary) -> int:
-    """Log time of the beginning, ns; until a message is sealed, when it was made."""
+    """Log time of the beginning, ns; until a message is flushed, when it was made."""
     return summary.extent[0] if summary.span else summary.created
 
 
@@ -65,7 +65,7 @@ def recording(context: Context, asked: Asked) -> dict[str, Any]:
     """One recording: its topics, marks, losses and times."""
     entry = context.recording(asked)
     start = start_of(entry)
-    begin, end = _extent(entry)
+    begin, end = extent(entry)
     return {
         "id": entry.id,
         "label": entry.label,
@@ -127,11 +127,6 @@ def _lost_parts(entry: RecordingEntry, begin: int, end: int) -> list[tuple[float
     is_lost = lost_parts(entry, (begin, end), _MAX_PARTS)
     edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)) / _MAX_PARTS
     return [(low, high) for low, high in edges.reshape(-1, 2).tolist()]
-
-
-def _extent(entry: RecordingEntry) -> tuple[int, int]:
-    begin, end = extent_of(entry)
-    return (begin, end) if end > begin else (entry.created, entry.created)
 
 
 def _mark(mark: Mapping[str, Any], start: int) -> dict[str, Any]:

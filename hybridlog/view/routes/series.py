@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hybridlog.drawing.fields import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.query.answers.infer_fields import SAMPLE
-from hybridlog.view.context import route
-from hybridlog.view.topic import Topic
+from hybridlog.view.context import route, start_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,23 +25,17 @@ _GREATEST_EXACT: Final = 1 << 53
 
 def fields(context: Context, asked: Asked) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
-    topic = Topic(context, asked)
-    found = fields_of(topic.field_types(), topic.messages(0, SAMPLE))
+    _, query = context.topic(asked)
+    found = fields_of(query.field_types(), iter(query.limit(SAMPLE)))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
 def series(context: Context, asked: Asked) -> dict[str, Any]:
     """Least and greatest values by pixel, or each value if there are few."""
-    topic = Topic(context, asked)
-    start = topic.start
+    recording, query = context.topic(asked)
+    start = start_of(recording)
     wanted = asked.texts("field", most=MAX_FIELDS)
-    found = read_series(
-        topic.query,
-        wanted,
-        pixels=asked.pixels(),
-        span=asked.span(start),
-        flushed=topic.flushed,
-    )
+    found = read_series(query, wanted, pixels=asked.pixels(), span=asked.span(start))
     if len(found) > MAX_FIELDS:
         raise UsageError(f"These are {len(found)} fields, at most {MAX_FIELDS} fit in a plot.")
     return {

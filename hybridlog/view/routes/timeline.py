@@ -1,4 +1,4 @@
-"""The timeline: messages by pixel, gaps and marks; and how far a running recording is."""
+"""The timeline: messages by pixel, gaps and marks."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ import numpy as np
 from starlette.responses import Response
 
 from hybridlog.drawing.silence import gaps
-from hybridlog.losses import extent_of
 from hybridlog.marks import MARKS
-from hybridlog.view.context import Context, route, start_of
+from hybridlog.view.context import Context, extent, route, start_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.view.asked import Asked
-    from hybridlog_storage.catalog import RecordingEntry
 
 MAX_LANES: Final = 64
 """Topics of one picture."""
@@ -55,11 +53,10 @@ def timeline(context: Context, asked: Asked) -> Response:
     start = start_of(recording)
     span = asked.span(start)
     found = context.densities.density(recording, span, pixels, topics)
-    extent = _extent(context, recording)
     periods = context.densities.periods(recording, span, topics)
     lanes, body = [], []
     for counts, exact, period in zip(found.counts, found.exact.tolist(), periods, strict=True):
-        silent = gaps(*_within(counts, found.edges, extent), period)
+        silent = gaps(*_within(counts, found.edges, extent(recording)), period)
         small = _small(counts)
         lanes.append(
             {"size": small.itemsize, "gaps": len(silent), "exact": exact, "period": period}
@@ -76,33 +73,6 @@ def timeline(context: Context, asked: Asked) -> Response:
     text += b" " * (-(len(text) + 4) % _ALIGNED)
     content = b"".join([len(text).to_bytes(4, "little"), text, *body])
     return Response(content, media_type="application/octet-stream")
-
-
-def live(context: Context, asked: Asked) -> dict[str, Any]:
-    """Status, span and counts of a running recording, with what it has flushed."""
-    recording = context.recording(asked)
-    if recording.status == "open":
-        listing = context.store.directory.listing(recording.label)
-        if not listing.open or recording.digests.keys() != {str(n) for n in listing.sealed}:
-            context.refresh()
-            recording = context.recording(asked)
-    start = start_of(recording)
-    begin, end = _extent(context, recording)
-    topics: dict[str, dict[str, Any]] = {}
-    for channel in recording.channels:
-        row = topics.setdefault(channel.topic, _row(channel.topic, channel.type))
-        row["messages"] += channel.stats.messages
-    for topic, running in context.densities.running(recording).items():
-        row = topics.setdefault(topic, _row(topic, running.type))
-        row["messages"] += running.messages
-    return {
-        "status": recording.status,
-        "start": str(start),
-        "begin": str(begin - start),
-        "end": str(end - start),
-        "messages": sum(row["messages"] for row in topics.values()),
-        "topics": [topics[topic] for topic in sorted(topics)],
-    }
 
 
 def marks(context: Context, asked: Asked) -> dict[str, Any]:
@@ -123,24 +93,12 @@ def marks(context: Context, asked: Asked) -> dict[str, Any]:
     return {"marks": found, "more": query.count() - len(found)}
 
 
-def _extent(context: Context, recording: RecordingEntry) -> tuple[int, int]:
-    """Log time `[begin, end)` of a recording, ns, with what is flushed."""
-    begin, end = extent_of(recording)
-    if recording.status == "open":
-        running = context.densities.running(recording).values()
-        spans = [(topic.first, topic.last + 1) for topic in running if topic.messages]
-        spans += [(begin, end)] if begin < end else []
-        if spans:
-            return min(a for a, _ in spans), max(b for _, b in spans)
-    return (begin, end) if begin < end else (recording.created, recording.created)
-
-
 def _within(
-    counts: NDArray[np.int64], edges: NDArray[np.int64], extent: tuple[int, int]
+    counts: NDArray[np.int64], edges: NDArray[np.int64], whole: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Bins cut to the time of a recording; those outside are not empty."""
-    is_outside = (edges[1:] <= extent[0]) | (edges[:-1] >= extent[1])
-    return np.where(is_outside, 1, counts), np.clip(edges, *extent)
+    is_outside = (edges[1:] <= whole[0]) | (edges[:-1] >= whole[1])
+    return np.where(is_outside, 1, counts), np.clip(edges, *whole)
 
 
 def _small(counts: NDArray[np.int64]) -> NDArray[Any]:
@@ -154,8 +112,4 @@ def _filled(content: bytes) -> bytes:
     return content + bytes(-len(content) % _ALIGNED)
 
 
-def _row(topic: str, kind: str) -> dict[str, Any]:
-    return {"topic": topic, "type": kind, "messages": 0}
-
-
-routes = [route("/timeline", timeline), route("/live", live), route("/marks", marks)]
+routes = [route("/timeline", timeline), route("/marks", marks)]

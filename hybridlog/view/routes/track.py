@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
-from hybridlog.view.context import route
+from hybridlog.view.context import route, start_of
 from hybridlog.view.current import current
 from hybridlog.view.packed import packed_response
-from hybridlog.view.topic import Topic
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,12 +27,12 @@ def track_of(context: Context, asked: Asked) -> Response:
     Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time. A time
     is the sum of `times` and `rests`: a float64 is too coarse far from the start.
     """
-    topic = Topic(context, asked)
-    start = topic.start
+    recording, query = context.topic(asked)
+    start = start_of(recording)
     span = None
     if asked.has("begin") or asked.has("end"):
         span = asked.span(start)
-    found = track(topic.query, pixels=asked.pixels(), span=span, flushed=topic.flushed)
+    found = track(query, pixels=asked.pixels(), span=span)
     header = {
         "grid": None if found.grid is None else asdict(found.grid),
         "is_geographic": found.is_geographic,
@@ -60,8 +59,8 @@ def fix_at(context: Context, asked: Asked) -> dict[str, Any]:
     answer: dict[str, Any] = {"time": shown.time, "until": shown.until}
     if shown.message is None:
         return answer
-    known = Topic(context, asked).field_types()
-    position = position_of(known) or Position("", is_geographic=True)
+    _, query = context.topic(asked)
+    position = position_of(query.field_types()) or Position("", is_geographic=True)
     if position.is_geographic:
         found = asdict(fix_of(shown.message, position.prefix))
     else:

@@ -38,16 +38,13 @@ export function followLive(recording) {
 
   async function update() {
     const parameters = { recording: recording.info.id };
-    const found = timed(await get("live", parameters, { signal: stop.signal }));
+    const found = timed(await get("recording", parameters, { signal: stop.signal }));
     const { info } = recording;
     if (found.messages === info.messages && found.status === info.status) return;
     const isAtEnd = state.get("at") >= lastTime(recording);
     const before = info.end;
-    const isMoved = moveStart(BigInt(found.start));
-    if (isMoved || found.status !== "open") {
-      Object.assign(info, timed(await get("recording", parameters, { signal: stop.signal })));
-    }
-    if (found.status === "open") Object.assign(info, { ...found, topics: merged(info, found) });
+    moveStart(BigInt(found.start));
+    Object.assign(info, found);
     if (isAtEnd) {
       const { begin, end } = visible(recording);
       const by = Number(info.end - before);
@@ -57,23 +54,15 @@ export function followLive(recording) {
     recording.tell();
   }
 
-  /** Times count from the first message, which is known for sure once a segment is sealed. */
+  /** Times count from the first message; a late one may be before it. */
   function moveStart(start) {
     const by = recording.start - start;
-    if (!by) return false;
+    if (!by) return;
     recording.start = start;
     const moved = (time) => (time === null ? null : time + by);
     const { begin, end, at } = state.get();
     recording.info.end += by;
     recording.info.begin += by;
     state.set({ begin: moved(begin), end: moved(end), at: at + by });
-    return true;
   }
-}
-
-/** The topics as they are now, with what is known of them besides. */
-function merged(info, found) {
-  const known = new Map(info.topics.map((one) => [one.topic, one]));
-  const empty = { encoding: "", bytes: 0 };
-  return found.topics.map((one) => ({ ...one, ...empty, ...known.get(one.topic), messages: one.messages }));
 }
