@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, overload
 
@@ -11,12 +11,14 @@ import numpy as np
 from hybridlog.across.approximate_time import approximate_sets
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
+from hybridlog.query.answers.remarks import completeness
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.stamps import stamp_array
+from hybridlog.wording import counted
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.times import span_of
 
@@ -64,6 +66,7 @@ class Synced(Sequence[tuple["Message", ...]]):
         topics: Full names of the topics, in the order of each set.
         recordings: Id of each set's recording.
         times: int64[n, topics], times of the messages on the clock, ns.
+        left_out: Number of messages of each topic that are in no set, in the order of `topics`.
         counters: What reading has cost in this process, with the times at first.
     """
 
@@ -88,7 +91,9 @@ class Synced(Sequence[tuple["Message", ...]]):
         shared = [set(session.chosen(question).tolist()) for question in questions]
         labels: list[str] = []
         found: list[list[_Found]] = []
-        for place in sorted(set.intersection(*shared)):
+        known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
+        places = sorted(set.intersection(*shared))
+        for place in places:
             recording = snapshot.summaries[place].id
             columns = [
                 _times_of(session, replace(q, recordings=(recording,)), clock, self.counters)
@@ -97,7 +102,14 @@ class Synced(Sequence[tuple["Message", ...]]):
             rows = approximate_sets([column.time for column in columns], limit)
             labels += [recording] * len(rows)
             found.append([column.take(rows[:, n]) for n, column in enumerate(columns)])
+            known += [[len(c.log_time) for c in columns], [len(c.time) for c in columns]]
         self.recordings = tuple(labels)
+        left_out = [
+            _left_out(session, question, read, places, len(labels))
+            for question, read in zip(questions, known.T.tolist(), strict=True)
+        ]
+        self.left_out = tuple(messages for messages, _ in left_out)
+        self._why_left_out = [why for _, why in left_out if why]
         by_topic = [_joined([part[n] for part in found]) for n in range(len(questions))]
         self.times: NDArray[np.int64] = np.stack([column.time for column in by_topic], axis=1)
         self._topics = [
@@ -106,7 +118,15 @@ class Synced(Sequence[tuple["Message", ...]]):
         ]
 
     def __repr__(self) -> str:
-        return f"<Synced {', '.join(self.topics)}; {len(self)} sets>"
+        left_out = ", ".join(map(str, self.left_out))
+        return f"<Synced {', '.join(self.topics)}; {len(self)} sets, left out: {left_out}>"
+
+    def remarks(self) -> list[str]:
+        """Sentences about the sets: messages that are in none, and what the topics may lack."""
+        session, found = self._opened(), list(self._why_left_out)
+        for topic in self._topics:
+            found += completeness(session, topic.question)
+        return [*dict.fromkeys(found)]
 
     def __len__(self) -> int:
         """Number of sets."""
@@ -280,3 +300,43 @@ def _read_times(planner: Planner, clock: Clock) -> Iterator[_Block]:
             known = stamps.is_valid().to_numpy(zero_copy_only=False)
             filled = stamps.view("int64").fill_null(0).to_numpy()
             yield values.log_time, filled, known
+
+
+def _left_out(
+    session: Session,
+    question: Question,
+    read: Sequence[int],
+    places: Collection[int],
+    sets: int,
+) -> tuple[int, str]:
+    """The number of messages of a topic that are in no set, and a sentence about them.
+
+    Args:
+        session: The open store.
+        question: The question about the topic.
+        read: Messages in the recordings with all topics, and those with a time on the clock.
+        places: Places of these recordings.
+        sets: Number of sets.
+    """
+    summaries = session.snapshot().summaries
+
+    def count(chosen: Collection[int]) -> int:
+        own = replace(question, recordings=tuple(summaries[place].id for place in chosen))
+        try:
+            return Planner(session, own, Counters()).count() if chosen else 0
+        except TimeError:
+            return 0  # the range does not touch them
+
+    found, timed = read
+    if question.predicate is None:
+        found = count(places)  # with those that are unreadable
+    apart = count({*session.chosen(question).tolist()} - {*places})
+    left_out, topic = found + apart - sets, question.topics[0]
+    if not left_out:
+        return 0, ""
+    are = "is" if left_out == 1 else "are"
+    text = f"{left_out} of {counted(found + apart, 'message')} of {topic} {are} in no set"
+    why = [f"{apart} in recordings without another of the topics"] if apart else []
+    if found > timed:
+        why.append(f"{found - timed} without a time on the clock")
+    return left_out, f"{': '.join([text, ', '.join(why)] if why else [text])}."

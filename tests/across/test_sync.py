@@ -21,8 +21,14 @@ import hybridlog as hl
 from hybridlog.across.approximate_time import approximate_sets
 from hybridlog.across.sync import Synced
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
+from hybridlog_storage.messages import Channel, Schema
 
 from .conftest import MS, Logs, Said
+
+HEADER = (
+    b"Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\n"
+    b"uint32 seq\ntime stamp\nstring frame_id\n"
+)
 
 
 class ApproximateTime:
@@ -190,6 +196,46 @@ def test_sets_of_queries(logs: Logs) -> None:
     for _, pose in sets:
         start = starts[logs.store.entry(pose.recording).label]
         assert 100 * MS <= pose.log_time_ns - start < 900 * MS
+
+
+def test_messages_in_no_set_are_counted(logs: Logs) -> None:
+    topics = ["/base", "/right/pose"]
+    for labels in (["b"], ["b", "c"]):
+        queries = [logs.store.topic(topic).in_recording("b") for topic in topics]
+        if "c" in labels:
+            queries[0] = logs.store.topic("/base")
+        sets = logs.store.sync(queries, tolerance="5ms")
+        said = [sum(len(logs.of(label, topic)) for label in labels) for topic in topics]
+        left_out = tuple(number - len(sets) for number in said)
+        assert sets.left_out == left_out
+        assert min(left_out) > 0
+        apart = len(logs.of("c", "/base"))
+        why = f": {apart} in recordings without another of the topics" if "c" in labels else ""
+        assert sets.remarks() == [
+            f"{left_out[0]} of {said[0]} messages of /base are in no set{why}.",
+            f"{left_out[1]} of {said[1]} messages of /right/pose are in no set.",
+        ]
+    some = logs.store.topic("/base").where("on == true")
+    asked = logs.store.sync([some, "/left/pose"])
+    assert asked.left_out == (some.count() - len(asked), 600 - len(asked))
+    assert logs.store.sync([some, some]).remarks() == []
+    assert pickle.loads(pickle.dumps(asked)).remarks() == asked.remarks()
+
+
+def test_messages_without_a_stamp_are_in_no_set(tmp_path: Path) -> None:
+    schema = Schema("p/S", "ros1msg", HEADER)
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("now") as recording:
+            for n in range(5):
+                stamp = np.array([n, n, 0, 0], np.uint32).tobytes()
+                for topic in ("/a", "/b"):
+                    payload = b"x" if (topic, n) == ("/a", 3) else stamp
+                    recording.write(Channel(topic, "ros1", schema), payload, log_time=n)
+        assert store.sync(["/a", "/b"]).remarks() == [
+            "1 of 5 messages of /a is in no set: 1 without a time on the clock.",
+            "1 of 5 messages of /b is in no set.",
+        ]
+        assert store.sync(["/a", "/b"], clock="log").left_out == (0, 0)
 
 
 def test_only_times_are_read_before_a_set_is_asked_for(logs: Logs) -> None:
