@@ -18,7 +18,7 @@ import numpy as np
 
 from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog.drawing.density import MOST_WORK, Density, count, reading_work
-from hybridlog.drawing.silence import usual_period
+from hybridlog.drawing.silence import sampled_period
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class _Recorded:
         parts = chunks.parts(span, [topic])
         messages = int(parts.messages.sum())
         if not known or messages > 2 * told:
-            known = usual_period(chunks, parts) or known
+            known = sampled_period(chunks, parts) or known
             self._periods[topic] = known, messages
         return known
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from hybridlog.frames.names import FIELD
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.periods import GAP_PERIODS, Steps, usual_period
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.wording import listed
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Span
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
-GAP_PERIODS: Final = 5
-"""A time without messages is a gap if it is longer than so many usual periods."""
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
 _NUMBER = re.compile(r"bool|byte|char|time|duration|float(32|64)|u?int(8|16|32|64)")
 _SHOWN = 8  # names of fields in a message
@@ -150,15 +149,6 @@ def _asked(query: Asked, wanted: Sequence[_Wanted], span: Span | None) -> tuple[
         window = np.array([[begin, max(begin, end), 0]], np.int64)
         asked = asked.during(Intervals.of([(recording, window)])) if recording else asked
     return asked, (begin, end)
-
-
-def usual_period(steps: NDArray[np.int64]) -> float:
-    """The usual period of a topic, ns, also of one whose messages arrive some at once.
-
-    Args:
-        steps: int64[n], times from one message to the next, ns.
-    """
-    return float(np.quantile(steps, 0.9)) if len(steps) else 0.0
 
 
 def numbers_of(query: Asked) -> list[str]:
@@ -349,6 +339,7 @@ class _Grid:
         self._count = np.zeros(pixels, np.int64)
         self._first = np.zeros(pixels, np.int64)
         self._last = np.zeros(pixels, np.int64)
+        self._steps = Steps()
         self._extremes: dict[str, Numbers] = {}
 
     @classmethod
@@ -361,6 +352,7 @@ class _Grid:
         """Add messages, which are in order of time and not before earlier ones."""
         if not len(times):
             return
+        self._steps.add(times)
         # Messages of a running recording may be later than its known end.
         pixel = np.minimum((times - self._begin) // self._width, self.pixels - 1)
         begins = run_starts(pixel)
@@ -382,9 +374,8 @@ class _Grid:
         """An entry for each pixel with messages, and one of NaN in each gap."""
         used = np.flatnonzero(self._count)
         first, last = self._first[used], self._last[used]
-        usual = self._width / float(np.median(self._count[used]))
         pause = first[1:] - last[:-1]
-        is_gap = (np.diff(used) > 1) & (pause > GAP_PERIODS * usual)
+        is_gap = (np.diff(used) > 1) & (pause > GAP_PERIODS * self._steps.usual_period())
         gaps = np.flatnonzero(is_gap) + 1
         times = np.insert(first, gaps, last[gaps - 1] + pause[gaps - 1] // 2)
         found = []

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from hybridlog.query.periods import GAP_PERIODS, usual_period
 from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
@@ -14,13 +15,11 @@ if TYPE_CHECKING:
 
     from hybridlog.drawing.chunk_parts import Parts, RecordedChunks
 
-PERIODS: Final = 5
-"""Usual periods without a message after which there is a gap; as in `Query.gaps`."""
 _SAMPLED: Final = 16  # chunks that are read for one topic
 
 
-def usual_period(chunks: RecordedChunks, parts: Parts) -> float:
-    """The median time from one message of a topic to the next, ns, of some of its chunks.
+def sampled_period(chunks: RecordedChunks, parts: Parts) -> float:
+    """The usual time from one message of a topic to the next, ns, in some of its chunks.
 
     Args:
         chunks: The chunks of the recording.
@@ -43,8 +42,7 @@ def usual_period(chunks: RecordedChunks, parts: Parts) -> float:
     else:
         first = np.sort(parts.first)
         steps.append(first[1:] - first[:-1])
-    found = np.concatenate(steps)
-    return float(np.median(found)) if len(found) else 0.0
+    return usual_period(np.concatenate(steps))
 
 
 def gaps(counts: NDArray[np.int64], edges: NDArray[np.int64], period: float) -> NDArray[np.intp]:
@@ -65,5 +63,5 @@ def gaps(counts: NDArray[np.int64], edges: NDArray[np.int64], period: float) -> 
         return np.empty((0, 2), np.intp)
     is_empty = np.concatenate([[False], counts == 0, [False]])
     runs = np.flatnonzero(is_empty[1:] != is_empty[:-1]).reshape(-1, 2)
-    is_long = edges[runs[:, 1]] - edges[runs[:, 0]] > PERIODS * period
+    is_long = edges[runs[:, 1]] - edges[runs[:, 0]] > GAP_PERIODS * period
     return runs[is_long]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.drawing.series import GAP_PERIODS, usual_period
 from hybridlog.frames.names import FIELD
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import UsageError
 
@@ -250,6 +250,7 @@ class _Builder:
         self._messages = 0
         self._fixes = 0
         self._exact = True
+        self._steps = Steps()
 
     def add(self, table: pa.Table, paths: list[str]) -> None:
         """Add messages, which are in order of time."""
@@ -265,6 +266,7 @@ class _Builder:
         xy = np.full((len(has_fix), 2), np.nan)
         xy[has_fix] = self._metres(first[has_fix], second[has_fix])
         times = table["log_time"].combine_chunks().cast("int64").to_numpy()
+        self._steps.add(times)
         self._times = np.concatenate([self._times, times])
         self._xy = np.concatenate([self._xy, xy])
         if len(self._times) > self._limit:
@@ -299,7 +301,9 @@ class _Builder:
     def track(self) -> Track:
         """The track of the messages that were added."""
         steps = np.diff(self._times)
-        usual = usual_period(steps) if self._exact else float(self._width)
+        usual = self._steps.usual_period()
+        if not self._exact:
+            usual = max(usual, float(self._width))
         gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1
         middles = self._times[gaps - 1] + steps[gaps - 1] // 2
         return Track(

@@ -673,7 +673,7 @@ class Query:
 
         A gap lasts from one message to the next, from the beginning of the recording (or of
         the range) to the first message, or from the last message to the end. The usual period
-        is the median time from one message to the next in the recording.
+        is the 0.9 quantile of the times from one message to the next in the recording.
 
         Args:
             longer_than: Only gaps longer than this, a duration.

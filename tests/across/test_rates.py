@@ -20,6 +20,10 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.drawing.density_cache import DensityCache
+from hybridlog.drawing.series import series
+from hybridlog.drawing.silence import gaps as silent
+from hybridlog.query import periods
 from hybridlog.query.answers import rates
 from hybridlog.query.answers.field_statistics import _Running
 from hybridlog.query.counters import Counters
@@ -134,7 +138,7 @@ def test_gaps(
         if periods is not None or longer is None:
             if len(times) < 2:
                 continue
-            usual = statistics.median(b - a for a, b in pairwise(times))
+            usual = sorted(b - a for a, b in pairwise(times))[(len(times) - 2) * 9 // 10]
             limit = max(limit, (periods or 5.0) * usual)
         want += [(a, b) for a, b in pairwise([low, *times, high]) if b - a > limit]
     assert [(gap.begin_ns, gap.end_ns) for gap in found] == sorted(want)
@@ -174,12 +178,38 @@ def test_times_of_a_rare_topic_cost_no_payloads(
 
         # Of very many messages, a share says what the usual period is.
         sizes: list[int] = []
-        median = np.median
-        monkeypatch.setattr(np, "median", lambda steps: sizes.append(len(steps)) or median(steps))
-        monkeypatch.setattr(rates, "_SAMPLED", 20)
+        usual = periods.usual_period
+        monkeypatch.setattr(
+            periods, "usual_period", lambda steps: sizes.append(len(steps)) or usual(steps)
+        )
+        monkeypatch.setattr(periods, "_SAMPLED", 20)
         assert len(store.topic("loud").gaps(periods=1.5)) == 29
-        assert all(5 < size < 40 for size in sizes)
+        assert all(5 < size <= 40 for size in sizes)
         assert sizes
+
+
+def test_bursts_are_no_gaps(tmp_path: Path) -> None:
+    """A topic that comes four messages at once, every 100 ms, and is silent once for 2 s."""
+    begins = [BASE + n * 100 * MS for n in (*range(300), *range(320, 600))]
+    times = [begin + n * MS for begin in begins for n in range(4)]
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("a") as recording:
+            for time in times:
+                recording.write(Channel("/burst", "json", None), b'{"v": 1}', log_time=time)
+        silence = times[1199], times[1200]
+        query = store.topic("burst")
+        assert [(gap.begin_ns, gap.end_ns) for gap in query.gaps()] == [silence]
+        span = times[0], times[-1] + 1
+        for pixels in (20_000, 1000, 200):
+            (line,) = series(query, ["v"], pixels=pixels)
+            assert int(np.isnan(line.least).sum()) == 1, pixels
+        (period,) = DensityCache(store.session).periods(store.entry("a"), span, ["/burst"])
+        assert period == 97 * MS
+        edges = np.linspace(span[0], span[1], 5000).astype(np.int64)
+        counts = np.histogram(times, edges)[0]
+        found = silent(counts, edges, period)
+        assert len(found) == 1
+        assert silence[0] <= edges[found[0, 0]] < edges[found[0, 1]] <= silence[1]
 
 
 def test_a_topic_that_fell_silent(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.intervals import MOST_PIECES, Intervals
+from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 _KEPT = 1_000_000  # times that are kept for a second look
-_SAMPLED = 1_000_000  # times between messages whose median stands for that of all
 _Columns = dict[str, list["NDArray[Any]"]]
 
 
@@ -104,19 +104,18 @@ class Rates:
             )
         least = 0 if longer_than is None else parse_duration(longer_than)
         if periods is None and longer_than is None:
-            periods = 5.0
+            periods = GAP_PERIODS
         if periods is not None and not 0 < periods < float("inf"):
             raise UsageError(f"A number of periods is more than 0, not {periods}.")
         found: list[tuple[str, NDArray[np.int64]]] = []
         stretches = [(one, _Times(partial(self._times, one))) for one in self._stretches()]
-        medians = _medians(stretches) if periods is not None else {}
+        usual = _usual_periods(stretches) if periods is not None else {}
         for stretch, times in stretches:
             limit = float(least)
             if periods is not None:
-                median = medians.get(stretch.summary.id)
-                if median is None:
+                if not usual[stretch.summary.id]:
                     continue  # one message does not tell when the next one was due
-                limit = max(limit, periods * median)
+                limit = max(limit, periods * usual[stretch.summary.id])
             found += [(stretch.summary.id, rows) for rows in _longer(times, stretch.span, limit)]
         return Intervals.of(found)
 
@@ -223,24 +222,15 @@ def _longer(
         before = int(block[-1])
 
 
-def _medians(stretches: Iterable[tuple[_Stretch, _Times]]) -> dict[str, float]:
-    """Median time from one message to the next in each recording, ns, where there are two.
-
-    Of very many, the median of a random share, so that memory does not grow with them.
-    """
-    steps: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
+def _usual_periods(stretches: Iterable[tuple[_Stretch, _Times]]) -> dict[str, float]:
+    """The usual period in each recording, ns; 0 where it is unknown."""
+    steps: dict[str, Steps] = defaultdict(Steps)
     for stretch, times in stretches:
-        chance = min(1.0, _SAMPLED / max(stretch.part.messages, 1))
-        random = np.random.default_rng(0)
-        before: NDArray[np.int64] = np.empty(0, np.int64)
+        own = steps[stretch.summary.id]
+        own.restart()
         for block in times:
-            found = np.diff(np.concatenate([before, block]))
-            if chance < 1.0:
-                found = found[random.random(len(found)) < chance]
-            steps[stretch.summary.id].append(found)
-            before = block[-1:]
-    joined = {name: np.concatenate(parts) for name, parts in steps.items()}
-    return {name: float(np.median(found)) for name, found in joined.items() if len(found)}
+            own.add(block)
+    return {name: found.usual_period() for name, found in steps.items()}
 
 
 def _table(labels: list[tuple[str, str, int]], columns: _Columns) -> pa.Table:

@@ -1,0 +1,60 @@
+"""The usual time from one message of a topic to the next, by which gaps are told."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+GAP_PERIODS: Final = 5
+"""A time without messages is a gap if it is longer than so many usual periods."""
+_SAMPLED: Final = 1_000_000  # steps that are kept at least, of more a random share
+
+
+def usual_period(steps: NDArray[np.int64]) -> float:
+    """The usual period of a topic, ns, also of one whose messages come in bursts; 0 if unknown.
+
+    Nine of ten steps are no longer, and one long step among few does not count.
+
+    Args:
+        steps: int64[n], times from one message to the next, ns.
+    """
+    return float(np.quantile(steps, 0.9, method="lower")) if len(steps) else 0.0
+
+
+class Steps:
+    """Times from one message to the next; of very many a random share, in bounded memory."""
+
+    def __init__(self) -> None:
+        self._kept: list[NDArray[np.int64]] = []
+        self._size = 0
+        self._share = 1.0
+        self._random = np.random.default_rng(0)
+        self.restart()
+
+    def restart(self) -> None:
+        """The next message does not follow the last one."""
+        self._last: NDArray[np.int64] = np.empty(0, np.int64)
+
+    def add(self, times: NDArray[np.int64]) -> None:
+        """Add times of the next messages, ns."""
+        steps = np.diff(np.concatenate([self._last, times]))
+        self._last = times[-1:] if len(times) else self._last
+        self._keep(steps, self._share)
+        while self._size > 2 * _SAMPLED:
+            steps, self._kept, self._size = np.concatenate(self._kept), [], 0
+            self._keep(steps, 0.5)
+            self._share /= 2
+
+    def _keep(self, steps: NDArray[np.int64], share: float) -> None:
+        if share < 1.0:
+            steps = steps[self._random.random(len(steps)) < share]
+        self._kept.append(steps)
+        self._size += len(steps)
+
+    def usual_period(self) -> float:
+        """As the function of this name."""
+        return usual_period(np.concatenate(self._kept)) if self._kept else 0.0
