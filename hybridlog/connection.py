@@ -28,6 +28,7 @@ class Connection:
             for the one in the store's settings.
 
     Attributes:
+        wanted: The URI that was asked for; None for the one in the store's settings.
         may_write: False if the user of MongoDB may only read.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
         index: Id of the index; an index that replaces it has another one. Empty without a
@@ -42,7 +43,7 @@ class Connection:
         self.index = ""
         self._database: Database | None = None
         self._directory = directory
-        self._wanted = mongo
+        self.wanted = mongo
         self._cache_mb = cache_mb
         self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
@@ -90,7 +91,7 @@ class Connection:
         from hybridlog_storage.database import Database
 
         if self._uri is None:
-            self._uri = self._wanted or consent.trusted_uri(
+            self._uri = self.wanted or consent.trusted_uri(
                 self._directory.settings, self._directory.path
             )
         uri = self._uri
@@ -122,7 +123,7 @@ class Connection:
         """Description of the index's location; does not contact MongoDB."""
         if self.database is not None:
             return f"database {self.database.name} at {self.database.address}"
-        uri = self._wanted or self._directory.settings.mongo or EMBEDDED
+        uri = self.wanted or self._directory.settings.mongo or EMBEDDED
         if uri == EMBEDDED:
             return "the MongoDB that comes with hybridlog"
         from hybridlog_storage.database import without_secrets

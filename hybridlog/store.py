@@ -565,7 +565,9 @@ class Store:
             query: A query on views of topics (`base__scan`, or `scan` where that is
                 unambiguous) and on `recordings`, `topics`, `losses` and `marks`.
             params: Values of `?` or `$name` in it.
-            memory: Bytes that DuckDB may use, from 64 MiB; 1 GiB by default.
+            memory: Bytes that DuckDB may use by its own count, from 64 MiB; 1 GiB by default.
+                Lists and texts while they are made, and what is read for it, are not counted:
+                `hybridlog sql` and the page limit their whole process.
             timeout: Seconds that the answer may take; None for no limit.
 
         Returns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
@@ -24,7 +25,10 @@ from hybridlog.cli.table_output import TableChoices, table_options
 )
 @options.store
 @click.option(
-    "--memory", metavar="SIZE", help="Memory that the query may use, such as 4GiB; without, 1 GiB."
+    "--memory",
+    metavar="SIZE",
+    help="Memory that the query may use, such as 4GiB; without, 1 GiB. hybridlog takes at "
+    "most 512 MiB more for itself.",
 )
 @click.option("--timeout", metavar="DURATION", help="Stop a query that takes longer.")
 @table_options
@@ -48,6 +52,7 @@ def command(
     unambiguous. Tables: recordings, topics, losses, marks. Needs no MongoDB.
     """
     from hybridlog.query.times import parse_duration
+    from hybridlog.sql.memory_limit import limited_memory
 
     choices = TableChoices(
         form=form, output=output, force=force, limit=limit, quiet=quiet
@@ -57,8 +62,9 @@ def command(
     is_prompt = query is None and sys.stdin.isatty()
     if query is None and not is_prompt:
         query = sys.stdin.read()
-    with opened_store(store, mongo, quiet=quiet) as opened:
+    with opened_store(store, mongo, quiet=quiet) as opened, ExitStack() as stack:
         connection = opened.sql_engine.connect(most)
+        stack.enter_context(limited_memory(connection.memory))
 
         def check(text: str) -> None:
             known = set(opened.topics())

@@ -32,6 +32,7 @@ _SETTINGS: Final = {
     "python_enable_replacements": False,
     "temp_directory": "",
 }
+_SHORTAGES: Final = ("Out of Memory", "Cannot allocate memory", "start new thread")
 _T = TypeVar("_T")
 
 
@@ -83,18 +84,34 @@ def explained(memory: int) -> Iterator[None]:
     package = duckdb()
     try:
         yield
-    except package.OutOfMemoryException as error:
-        raise ResourceError(
-            f"The query needs more than {memory >> 20} MiB of memory: allow more (--memory), or "
-            "ask for less at a time."
-        ) from error
     except package.PermissionException as error:
         raise UsageError(
             "SQL reads the views of this store alone; files, extensions and other databases are "
             f"off. {_first_line(error)}"
         ) from error
-    except package.Error as error:
-        raise UsageError(str(error).strip()) from error
+    except Exception as error:
+        shortage = shortage_of(error, memory)
+        if shortage is not None:
+            raise shortage from error
+        if isinstance(error, package.Error):
+            raise UsageError(str(error).strip()) from error
+        raise
+
+
+def shortage_of(error: Exception, memory: int) -> ResourceError | None:
+    """The error to raise for one of DuckDB, Arrow or the system that means too little memory.
+
+    Args:
+        error: That error.
+        memory: Limit of DuckDB's memory, bytes.
+    """
+    is_short = isinstance(error, MemoryError | duckdb().OutOfMemoryException)
+    if not is_short and not any(text in str(error) for text in _SHORTAGES):
+        return None
+    return ResourceError(
+        f"The query needs more than {memory >> 20} MiB of memory: ask for less at a time, or "
+        "allow more (`hybridlog sql --memory`)."
+    )
 
 
 def _first_line(error: Exception) -> str:

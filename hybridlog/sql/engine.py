@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.query.question import Question
 from hybridlog.sql.content import StoreContent, current_content
-from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb
+from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
 from hybridlog.sql.source import source_of
@@ -451,10 +451,12 @@ class SqlAnswer:
             with explained(self._connection.memory):
                 yield
         except UsageError:
-            if isinstance(self._reading.error, HybridlogError):
-                raise self._reading.error from None
-            if self._reading.error is not None:
-                raise UsageError(str(self._reading.error)) from self._reading.error
+            error = self._reading.error
+            if isinstance(error, HybridlogError):
+                raise error from None
+            if error is not None:
+                shortage = shortage_of(error, self._connection.memory)
+                raise shortage or UsageError(str(error)) from error
             raise
 
 

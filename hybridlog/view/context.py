@@ -19,6 +19,7 @@ from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.export.slice_cache import SliceCache
 from hybridlog.losses import extent_of
 from hybridlog.view.asked import Asked
+from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.lazy import lazy
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 MAX_WORKING: Final = 4
 """Number of answers that are worked out at once; others wait for their turn."""
 
+SQL_MEMORY: Final = 512 << 20
+"""Bytes that DuckDB may use for all queries together."""
 REFRESH_S: Final = 2.0
 """Least time between two looks for new recordings."""
 REFRESH_SHARE: Final = 0.1
@@ -63,6 +66,11 @@ class Context:
     def matches(self) -> MatchCache:
         """Matches of the last questions."""
         return MatchCache()
+
+    @lazy
+    def sql(self) -> SqlProcess:
+        """Answers SQL."""
+        return SqlProcess(self.store)
 
     @lazy
     def slices(self) -> SliceCache:

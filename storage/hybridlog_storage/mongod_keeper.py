@@ -104,7 +104,7 @@ def describe_status(status: int) -> str:
 
 
 def _start(job: Job) -> subprocess.Popen[bytes]:
-    _raise_open_files()
+    _raise_limits()
     _put_log_aside(job)
     # C, since mongod does not start under a locale that is not installed, and ssh passes
     # on the locale of the other side.
@@ -153,7 +153,10 @@ def _die_with(keeper: int) -> Callable[[], None] | None:
     return tie
 
 
-def _raise_open_files() -> None:
+def _raise_limits() -> None:
+    """Undo the starter's limit of memory, and allow many open files."""
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = resource.RLIM_INFINITY
     wanted = OPEN_FILES if hard == unlimited else min(OPEN_FILES, hard)

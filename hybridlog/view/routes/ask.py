@@ -24,7 +24,7 @@ from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.query.topics import resolve
-from hybridlog.view.context import Context, route, start_of
+from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog.view.stopping import stoppable_route
 from hybridlog_storage.distinct import distinct
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 MAX_LISTED: Final = 200
 """Greatest number of matches that are listed at once."""
-SQL_MEMORY: Final = 512 << 20
-"""Bytes that DuckDB may use for all queries together."""
 SQL_SECONDS: Final = 60
 """Seconds that a query in SQL may take."""
 SQL_ROWS: Final = 1000
@@ -116,7 +114,7 @@ def completion(context: Context, asked: Asked) -> dict[str, Any]:
     text = asked.text("text", "", longest=MAX_TEXT)
     place = min(asked.integer("place", 0, MAX_TEXT), len(text))
     if asked.word("language", ("predicate", "sql"), "predicate") == "sql":
-        return _sql_completion(context, text, place)
+        return context.sql.ask(sql_completion, text, place, stopped=threading.Event())
     recording = context.recording(asked)
     own = asked.text("topic")
     topics = {channel.topic for channel in recording.channels}
@@ -137,7 +135,8 @@ def completion(context: Context, asked: Asked) -> dict[str, Any]:
     return {"begin": found.begin, "candidates": offered}
 
 
-def _sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
+def sql_completion(context: Context, text: str, place: int, _: threading.Event) -> dict[str, Any]:
+    """Candidates for completing SQL, worked out in the process for SQL."""
     from hybridlog.sql.completion import candidates, word_before
 
     word = word_before(text[:place])
@@ -152,27 +151,34 @@ def _sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
 
 def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, Any]:
     """The first rows of a query in SQL."""
-    from hybridlog.sql.shown import shown
-
     text = asked.text("text", longest=MAX_TEXT)
     with _sql_turn(stopped):
-        connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
-        connection.stopped = stopped
-        try:
-            answer = connection.query(text, timeout=SQL_SECONDS)
-            table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
-            body = f"    print(store.sql({text!r}).to_pandas())\n"
-            found = shown(table, SQL_COLUMNS)
-            found["at"], found["recordings"] = _moments(
-                context, found.pop("times"), found["recordings"], answer.remarks
-            )
-            return found | {
-                "more": is_cut,
-                "remarks": answer.told(),
-                "python": program(context.store, body),
-            }
-        finally:
-            connection.close()
+        return context.sql.ask(sql_answer, text, SQL_SECONDS, stopped=stopped)
+
+
+def sql_answer(
+    context: Context, text: str, seconds: float, stopped: threading.Event
+) -> dict[str, Any]:
+    """The first rows of a query, worked out in the process for SQL."""
+    from hybridlog.sql.shown import shown
+
+    connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
+    connection.stopped = stopped
+    try:
+        answer = connection.query(text, timeout=seconds)
+        table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
+        body = f"    print(store.sql({text!r}).to_pandas())\n"
+        found = shown(table, SQL_COLUMNS)
+        found["at"], found["recordings"] = _moments(
+            context, found.pop("times"), found["recordings"], answer.remarks
+        )
+        return found | {
+            "more": is_cut,
+            "remarks": answer.told(),
+            "python": program(context.store, body),
+        }
+    finally:
+        connection.close()
 
 
 def _moments(

@@ -1,0 +1,73 @@
+"""What the process does that answers SQL for the page."""
+
+from __future__ import annotations
+
+import os
+import threading
+import traceback
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle
+from typing import Any
+
+import hybridlog
+from hybridlog.sql.duck import shortage_of
+from hybridlog.sql.memory_limit import OWN_MEMORY, limited_memory, private_bytes
+from hybridlog.view.context import SQL_MEMORY, Context
+from hybridlog_storage.errors import HybridlogError
+
+
+class _GivenUp(threading.Event):
+    """Is set once the other side has closed the connection."""
+
+    def __init__(self, asked: Connection[Any, Any]) -> None:
+        super().__init__()
+        self._asked = asked
+
+    def is_set(self) -> bool:
+        return self._asked.poll()
+
+
+def serve(handle: int) -> None:
+    """Answer until the other side has gone.
+
+    Args:
+        handle: The descriptor that connections come through.
+    """
+    with Connection(handle) as control, suppress(EOFError):
+        context = _opened(*control.recv())
+        with limited_memory(SQL_MEMORY) as most:
+            while True:
+                asked = Connection(recv_handle(control))
+                if private_bytes() > most - OWN_MEMORY // 2:
+                    break  # free memory may stay reserved: a new process has it all
+                threading.Thread(target=_answer, args=(context, asked)).start()
+
+
+def _opened(path: str, mongo: str | None) -> Context | HybridlogError:
+    """The open store with all that a query loads, or why there is none."""
+    try:
+        store = hybridlog.open(path, mongo=mongo)
+        store.sql_engine.connect(SQL_MEMORY).query("select 1").to_arrow()
+    except HybridlogError as error:
+        return error
+    return Context(store)
+
+
+def _answer(context: Context | HybridlogError, asked: Connection[Any, Any]) -> None:
+    with asked, suppress(EOFError, ConnectionError):
+        work, arguments = asked.recv()
+        if isinstance(context, HybridlogError):
+            asked.send((False, context))
+            os._exit(1)  # the next one may be able to open it
+        try:
+            context.refresh()
+            answer = True, work(context, *arguments, _GivenUp(asked))
+        except HybridlogError as error:
+            answer = False, error
+        except Exception as error:
+            shortage = shortage_of(error, SQL_MEMORY)
+            if shortage is None:
+                traceback.print_exc()
+            answer = False, shortage or RuntimeError(repr(error))
+        asked.send(answer)

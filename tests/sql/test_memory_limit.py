@@ -1,0 +1,61 @@
+"""The limit of the whole process of `hybridlog sql`."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from hybridlog.sql.memory_limit import OWN_MEMORY, limited_memory, private_bytes
+from hybridlog_storage.mongod import EmbeddedMongod
+from tests.cli.running import COMMAND, environment
+
+LIMIT = 64 << 20
+START = 300 << 20  # what a process has before its first query, and files that it maps
+# DuckDB counts neither of them.
+GROWING = ("select unnest(range(100000000))", "select repeat('x', 900000000)")
+
+
+@pytest.mark.parametrize("query", GROWING)
+def test_a_query_takes_no_more_than_it_may(root: Path, query: str) -> None:
+    command = [*COMMAND, "sql", "--store", str(root), "--memory", "64MiB", query]
+    with subprocess.Popen(
+        command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stderr is not None
+        said = child.stderr.read()
+        _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+    assert child.returncode == 7, said
+    assert "The query needs more than 64 MiB of memory: ask for less at a time" in said
+    assert used.ru_maxrss << 10 < LIMIT + OWN_MEMORY + START
+
+
+def test_a_limit_ends_with_its_block() -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with limited_memory(LIMIT) as most:
+        assert 0 <= most - private_bytes() - LIMIT - OWN_MEMORY <= LIMIT
+        with pytest.raises(MemoryError):
+            bytearray(most)
+        with limited_memory(1 << 40) as inner:
+            assert inner == most
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+def test_mongod_has_no_limit_of_the_query_that_starts_it(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with limited_memory(LIMIT), EmbeddedMongod(tmp_path / "mongod", linger_s=0):
+        found = [
+            line.split()[3:5]
+            for place in Path("/proc").glob("[0-9]*")
+            if str(tmp_path).encode() in (place / "cmdline").read_bytes()
+            and b"--dbpath" in (place / "cmdline").read_bytes()
+            for line in (place / "limits").read_text().splitlines()
+            if line.startswith("Max data size")
+        ]
+    hard = "unlimited" if before[1] == resource.RLIM_INFINITY else str(before[1])
+    assert found
+    assert {tuple(limits) for limits in found} == {(hard, hard)}

@@ -1,0 +1,181 @@
+"""The process that answers SQL for the page."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import psutil
+import pytest
+
+import hybridlog as hl
+from hybridlog.sql.memory_limit import OWN_MEMORY
+from hybridlog.view.context import SQL_MEMORY
+from hybridlog.view.sql_process import SqlProcess
+from hybridlog_storage.errors import HybridlogError, ResourceError, StoreError
+from tests.imports import ROOT
+
+if TYPE_CHECKING:
+    from starlette.testclient import TestClient
+
+LIMIT_S = 60
+START = 400 << 20  # what the process has before its first query, and files that it maps
+reserved: list[Any] = []
+
+PAGE = """
+import sys, threading
+import hybridlog as hl
+from hybridlog.view.sql_process import SqlProcess
+from tests.view.test_sql_process import pid, wait
+
+if __name__ == "__main__":
+    process = SqlProcess(hl.open(sys.argv[1]))
+    print(process.ask(pid, stopped=threading.Event()), flush=True)
+    process.ask(wait, stopped=threading.Event())
+"""
+
+
+# In the process.
+
+
+def pid(_context: object, _stopped: object) -> int:
+    return os.getpid()
+
+
+def peak(_context: object, _stopped: object) -> int:
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) << 10
+
+
+def wait(_context: object, stopped: threading.Event) -> None:
+    while not stopped.is_set():
+        time.sleep(0.01)
+
+
+def reserve(_context: object, _stopped: object) -> None:
+    reserved.append(np.empty(SQL_MEMORY + OWN_MEMORY * 3 // 4, np.uint8))
+
+
+def end(_context: object, _stopped: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse(_context: object, _stopped: object) -> None:
+    raise HybridlogError("no")
+
+
+# In the page.
+
+
+@pytest.fixture
+def process(demo_store: hl.Store) -> SqlProcess:
+    return SqlProcess(demo_store)
+
+
+def asked(process: SqlProcess, work: Callable[..., Any]) -> Any:
+    return process.ask(work, stopped=threading.Event())
+
+
+def assert_ends(number: int) -> None:
+    until = time.monotonic() + LIMIT_S
+    while psutil.pid_exists(number) and psutil.Process(number).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < until, "it runs on"
+        time.sleep(0.02)
+
+
+def process_of(client: TestClient) -> SqlProcess:
+    guard: Any = client.app
+    found: SqlProcess = guard._app.state.context.sql
+    return found
+
+
+def test_a_query_takes_no_more_than_it_may(client: TestClient, demo_store: hl.Store) -> None:
+    def rows(text: str) -> Any:
+        return client.get("sql", params={"recording": "robot", "text": text}).json()
+
+    before = psutil.Process().memory_info().rss
+    for text in ("select unnest(range(100000000))", "select list(range) from range(100000000)"):
+        problem = rows(text)["error"]
+        assert "needs more than 512 MiB of memory: ask for less at a time" in problem
+        assert rows("select count(*) from scan")["rows"] == [
+            [str(demo_store.topic("/base/scan").count())]
+        ]
+    assert asked(process_of(client), peak) < SQL_MEMORY + OWN_MEMORY + START
+    assert psutil.Process().memory_info().rss - before < 200 << 20
+
+
+def test_all_questions_share_one_process(process: SqlProcess) -> None:
+    number = asked(process, pid)
+    stopped = threading.Event()
+    problems: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            process.ask(wait, stopped=stopped)
+        except ResourceError as error:
+            problems.append(error)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        assert asked(process, pid) == number != os.getpid()
+    finally:
+        stopped.set()
+        thread.join()
+    assert "was stopped" in str(problems[0])
+    with pytest.raises(HybridlogError, match="no"):
+        asked(process, refuse)
+    assert asked(process, pid) == number
+
+
+def test_a_process_that_has_ended_is_started_again(process: SqlProcess) -> None:
+    number = asked(process, pid)
+    os.kill(number, signal.SIGKILL)
+    again = asked(process, pid)
+    assert again != number
+    with pytest.raises(ResourceError, match="ask for less"):
+        asked(process, end)
+    assert asked(process, pid) not in {number, again}
+
+
+def test_a_process_whose_memory_is_reserved_is_replaced(process: SqlProcess) -> None:
+    number = asked(process, pid)
+    asked(process, reserve)
+    assert asked(process, pid) != number
+    assert_ends(number)
+
+
+def test_it_ends_with_its_page(demo_store: hl.Store) -> None:
+    process = SqlProcess(demo_store)
+    number = asked(process, pid)
+    del process
+    assert_ends(number)
+    page = subprocess.Popen(
+        [sys.executable, "-c", PAGE, str(demo_store.directory.path)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with page:
+        assert page.stdout is not None
+        number = int(page.stdout.readline())
+        page.kill()
+    assert_ends(number)
+
+
+def test_a_store_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        process = SqlProcess(store)
+        (tmp_path / "store").rename(tmp_path / "elsewhere")
+        with pytest.raises(StoreError, match="no such directory"):
+            asked(process, pid)
+        (tmp_path / "elsewhere").rename(tmp_path / "store")
+        assert asked(process, pid) != os.getpid()
