@@ -19,7 +19,9 @@ from hybridlog.schema.definition_text import (
     RawField,
     Section,
     canonical,
+    derived_from,
     has_parts,
+    interface_of,
     parse_msg,
     parse_parts,
     split_sections,
@@ -261,6 +263,7 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
     if ros == 2 and "\n" not in text:
         text = text.replace("\r", "\n")  # rosidl accepts any line end
     types: dict[str, list[RawField]] = {}
+    blank: dict[str, list[RawField]] = {}
     idl = IdlTypes()
     first = ""
     for section in split_sections(text):
@@ -270,12 +273,17 @@ def _parse_sections(schema: Schema, ros: int) -> tuple[dict[str, list[RawField]]
         if kind == "IDL" and ros == 2:
             parse_idl(name, section.text, idl)
             continue
-        for key, fields in _parse_text(name, section, ros).items():
+        parsed = _parse_text(name, section, ros)
+        if not section.kind and not any(parsed.values()):
+            blank = parsed  # what stands before the header line of the definition
+            continue
+        for key, fields in parsed.items():
             if types.setdefault(key, fields) != fields:
                 raise DefinitionError(f"{schema.name}: {key} is defined twice, differently")
     for key, fields in idl.resolved().items():
         types.setdefault(key, fields)
-    return types, first
+    derived = derived_from(interface_of(canonical(schema.name)), types) if ros == 2 else {}
+    return blank | derived | types, first
 
 
 def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawField]]:

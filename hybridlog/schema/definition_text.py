@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
 MAX_NAME = 255
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
@@ -120,7 +120,7 @@ def _lines(text: str) -> Iterator[str]:
             before, behind = line[:end].rstrip("="), line[end:].strip()
             following = lines[number + 1] if number + 1 < len(lines) else ""
             if _HEADER.match(behind or following.strip()):
-                yield from (before, _RULE, behind)
+                yield from filter(None, (before, _RULE, behind))
                 continue
         yield line
 
@@ -166,11 +166,11 @@ def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
     return fields
 
 
-def _event(kind: str, base: str) -> list[RawField]:
+def _event(stem: str) -> list[RawField]:
     return [
         RawField("info", "service_msgs/ServiceEventInfo"),
-        RawField("request", f"{kind}{base}_Request", array=True, bound=1),
-        RawField("response", f"{kind}{base}_Response", array=True, bound=1),
+        RawField("request", f"{stem}_Request", array=True, bound=1),
+        RawField("response", f"{stem}_Response", array=True, bound=1),
     ]
 
 
@@ -208,36 +208,45 @@ def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
             parts[-1].append(line)
     if len(parts) not in {2, 3}:
         raise DefinitionError(f"{name}: {len(parts)} parts; a service has 2 and an action 3")
-    folder, _, leaf = name.rpartition("/")
-    base = interface_of(leaf)
-    if folder:
-        folder += "/"
-    parsed = [parse_msg(name, "\n".join(part), defaults=True) for part in parts]
-    stem = f"{folder}{base}"
-    if len(parsed) == 2:
-        return {
-            f"{stem}_Request": parsed[0],
-            f"{stem}_Response": parsed[1],
-            f"{stem}_Event": _event(folder, base),
-        }
+    stem = interface_of(name)
+    names = _SERVICE if len(parts) == 2 else _ACTION
+    found = {
+        f"{stem}{part}": parse_msg(name, "\n".join(lines), defaults=True)
+        for part, lines in zip(names, parts, strict=True)
+    }
+    return found | derived_from(stem, found)
+
+
+_SERVICE = ("_Request", "_Response")
+_ACTION = ("_Goal", "_Result", "_Feedback")
+
+
+def derived_from(stem: str, known: Collection[str]) -> dict[str, list[RawField]]:
+    """Types that ROS 2 derives from the parts of a service or an action.
+
+    Args:
+        stem: Canonical name of the service or action.
+        known: Names of types; only if all parts are among them, there are derived ones.
+    """
+    if all(f"{stem}{part}" in known for part in _SERVICE):
+        return {f"{stem}_Event": _event(stem)}
+    if not all(f"{stem}{part}" in known for part in _ACTION):
+        return {}
     goal_id = RawField("goal_id", "unique_identifier_msgs/UUID")
     return {
-        f"{stem}_Goal": parsed[0],
-        f"{stem}_Result": parsed[1],
-        f"{stem}_Feedback": parsed[2],
         f"{stem}_FeedbackMessage": [goal_id, RawField("feedback", f"{stem}_Feedback")],
         f"{stem}_SendGoal_Request": [goal_id, RawField("goal", f"{stem}_Goal")],
         f"{stem}_SendGoal_Response": [
             RawField("accepted", "bool"),
             RawField("stamp", "builtin_interfaces/Time"),
         ],
-        f"{stem}_SendGoal_Event": _event(folder, f"{base}_SendGoal"),
+        f"{stem}_SendGoal_Event": _event(f"{stem}_SendGoal"),
         f"{stem}_GetResult_Request": [goal_id],
         f"{stem}_GetResult_Response": [
             RawField("status", "int8"),
             RawField("result", f"{stem}_Result"),
         ],
-        f"{stem}_GetResult_Event": _event(folder, f"{base}_GetResult"),
+        f"{stem}_GetResult_Event": _event(f"{stem}_GetResult"),
     }
 
 

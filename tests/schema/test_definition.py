@@ -664,3 +664,35 @@ def test_nothing_but_one_error_comes_of_garbage(tokens, glue, encoding):
 def test_bytes_that_are_no_text(data, encoding):
     with contextlib.suppress(DefinitionError):
         parse_definition(Schema("pkg/T", encoding, data))
+
+
+ADD = "int64 a\nint64 b\n---\nint64 sum\n"
+IDL_ADD = (
+    "module p { module srv {\nstruct A_Request { long long a; long long b; };\n"
+    "struct A_Response { long long sum; };\n}; };\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (f"{RULE}\nSRV: p/srv/A\n{ADD}", "ros2msg"),
+        (f"\n\n{RULE}\nSRV: p/srv/A\n{ADD}", "ros2msg"),
+        (f"# recorded\n\n{RULE}\nSRV: p/srv/A\n\n{ADD}\n{RULE}\nMSG: p/msg/B\nint8 c\n", "ros2msg"),
+        (f"{RULE}SRV: p/srv/A\n{ADD}", "ros2msg"),
+        (f"{RULE}\r\nSRV: p/srv/A\r\n{ADD}".replace("\n", "\r\n"), "ros2msg"),
+        (ADD, "ros2msg"),
+        (f"{RULE}\nIDL: p/srv/A\n{IDL_ADD}", "ros2msg"),
+        (IDL_ADD, "ros2idl"),
+    ],
+)
+def test_events_of_a_service_in_all_spellings(text, encoding):
+    found = listing(parse(text, encoding, "p/srv/A_Event"))
+    assert found["info.event_type"] == "uint8"
+    assert found["request"] == "p/srv/A_Request[<=1]"
+    assert (found["request[].b"], found["response[].sum"]) == ("int64", "int64")
+
+
+def test_a_message_without_fields_before_others():
+    assert parse(f"\n{RULE}\nMSG: p/Other\nint8 x\n", name="p/Nothing").fields == ()
+    assert parse(f"# only words\n{RULE}\nMSG: p/Other\nint8 x\n", name="p/Nothing").fields == ()
