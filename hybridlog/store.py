@@ -431,6 +431,7 @@ class Store:
         tolerance: DurationLike | None = None,
         fields: Mapping[str, Sequence[str]] | None = None,
         clock: str = "log",
+        across_recordings: bool = False,
     ) -> Aligned:
         """Make a table of topics side by side: a row for each message of one topic.
 
@@ -448,6 +449,9 @@ class Store:
             fields: Paths of the fields wanted, by topic name; None for all. Queries may bring
                 their own.
             clock: The time that is compared: `log`, `publish` or `header`.
+            across_recordings: Messages of `others` may be of any recording of their queries,
+                such as one of a second robot at that time; by default, of the row's. The
+                column `scan.recording` has the label of each.
 
         Raises:
             TopicError: no such topic or field, or a topic does not have the clock.
@@ -464,7 +468,13 @@ class Store:
             raise TopicError(f"{', '.join(chosen)} of fields is no topic of this alignment.")
         questions = [query.question for query in queries]
         return side_by_side(
-            self.session, questions[0], questions[1:], how=how, tolerance=tolerance, clock=clock
+            self.session,
+            questions[0],
+            questions[1:],
+            how=how,
+            tolerance=tolerance,
+            clock=clock,
+            across_recordings=across_recordings,
         )
 
     @of_one_moment

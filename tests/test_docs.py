@@ -555,9 +555,9 @@ def test_every_public_name_is_described(thing: type) -> None:
     if thing is hl.Query:
         members |= dict.fromkeys(("question", "counters", "conditions"))
     if thing.__name__ == "Aligned":
-        members |= {"counters": None}
+        members |= {"rows": None}
     if thing.__name__ == "Synced":
-        members |= dict.fromkeys(("topics", "recordings", "times", "counters"))
+        members |= dict.fromkeys(("topics", "recordings", "times", "counters", "left_out"))
     if thing.__name__ == "Recordings":
         conditions = inspect.signature(hl.Store.recordings).parameters
         members |= dict.fromkeys(("summaries", *(name for name in conditions if name != "self")))

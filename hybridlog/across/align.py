@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -18,11 +19,12 @@ from hybridlog.frames.names import free_name
 from hybridlog.query.answers.remarks import about_names, remarks
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration
+from hybridlog.query.times import DurationLike, format_duration, parse_duration
 from hybridlog.schema.arrow_columns import DURATION, numbers
 from hybridlog.schema.arrow_types import common_schema
-from hybridlog.wording import listed
+from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,6 +35,10 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _DISTANCE = "distance"
+_SHOWN = 20  # remarks about empty columns
+_LOST = "messages of that time are lost"
+_NO_TIME = "the row has no time on the clock"
+_NO_VALUE = "the message has no such value"
 _PIECE_BYTES = 32 << 20  # of the other topics, in rows that are made together
 
 
@@ -58,7 +64,7 @@ class Aligned:
     """The messages of topics side by side. Each access reads them again.
 
     Rows are ordered by recording, oldest first, then by log time. Messages of different
-    recordings are never in one row.
+    recordings are in one row only where that is asked for.
 
     Args:
         session: The open store.
@@ -67,6 +73,9 @@ class Aligned:
         how: Which message of each.
         tolerance: Greatest distance in time, a duration; None for any.
         clock: The time that is compared.
+
+    Attributes:
+        rows: Number of rows of the last answer.
 
     Raises:
         UsageError: an unknown way or clock, or a question with limit, every or reverse.
@@ -96,6 +105,8 @@ class Aligned:
         self._how = how
         self._clock: Clock = clock
         self._tolerance = None if tolerance is None else parse_duration(tolerance)
+        self.rows = 0
+        self._empty: Counter[tuple[str, str]] = Counter()
 
     def _partner(self, stream: Stream) -> _Partner | Bins:
         if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
@@ -107,6 +118,7 @@ class Aligned:
             how=self._how,  # type: ignore[arg-type]
             tolerance=self._tolerance,
             clock=self._clock,
+            empty=self._empty,
         )
 
     @property
@@ -123,6 +135,17 @@ class Aligned:
             found.add(stream.counters)
         return found
 
+    @property
+    def empty(self) -> dict[str, dict[str, int]]:
+        """Numbers of rows that are empty in the last answer, by reason.
+
+        By topic where it has no message for the row, by column where that has no value.
+        """
+        found: dict[str, dict[str, int]] = {}
+        for (name, reason), rows in (+self._empty).items():
+            found.setdefault(name, {})[reason] = rows
+        return found
+
     def remarks(self, *names: str) -> list[str]:
         """Sentences about the last answer, those of `Query.remarks` about each topic.
 
@@ -133,6 +156,15 @@ class Aligned:
         topics = tuple(topic for stream in streams for topic in stream.question.topics)
         asked = replace(streams[0].question, topics=topics)
         found = [*about_names(self._session, asked, names)]
+        of = f"of {self.rows} {'row is' if self.rows == 1 else 'rows are'} empty"
+        lines = [
+            f"{name}: {number} {of}: {reason}."
+            for name, reasons in self.empty.items()
+            for reason, number in reasons.items()
+        ]
+        found += lines[:_SHOWN]
+        if len(lines) > _SHOWN:
+            found.append(f"{counted(len(lines) - _SHOWN, 'more column')} are empty in some rows.")
         for stream in streams:
             found += remarks(self._session, stream.question, stream.counters, (), is_empty=False)
         return [*dict.fromkeys(found)]
@@ -148,6 +180,8 @@ class Aligned:
         """
         for stream in self._streams:
             stream.counters.reset()
+        self.rows = 0
+        self._empty.clear()
         partners = [self._partner(other) for other in self._others]
         several = len(self._session.chosen(self._base.question)) > 1
         given = False
@@ -158,8 +192,10 @@ class Aligned:
             for times, table in self._base.tables(recording):
                 label = resolved.summary.label if several else None
                 for rows in _pieces(times, partners):
-                    beside = [partner.rows(times[rows]) for partner in partners]
                     own = table.slice(rows.start, rows.stop - rows.start)
+                    self.rows += own.num_rows
+                    _count_blanks(self._empty, own, 0)
+                    beside = [partner.rows(times[rows]) for partner in partners]
                     yield _side_by_side(own, label, beside)
                 given = given or bool(table.num_rows)
         if not given:
@@ -247,8 +283,13 @@ class _Partner:
         how: How,
         tolerance: int | None,
         clock: Clock,
+        empty: Counter[tuple[str, str]],
     ) -> None:
         self._reader = TopicReader(session, stream, clock)
+        (self._topic,) = stream.question.topics
+        self._empty = empty
+        self._reason = ""
+        self._lost = np.empty((0, 2), np.int64)
         self._how = how
         self._tolerance = tolerance
         self._clock = clock
@@ -268,11 +309,41 @@ class _Partner:
             end: Time that all rows are before, by the log clock, ns; None if unknown.
         """
         self._recording = recording
+        elsewhere = self._reader.elsewhere(recording)
+        self._reason = self._why() if elsewhere is None else elsewhere
+        self._lost = self._reader.lost(recording)
         self._end = end
         self._blocks = None
         self._times, self._table = self._none
         self._last = None
         self._is_last = False
+
+    def _why(self) -> str:
+        """The reason why no message belongs to a row."""
+        if self._tolerance is not None:
+            near = format_duration(self._tolerance)
+            if self._how == "interpolate":
+                return f"no message within {near} before and after"
+            return f"no message within {near}{' before' if self._how == 'asof' else ''}"
+        reasons = {
+            "asof": "no message came before",
+            "nearest": "no message",
+            "interpolate": "no message before, or none after",
+        }
+        return reasons[self._how]
+
+    def _is_lost(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Rows whose message may have been lost."""
+        low, high = np.full_like(times, BEGIN), times
+        if self._tolerance is not None:
+            low = np.maximum(times, BEGIN + self._tolerance) - self._tolerance
+        if self._how != "asof":
+            near = END if self._tolerance is None else self._tolerance
+            high = np.minimum(times, END - near) + near
+        place = np.searchsorted(self._lost[:, 1], low, "right")
+        found: NDArray[np.bool_] = place < len(self._lost)
+        found[found] = self._lost[place[found], 0] <= high[found]
+        return found
 
     def row_bytes(self, times: NDArray[np.int64]) -> int:
         """Mean bytes of the messages that are read next.
@@ -332,15 +403,16 @@ class _Partner:
         if reader.question.bounds is not None:
             return None
         if self._tolerance is not None:
-            begin: int | None = max(first - self._tolerance, 0)
+            begin = max(first - self._tolerance, BEGIN)
         else:
-            begin = reader.latest(recording, first)
+            latest = reader.latest(recording, first)
+            begin = first if latest is None else latest
         if end is not None and self._how != "asof":
             if self._tolerance is not None:
-                end = min(end + self._tolerance, TIME_LIMIT - 1)
+                end = min(end + self._tolerance, END)
             else:
                 end = reader.following(recording, end)
-        return begin or 0, TIME_LIMIT - 1 if end is None else end
+        return begin, END if end is None else end
 
     def _advance(self) -> None:
         """Read the next block; the last row before it may still be the latest one."""
@@ -389,7 +461,24 @@ class _Partner:
             if missing.any()
             else numbers(found.distance, "duration")
         )
-        return self._reader.named(rows, self._reader.prefix + _DISTANCE, distance)
+        table = self._reader.named(rows, self._reader.prefix + _DISTANCE, distance)
+        empty = int(missing.sum())
+        if empty:
+            is_unknown = times == UNKNOWN
+            is_lost = missing & ~is_unknown & self._is_lost(times)
+            numbers_of = int(is_unknown.sum()), int(is_lost.sum())
+            for reason, number in zip((_NO_TIME, _LOST), numbers_of, strict=True):
+                self._empty[self._topic, reason] += number
+            self._empty[self._topic, self._reason] += empty - sum(numbers_of)
+        _count_blanks(self._empty, table, empty)
+        return table
+
+
+def _count_blanks(empty: Counter[tuple[str, str]], table: pa.Table, known: int) -> None:
+    """Count the rows that are empty in single columns, beside a number of rows without any."""
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if column.null_count > known:
+            empty[name, _NO_VALUE] += column.null_count - known
 
 
 def _pieces(times: NDArray[np.int64], partners: Sequence[_Partner | Bins]) -> Iterator[slice]:
@@ -438,6 +527,7 @@ def side_by_side(
     how: str,
     tolerance: DurationLike | None,
     clock: str,
+    across_recordings: bool = False,
 ) -> Aligned:
     """An alignment of topics to the messages of one topic; see `Store.align`."""
     if clock not in {"log", "publish", "header"}:
@@ -450,8 +540,12 @@ def side_by_side(
     chosen: Clock = clock  # type: ignore[assignment]
     taken: set[str] = set()
     streams = [
-        Stream(replace(question, topics=(topic,)), _prefix(topic, taken))
-        for question in (base, *others)
+        Stream(
+            replace(question, topics=(topic,)),
+            _prefix(topic, taken),
+            is_apart=across_recordings and n > 0,
+        )
+        for n, question in enumerate((base, *others))
         for topic in question.topics
     ]
     rows = TopicBase(session, streams[0], chosen)

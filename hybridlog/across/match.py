@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from hybridlog_storage.times import BEGIN
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 How = Literal["asof", "nearest", "interpolate"]
 HOWS: tuple[How, ...] = ("asof", "nearest", "interpolate")
-UNKNOWN = -1
+UNKNOWN = BEGIN
 """The time of a message that has none on a clock: it matches nothing."""
 
 

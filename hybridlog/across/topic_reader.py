@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -15,10 +16,13 @@ from hybridlog.across.match import UNKNOWN
 from hybridlog.frames.answer import stream
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.last_message import message_at
+from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.counters import Counters
+from hybridlog.query.intervals import joined
 from hybridlog.query.planner import Planner
 from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import STAMP
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import END
 
@@ -32,6 +36,7 @@ TIME: Final = "log_time"
 """Column of the time of a row."""
 RECORDING: Final = "recording"
 """Column of the recording of a row."""
+_SHOWN: Final = 3  # recordings in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +46,13 @@ class Stream:
     Attributes:
         question: The question about the topic.
         prefix: Beginning of its columns' names; empty for none.
+        is_apart: Its messages may be of other recordings than the rows.
         counters: What reading it costs.
     """
 
     question: Question
     prefix: str
+    is_apart: bool = False
     counters: Counters = field(default_factory=Counters, compare=False)
 
 
@@ -66,6 +73,9 @@ class TopicReader:
                 "reverse."
             )
         self.prefix = stream.prefix
+        self._is_apart = stream.is_apart
+        if stream.is_apart:
+            question = replace(question, names_recording=True)
         self._session = session
         self._counters = stream.counters
         known = session.field_types(question.topics, question.recordings)
@@ -108,11 +118,9 @@ class TopicReader:
             recording: Id of the recording.
             span: Log time `[begin, end)`, ns, of a question without a range.
         """
-        places = self._session.chosen(self.question)
-        snapshot = self._session.snapshot()
-        if snapshot.by_id[recording] not in places:
+        if self.elsewhere(recording) is not None:
             return
-        question = replace(self.question, recordings=(recording,))
+        question = self._beside(recording)
         if span is not None:
             question = replace(question, bounds=span)
         counters = Counters()
@@ -125,17 +133,47 @@ class TopicReader:
         finally:
             self._counters.add(counters)
 
+    def elsewhere(self, recording: str) -> str | None:
+        """Why no message can be beside the rows of a recording; None if there may be some."""
+        snapshot = self._session.snapshot()
+        place, places = snapshot.by_id[recording], self._session.chosen(self.question)
+        if self._is_apart or place in places:
+            return None
+        is_near = (snapshot.begin[places] < snapshot.end[place]) & (
+            snapshot.begin[place] < snapshot.end[places]
+        )
+        labels = [snapshot.summaries[n].label for n in places[is_near].tolist()]
+        if not labels:
+            return "the messages are of other recordings"
+        return (
+            f"the messages of that time are of other recordings ({listed(labels, _SHOWN)}), which "
+            "--beside or across_recordings takes"
+        )
+
+    def lost(self, recording: str) -> NDArray[np.int64]:
+        """int64[n, 2], log time in which messages beside a recording are lost, ns, in order."""
+        spans: list[tuple[int, int, int]] = []
+        if self._clock_column == TIME and self.elsewhere(recording) is None:
+            with suppress(TimeError):  # the range does not touch this recording
+                lost = lost_times(self._session, self._beside(recording))
+                spans = sorted((one.begin_ns, one.end_ns, 0) for one in lost)
+        return joined(np.array(spans, np.int64).reshape(-1, 3))[:, :2]
+
+    def _beside(self, recording: str) -> Question:
+        """The question about the messages that may be beside the rows of a recording."""
+        return self.question if self._is_apart else replace(self.question, recordings=(recording,))
+
     def latest(self, recording: str, moment: int) -> int | None:
-        """Log time of the last message of a recording by a time, ns."""
+        """Log time of the last message beside a recording by a time, ns."""
         if moment >= END:
             return None
-        question = replace(self.question, recordings=(recording,))
+        question = self._beside(recording)
         found = message_at(self._session, question, self._counters, moment)
         return None if found is None else found.log_time_ns
 
     def following(self, recording: str, moment: int) -> int | None:
-        """Log time just behind the first message of a recording from a time on, ns."""
-        later = replace(self.question, recordings=(recording,), bounds=(moment, END), limit=1)
+        """Log time just behind the first message beside a recording from a time on, ns."""
+        later = replace(self._beside(recording), bounds=(moment, END), limit=1)
         counters = Counters()
         try:
             for run in Planner(self._session, later, counters).runs():
@@ -163,7 +201,7 @@ class TopicReader:
             column: That column.
         """
         found: dict[str, Any] = {first: column}
-        own = {TIME, RECORDING, self._own}
+        own = {TIME, self._own, *(() if self._is_apart else (RECORDING,))}
         for name, values in zip(table.column_names, table.columns, strict=True):
             if name not in own:
                 found[free_name(self.prefix + name, found)] = values

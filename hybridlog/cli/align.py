@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hybridlog.choice import Choice
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost
-from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.completion import complete_recording, complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output import notes
 from hybridlog.cli.query_options import parse_fields, query_of
@@ -20,7 +21,6 @@ from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -66,6 +66,14 @@ if TYPE_CHECKING:
 )
 @options.choice
 @click.option(
+    "--beside",
+    multiple=True,
+    metavar="RECORDING",
+    shell_complete=complete_recording,
+    help="The topics beside it are of these recordings, whose time may overlap: a second robot or "
+    "recorder. As for --recording; '*' for all. Repeatable.",
+)
+@click.option(
     "--fields",
     multiple=True,
     metavar="TOPIC: A,B.C",
@@ -83,6 +91,7 @@ def command(
     between: tuple[str, str] | None,
     where: tuple[str, ...],
     choice: Choice,
+    beside: tuple[str, ...],
     fields: tuple[str, ...],
     form: str | None,
     output: Path | None,
@@ -96,14 +105,14 @@ def command(
 
     A row for each message of one topic, with what the others had said by then. Columns are
     named by topic and field; `distance` is the time of a topic's message minus that of the
-    row. What is not near enough is empty.
+    row. What is not near enough is empty; lines on standard error say why.
     """
     choices = TableChoices(
         form=form, output=output, force=force, limit=limit, quiet=quiet
     ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
-        queries = _queries(opened, [base, *topic], choice)
+        queries = _queries(opened, [base, *topic], choice, beside)
         for predicates, add in ((where, _where), (fields, _fields)):
             for text in predicates:
                 add(opened, queries, text)
@@ -112,7 +121,14 @@ def command(
         if strict:
             for query in queries:
                 query.check_complete()
-        aligned = opened.align(queries[0], queries[1:], how=how, tolerance=tolerance, clock=clock)
+        aligned = opened.align(
+            queries[0],
+            queries[1:],
+            how=how,
+            tolerance=tolerance,
+            clock=clock,
+            across_recordings=bool(beside),
+        )
         write_tables(aligned.to_tables(), aligned.schema, choices)
         sys.stdout.flush()
         if not quiet:
@@ -120,10 +136,15 @@ def command(
             notes(aligned.remarks(base, *topic))
 
 
-def _queries(store: Store, topics: Sequence[str], choice: Choice) -> list[Query]:
+def _queries(
+    store: Store, topics: Sequence[str], choice: Choice, beside: Sequence[str]
+) -> list[Query]:
     """A query for each topic; the base is one topic."""
-    found = [query_of(store, [name], choice) for name in topics]
-    return [found[0], *(q.with_topic(topic) for q in found[1:] for topic in q.topics)]
+    others = Choice.of(beside) if beside else choice
+    base, *found = (
+        query_of(store, [name], others if n else choice) for n, name in enumerate(topics)
+    )
+    return [base, *(q.with_topic(topic) for q in found for topic in q.topics)]
 
 
 def _where(store: Store, queries: list[Query], text: str) -> None:

@@ -15,10 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import hybridlog as hl
 from hybridlog.across import align, topic_reader
 from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import UNKNOWN, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs, Said
@@ -362,6 +365,136 @@ def test_what_is_refused(logs: Logs) -> None:
         store.topic("base").resample("1ns")
 
 
+@pytest.mark.usefixtures("_blocks")
+@pytest.mark.parametrize("how", ["asof", "nearest", "interpolate"])
+@pytest.mark.parametrize("tolerance", [None, 7 * MS])
+def test_empty_cells_are_explained(logs: Logs, how: str, tolerance: int | None) -> None:
+    topics = ["left/pose", "right/pose"]
+    near = None if tolerance is None else f"{tolerance}ns"
+    aligned = logs.store.align("base", topics, how=how, tolerance=near)
+    found = aligned.to_pandas()
+    assert aligned.rows == len(found)
+    for topic in topics:
+        reasons = dict(aligned.empty.get(f"/{topic}", {}))
+        assert sum(reasons.values()) == found[f"{topic}.distance"].isna().sum()
+        elsewhere = 0
+        for label in logs.said:
+            rows = [one.time for one in logs.of(label, f"/{topic}")]
+            times = [one.time for one in logs.of(label, "/base")]
+            empty = sum(naive(time, rows, how, tolerance) is None for time in times)
+            elsewhere += 0 if rows else empty
+        apart = [number for why, number in reasons.items() if "other recordings (b), " in why]
+        assert apart == ([elsewhere] if elsewhere else [])
+        others = {why for why in reasons if "other recordings" not in why}
+        assert all(why.startswith("no message") for why in others)
+        assert all(("7ms" in why) == (tolerance is not None) for why in others)
+    said = [line.partition(": ")[0] for line in aligned.remarks()]
+    assert said == [name for name, reasons in aligned.empty.items() for _ in reasons]
+
+
+def test_cells_without_a_value_are_counted_by_column(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("now") as recording:
+            for n in range(6):
+                fields = {"n": n} | ({"x": n} if n % 3 else {})
+                for topic in ("/a", "/b"):
+                    payload = json.dumps(fields).encode()
+                    recording.write(Channel(topic, "json", None, {}), payload, log_time=BASE + n)
+        aligned = store.align("/a", store.topic("/b").between(BASE + 1, None))
+        aligned.to_arrow()
+        assert aligned.empty == {
+            "a.x": {"the message has no such value": 2},
+            "/b": {"no message came before": 1},
+            "b.x": {"the message has no such value": 1},
+        }
+        assert aligned.remarks() == [
+            "a.x: 2 of 6 rows are empty: the message has no such value.",
+            "/b: 1 of 6 rows are empty: no message came before.",
+            "b.x: 1 of 6 rows are empty: the message has no such value.",
+        ]
+
+
+@pytest.mark.usefixtures("_blocks")
+@pytest.mark.parametrize("clock", ["log", "header"])
+@pytest.mark.parametrize(("how", "direction"), [("asof", "backward"), ("nearest", "nearest")])
+@pytest.mark.parametrize("labels", [["c"], ["b", "c"]])
+def test_messages_of_another_recording(
+    logs: Logs, how: str, direction: str, clock: str, labels: list[str]
+) -> None:
+    base = logs.store.topic("base").in_recording("b").fields("header.seq")
+    other = logs.store.topic("left/pose").in_recording(*labels).fields("header.seq", "x")
+    found = logs.store.align(
+        base, [other], how=how, tolerance="7ms", clock=clock, across_recordings=True
+    ).to_pandas()
+    time: Callable[[Said], int] = (lambda m: m.time) if clock == "log" else (lambda m: m.stamp)
+    theirs = [one for label in labels for one in logs.of(label, "/left/pose")]
+    label_of = {id(one): label for label in labels for one in logs.of(label, "/left/pose")}
+    theirs.sort(key=lambda one: one.time)
+    others = frame_of(theirs, time, "their_")
+    want = pd.merge_asof(
+        frame_of(logs.of("b", "/base"), time, ""),
+        others.assign(their_time=others["time"]),
+        on="time",
+        direction=direction,  # type: ignore[arg-type]
+        tolerance=pd.Timedelta(7, "ms"),
+    ).sort_values("number", kind="stable")
+    found = found.sort_values("base.header.seq", kind="stable")
+    distance = (want["their_time"] - want["time"]).to_numpy()
+    np.testing.assert_array_equal(found["left/pose.distance"].to_numpy(), distance)
+    assert found["left/pose.distance"].notna().sum() > 20
+    numbers = {(label_of[id(one)], one.number): time(one) for one in theirs}
+    for row in found.dropna(subset=["left/pose.distance"]).itertuples(index=False):
+        label, number = row[2], int(row[3])
+        assert (label, number) in numbers
+    assert set(found["left/pose.recording"].dropna()) <= set(labels)
+
+
+def test_lost_messages_explain_empty_cells(tmp_path: Path) -> None:
+    settings = SegmentSettings(chunk_size=1 << 10, segment_size=1)
+    a, b = (Channel(topic, "json", None, {}) for topic in ("/a", "/b"))
+    path = tmp_path / "store"
+    with hl.open(path, create=True) as store:
+        with store.start("now", settings=settings) as recording:
+            for second in range(6):
+                payload = json.dumps({"n": second, "pad": "-" * 2000}).encode()
+                for channel in (a, b):
+                    recording.write(channel, payload, log_time=BASE + second * 10**9)
+    for line in (path / "recordings" / "now" / "journal").read_text().splitlines():
+        event = json.loads(line[9:])
+        for channel in event.get("channels", ()) if event["event"] == "sealed" else ():
+            if channel["topic"] == "/b" and (channel["first"] - BASE) // 10**9 in {2, 3, 5}:
+                (path / "recordings" / "now" / event["file"]).unlink()
+    with hl.open(path) as store:
+        for how, want in (("asof", 3), ("nearest", 3), ("interpolate", 3)):
+            aligned = store.align("/a", "/b", how=how, tolerance="0.5s")
+            aligned.to_arrow()
+            assert aligned.empty == {"/b": {"messages of that time are lost": want}}
+            assert "3 messages lost in" in aligned.remarks()[-1]
+        whole = store.align("/a", store.topic("/b").between("+0.5s", None), tolerance="0.2s")
+        whole.to_arrow()
+        assert whole.empty == {
+            "/b": {
+                "messages of that time are lost": 3,
+                "no message within 200ms before": 1,
+            }
+        }
+
+
+def test_the_command_takes_messages_of_another_recording(logs: Logs) -> None:
+    store = logs.store.directory.path
+    asked = ("align", "--to", "base", "-t", "left/pose", "-r", "b", "--fields", "base: x")
+    done = run(*asked, "--fields", "left/pose: x", "--beside", "c", store=store)
+    base, other = (logs.store.topic(name).fields("x") for name in ("base", "left/pose"))
+    want = logs.store.align(
+        base.in_recording("b"), [other.in_recording("c")], across_recordings=True
+    ).to_arrow()
+    lines = [json.loads(line) for line in done.lines]
+    distances = want["left/pose.distance"].cast(pa.int64()).to_pylist()
+    assert [row["left/pose.distance"] for row in lines] == distances
+    assert {row["left/pose.recording"] for row in lines} <= {"c", None}
+    assert "no message came before." in done.err
+
+
 def test_the_commands(logs: Logs, tmp_path: Path) -> None:
     store = logs.store.directory.path
     asked = (
@@ -378,7 +511,9 @@ def test_the_commands(logs: Logs, tmp_path: Path) -> None:
     path = tmp_path / "x.parquet"
     done = run(*asked, "-o", path, store=store)
     assert str(pq.read_table(path).to_pylist()) == str(want.to_pylist())
-    assert done.err.endswith(" s\n")
+    cost, *why = done.err.splitlines()
+    assert cost.endswith(" s")
+    assert "/left/pose: 87 of 260 rows are empty: no message within 5ms." in why
     lines = [json.loads(line) for line in run(*asked, "-n", "30", store=store).lines]
     assert len(lines) == 30
     assert lines[0]["log_time_ns"] == want["log_time"][0].value
