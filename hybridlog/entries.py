@@ -472,7 +472,7 @@ def _fill_stats(entry: RecordingEntry, inventory: Inventory, stamps: Stamps) -> 
     entry.is_decoded = True
     for number, summary in inventory.summaries.items():
         found = stamps(entry, number, summary.table)
-        entry.is_decoded &= found is not None or not summary.chunks
+        entry.is_decoded &= found is not None or not len(summary.table.chunks)
         for channel_id, stats in channel_totals(summary.table, found, silent).items():
             totals.setdefault(channel_id, ChannelStats()).add(stats)
     for channel in entry.channels:

@@ -192,7 +192,6 @@ def _print_recording(
     losses = losses_of(entry)
     source = entry.source
     summary = summary_of(entry)
-    has_content = recording_summary.has_content(summary)
     status = recording_summary.status(summary)
     if entry.status == "open":
         status += f"; `hybridlog top {entry.label}` shows it"
@@ -208,8 +207,8 @@ def _print_recording(
         ("start", format_time(span[0]) if span else "-"),
         ("last", format_time(span[1]) if span else "-"),
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
-        ("messages", str(entry.messages) if has_content else "-"),
-        ("stored", held if has_content else "-"),
+        ("messages", str(entry.messages)),
+        ("stored", held),
         *_coverage(entry, coverage.describe(entry, losses)),
         *(("", line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),

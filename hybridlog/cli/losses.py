@@ -57,8 +57,8 @@ def command(
     for entry in entries:
         if entry.status == "open":
             output.note(
-                f"{entry.label} is still being recorded: its losses appear here when it ends, and "
-                f"`hybridlog top {entry.label}` shows them now."
+                f"{entry.label} is still being recorded; `hybridlog top {entry.label}` shows later "
+                "losses."
             )
 
 

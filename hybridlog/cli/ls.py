@@ -56,16 +56,15 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
-    known = recording_summary.has_content(entry)
     start = output.short_time(span[0], minutes=narrow) if span else "-"
     cells = [
         entry.label,
         start,
         output.short_duration(span[1] - span[0]) if span else "-",
-        str(entry.messages) if known else "-",
+        str(entry.messages),
         ", ".join(notes),
     ]
     if not narrow:
-        cells.insert(3, str(entry.topic_count) if known else "-")
-        cells.insert(5, output.size(entry.stored_bytes) if known else "-")
+        cells.insert(3, str(entry.topic_count))
+        cells.insert(5, output.size(entry.stored_bytes))
     return cells

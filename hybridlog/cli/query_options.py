@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.recordings import Recordings
     from hybridlog.store import Store
-    from hybridlog_storage.summary import RecordingSummary
 
 
 _SHOWN = 5  # recordings in a message
@@ -97,33 +96,12 @@ def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Quer
     if choice.is_everything:
         if not topics:
             return store.all_topics()
-        with _name_open_recordings(store.summaries):
-            return store.topic(*topics)
+        return store.topic(*topics)
     chosen = recordings_of(store, choice)
     if not topics:
         return chosen.all_topics()
-    with (
-        _name_open_recordings(lambda: chosen.summaries),
-        _name_other_recordings(store, topics, chosen.topics()),
-    ):
+    with _name_other_recordings(store, topics, chosen.topics()):
         return chosen.topic(*topics)
-
-
-@contextmanager
-def _name_open_recordings(
-    recordings: Callable[[], Sequence[RecordingSummary]],
-) -> Iterator[None]:
-    """Add the recordings in progress to the error about a topic: they may have it."""
-    try:
-        yield
-    except TopicError as error:
-        names = [entry.label for entry in recordings() if entry.status == "open"]
-        if not names:
-            raise
-        are = "is" if len(names) == 1 else "are"
-        raise TopicError(
-            f"{error}; {', '.join(names)} {are} still being recorded: ask again when that has ended"
-        ) from error
 
 
 @contextmanager

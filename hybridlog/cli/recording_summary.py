@@ -23,11 +23,6 @@ def status(recording: RecordingSummary) -> str:
     return _STATUS.get(recording.status, recording.status)
 
 
-def has_content(recording: RecordingSummary) -> bool:
-    """True when the catalog knows the content, which it does once a segment is sealed."""
-    return recording.status != "open" or recording.topic_count > 0
-
-
 def as_dict(recording: RecordingSummary) -> dict[str, Any]:
     """A recording in short, for JSON."""
     span = recording.span

@@ -29,17 +29,18 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     with SegmentReader(path, number) as reader:
         summary = reader.summary()
         bytes_all = reader.size
+    chunks = summary.chunks
     channels = [
         {
             "topic": channel.topic,
             "type": channel.schema.name if channel.schema is not None else None,
             "messages": summary.counts.get(channel_id, 0),
-            "chunks": sum(channel_id in place.channels for place in summary.chunks),
+            "chunks": sum(channel_id in place.channels for place in chunks),
         }
         for channel_id, channel in sorted(summary.channels.items())
     ]
-    first = min((place.first for place in summary.chunks), default=None)
-    last = max((place.last for place in summary.chunks), default=None)
+    first = min((place.first for place in chunks), default=None)
+    last = max((place.last for place in chunks), default=None)
     if as_json:
         output.print_json(
             {
@@ -49,7 +50,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
                 "end": summary.end,
                 "first_ns": first,
                 "last_ns": last,
-                "chunks": len(summary.chunks),
+                "chunks": len(chunks),
                 "channels": channels,
             }
         )
@@ -64,7 +65,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             ("start", format_time(first) if first is not None else "-"),
             ("last", format_time(last) if last is not None else "-"),
             ("bytes", output.size(bytes_all)),
-            ("chunks", str(len(summary.chunks))),
+            ("chunks", str(len(chunks))),
             ("messages", str(sum(summary.counts.values()))),
         ],
     )

@@ -11,7 +11,7 @@ import stat
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
 
@@ -106,7 +106,6 @@ class SegmentSummary:
         end: The end of the recording; None except in its last segment.
         channels: Channels by id.
         schema_ids: Id of each channel's schema, 0 without one, by channel id.
-        chunks: Chunks in file order.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
@@ -122,7 +121,6 @@ class SegmentSummary:
     end: dict[str, object] | None
     channels: dict[int, Channel]
     schema_ids: dict[int, int]
-    chunks: list[ChunkPlace]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
     attachments: list[AttachmentIndex]
@@ -131,6 +129,11 @@ class SegmentSummary:
     table: ChunkTable
     digest: str
     size: int
+
+    @property
+    def chunks(self) -> list[ChunkPlace]:
+        """Position of each chunk, in file order."""
+        return places_of(self.table)
 
 
 @dataclass(slots=True)
@@ -333,7 +336,6 @@ class SegmentReader:
             end=found.get(END_METADATA),
             channels={i: channel_of(r, records.schemas) for i, r in records.channels.items()},
             schema_ids={i: r.schema_id for i, r in records.channels.items()},
-            chunks=places_of(table),
             counts=counts,
             losses=losses,
             attachments=records.attachments,
@@ -615,11 +617,8 @@ _WANTED = frozenset(
 def _listed_counts(table: ChunkTable) -> dict[int, int]:
     """Messages of each channel in chunks that were not moved."""
     rows = np.repeat(table.chunks["length"] != MOVED_SIZE, table.chunks["parts"])
-    counts: dict[int, int] = {}
-    parts = table.parts[rows]
-    for channel, count in zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True):
-        counts[channel] = counts.get(channel, 0) + count
-    return counts
+    totals = replace(table, parts=table.parts[rows]).by_channel()
+    return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
 
 
 def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:

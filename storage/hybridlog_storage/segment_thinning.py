@@ -101,6 +101,7 @@ def _copy(
     for channel_id, channel in summary.channels.items():
         segment.define(channel_id, summary.schema_ids[channel_id], channel, write=False)
     bounds = summary.table.part_bounds().tolist()
+    places = summary.chunks
     old: list[int] = []
     new: list[int] = []
     for piece in _pieces(summary):
@@ -110,7 +111,7 @@ def _copy(
             is_last = piece.offset + piece.length == summary.table.end
             _copy_stretch(reader, segment, piece, is_last=is_last)
             continue
-        place = summary.chunks[piece.chunk]
+        place = places[piece.chunk]
         record: Buffer = _checked(reader, place.offset, place.length, piece.crc)
         trailer = _checked(
             reader, place.offset + place.length, place.trailer, place.trailer_crc or 0
