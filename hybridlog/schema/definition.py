@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 MAX_DEFINITION = 1 << 20
 """Largest definition, in bytes."""
-MAX_DEPTH = 64
-"""Deepest nesting of messages."""
+MAX_DEPTH = 62
+"""Deepest nesting of messages, arrays of messages counted twice: deeper columns cannot be read."""
 MAX_FIELDS = 100_000
 """Most fields of an unfolded type; nested ones count at each occurrence."""
 MAX_PATH_CHARACTERS = 1 << 24
@@ -407,16 +407,17 @@ class _Resolver:
         if not raw.array:
             return element, extent
         width = raw.width
+        depth = extent.depth + (extent.depth > 0)
         if width is None:
             return ArrayOf(element, None, raw.bound), _Extent(
-                extent.depth, extent.fields, extent.characters, 4
+                depth, extent.fields, extent.characters, 4
             )
         if width > MAX_WIDTH or (width == 0 and self._ros == 2):
             least = 0 if self._ros == 1 else 1
             raise self._fail(
                 f"{owner}.{raw.name} has {width} elements; from {least} to {MAX_WIDTH} are indexed"
             )
-        extent = _Extent(extent.depth, extent.fields, extent.characters, extent.size * width)
+        extent = _Extent(depth, extent.fields, extent.characters, extent.size * width)
         return ArrayOf(element, width), extent
 
     def _element(self, owner: str, raw: RawField) -> tuple[FieldType, _Extent]:

@@ -8,8 +8,11 @@ from typing import Any
 
 from hybridlog.schema.utf8 import repaired_text
 
-MAX_DEPTH = 100
-"""Values with deeper nesting are JSON text in tables."""
+MAX_DEPTH = 32
+"""Values with deeper nesting are JSON text in columns.
+
+A list is two levels of a Parquet schema, and readers of Parquet take at most 100 levels.
+"""
 
 
 def json_text(value: object) -> str:
@@ -21,7 +24,7 @@ def json_text(value: object) -> str:
     except ValueError:
         return json_text(without_nan(value))
     except RecursionError:
-        text = json.dumps(f"nested deeper than {MAX_DEPTH}")
+        text = json.dumps("nested too deep")
     return repaired_text(text)
 
 

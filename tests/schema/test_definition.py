@@ -588,8 +588,10 @@ def chain(length: int, line: str) -> str:
 
 def test_nesting_and_unfolding_are_bounded():
     assert len(paths(parse(chain(60, "A{0} a")))) == 61
+    assert len(paths(parse(chain(28, "A{0}[] a")))) == 29
     for text, reason in [
         (chain(80, "A{0} a"), "nested deeper"),
+        (chain(40, "A{0}[] a"), "nested deeper"),  # an array is two levels of a column
         (chain(5000, "A{0} a"), "nested deeper"),
         (chain(40, "A{0} a\nA{0} b"), "unfolds to"),
         (chain(10, "A{0}[200000000] a"), "bytes at the least"),
