@@ -13,6 +13,7 @@ from hybridlog.query.times import (
     parse_range,
     parse_time,
 )
+from hybridlog.schema.stamps import stamps_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END, span_of
@@ -21,9 +22,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.question import Clock, Question, Span
+    from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog.snapshot import Snapshot
+    from hybridlog_storage.catalog import ChannelStats
     from hybridlog_storage.summary import RecordingSummary
 
 _SHOWN = 5  # recordings in a message
@@ -197,22 +199,32 @@ class RangeResolver:
 
     def _clock_span(self, summary: RecordingSummary) -> Span:
         """`[first, end)` of the question's topics, on the question's clock."""
-        clock: Clock = self._question.clock
-        if clock == "log":
+        if self._question.clock == "log":
             return summary.extent
-        recording = self._session.entry_of(summary)
-        stats = [c.stats for c in recording.channels if c.topic in self._question.topics]
-        pairs = [
-            (s.first_publish, s.last_publish)
-            if clock == "publish"
-            else (s.first_stamp, s.last_stamp)
-            for s in stats
-        ]
-        known = [(first, last) for first, last in pairs if first is not None and last is not None]
-        if not known:
-            return summary.extent
-        first, last = min(low for low, _ in known), max(high for _, high in known)
-        return span_of(first, last)
+        channels = self._session.channels(self._session.entry_of(summary))
+        wanted = (c for c in channels if c.channel.topic in self._question.topics)
+        ends = [time for channel in wanted for time in self._ends(channel)]
+        return span_of(min(ends), max(ends)) if ends else summary.extent
+
+    def _ends(self, channel: RecordedChannel) -> Iterator[int]:
+        """First and last time of a channel on the question's clock, perhaps of each chunk.
+
+        Where statistics do not have them, the messages are read.
+        """
+        recording, is_publish = channel.recording, self._question.clock == "publish"
+        if recording.is_decoded if not is_publish else not recording.flushed:
+            yield from _known_ends(channel.stats, is_publish=is_publish)
+            return
+        number = channel.channel_id
+        for chunk in self._session.chunks(recording, [number], None, "log"):
+            known = _known_ends(chunk.stats[number], is_publish=is_publish)
+            if not known:
+                reader = self._session.segment(recording.id, chunk.segment)
+                batch = reader.read_chunk(chunk.place).batch
+                batch = batch.take(np.flatnonzero(batch.channel == number))
+                times = batch.publish_time if is_publish else stamps_of(channel.codec, batch)[1]
+                known = [int(times.min()), int(times.max())] if len(times) else []
+            yield from known
 
     def _is_outside(self, bounds: Span, recording: RecordingSummary) -> bool:
         """True if a range is empty, or does not overlap the recording on the log clock."""
@@ -255,3 +267,13 @@ class RangeResolver:
         places = snapshot.between(snapshot.having(self._question.topics), *shared).tolist()
         labels = [snapshot.summaries[place].label for place in places]
         return f" Other recordings span that time: {listed(labels, _SHOWN)}." if labels else ""
+
+
+def _known_ends(stats: ChannelStats, *, is_publish: bool) -> list[int]:
+    """First and last publish time, or header stamp; empty if they are unknown."""
+    ends = (
+        (stats.first_publish, stats.last_publish)
+        if is_publish
+        else (stats.first_stamp, stats.last_stamp)
+    )
+    return [time for time in ends if time is not None]

@@ -1,0 +1,1 @@
+"""Recordings that go on, compared with the sequence that is written."""

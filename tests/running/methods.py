@@ -1,0 +1,761 @@
+"""Every method of `Query` and of `Store` that answers, with what is right, in plain Python."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.query.intervals import Intervals
+from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError
+from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
+
+LABEL = "live"
+"""Label of the recording that goes on."""
+TAGS = {"robot": "7"}
+FIRST_S, LAST_S = START + SECOND, START + 2 * SECOND
+"""A second in the middle of what is there from the first answer on."""
+
+
+class Rule(NamedTuple):
+    """A question, and the right answer.
+
+    Attributes:
+        ask: Asks a store.
+        right: The answer, if the recording has these messages.
+    """
+
+    ask: Callable[[hl.Store], Any]
+    right: Callable[[Known], Any]
+
+
+def same(found: Any, wanted: Any) -> bool:
+    """True if two answers are equal; floats up to rounding."""
+    if isinstance(found, float) or isinstance(wanted, float):
+        if found is None or wanted is None:
+            return found is wanted
+        return bool(found == pytest.approx(wanted, rel=1e-9, abs=1e-9, nan_ok=True))
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return found.keys() == wanted.keys() and all(same(found[k], wanted[k]) for k in found)
+    if isinstance(found, list | tuple) and isinstance(wanted, list | tuple):
+        pairs = zip(found, wanted, strict=False)
+        return len(found) == len(wanted) and all(same(one, other) for one, other in pairs)
+    return bool(found == wanted)
+
+
+# What is read.
+
+
+def rows(messages: Iterable[hl.Message]) -> list[tuple[Any, ...]]:
+    return [(m.topic, m.log_time_ns, m.publish_time_ns, m.seq, m.raw) for m in messages]
+
+
+def sent(messages: Iterable[Sent]) -> list[tuple[Any, ...]]:
+    return [(m.topic, m.log_time, m.publish_time, m.seq, m.raw) for m in messages]
+
+
+def seqs(messages: Iterable[Any]) -> list[int]:
+    return [message.seq for message in messages]
+
+
+def batches(found: Iterable[tuple[Any, Any]]) -> list[tuple[Any, ...]]:
+    return [
+        (channels[batch.channel[n]].channel.topic, int(batch.log_time[n]), bytes(batch.payload(n)))
+        for batch, channels in found
+        for n in range(len(batch))
+    ]
+
+
+def spans(intervals: Intervals) -> list[tuple[int, int, int]]:
+    assert set(intervals.recordings) <= {one.recording for one in intervals}
+    return [(one.begin_ns, one.end_ns, one.messages) for one in intervals]
+
+
+def refusal(work: Callable[[], Any]) -> str:
+    """The name of the error that something raises; empty without."""
+    try:
+        work()
+    except HybridlogError as error:
+        return type(error).__name__
+    return ""
+
+
+# What is right, in plain Python.
+
+
+def held(known: Known, topic: str, holds: Callable[[dict[str, Any]], bool]) -> Any:
+    """The longest intervals in which the last message holds."""
+    found: list[list[int]] = []
+    is_on = False
+    for one in known.of(topic):
+        assert one.fields is not None
+        if holds(one.fields):
+            if not is_on:
+                found.append([one.log_time, 0, 0])
+            found[-1][2] += 1
+        elif is_on:
+            found[-1][1] = one.log_time
+        is_on = holds(one.fields)
+    if is_on:
+        found[-1][1] = known.span[1] + 1
+    return [tuple(one) for one in found]
+
+
+def changed(known: Known, topic: str, name: str, pause: int) -> Any:
+    found: list[list[int]] = []
+    before = None
+    for one in known.of(topic):
+        assert one.fields is not None
+        if before is not None and one.fields[name] != before:
+            if found and one.log_time - found[-1][1] <= pause:
+                found[-1][1:] = [one.log_time, found[-1][2] + 1]
+            else:
+                found.append([one.log_time, one.log_time, 1])
+        before = one.fields[name]
+    return [(begin, last + 1, steps) for begin, last, steps in found]
+
+
+def silent(known: Known, topic: str, longer: int) -> Any:
+    first, last = known.span
+    times = [one.log_time for one in known.of(topic)]
+    edges = [first, *times, last + 1]
+    return [(a, b, 0) for a, b in pairwise(edges) if b - a > longer]
+
+
+def around(known: Known, times: Sequence[int], before: int, after: int, *topics: str) -> Any:
+    return [
+        m for m in known.of(*topics) if any(t - before <= m.log_time < t + after for t in times)
+    ]
+
+
+def numbers(known: Known, topic: str, name: str) -> Any:
+    values = [one.fields[name] for one in known.of(topic) if one.fields is not None]
+    least, most = min(values), max(values)
+    mean, deviation = statistics.fmean(values), statistics.stdev(values)
+    return [(topic, name, len(values), 0, 0, least, most, mean, deviation)]
+
+
+def rates(known: Known, *topics: str) -> Any:
+    found = []
+    for topic in sorted(topics):
+        times = [one.log_time for one in known.of(topic)]
+        rate = (len(times) - 1) * 1e9 / (times[-1] - times[0]) if len(times) > 1 else math.nan
+        found.append((times[0], times[-1] + 1, topic, len(times), rate))
+    return found
+
+
+def by_window(known: Known, topic: str, size: int) -> Any:
+    first, last = known.span
+    times = [one.log_time for one in known.of(topic)]
+    return [
+        (begin, min(begin + size, last + 1), sum(begin <= t < begin + size for t in times))
+        for begin in range(first, last + 1, size)
+    ]
+
+
+def current(known: Known, topic: str, time: int) -> Sent:
+    """The last message not after a time."""
+    found = known.of(topic)
+    return found[bisect_right([one.log_time for one in found], time) - 1]
+
+
+def beside(known: Known, base: str, other: str) -> Any:
+    """Log time and `n` of a topic; distance and `n` of the last message of another by then."""
+    found = []
+    others = known.of(other)
+    times = [one.log_time for one in others]
+    for one in known.of(base):
+        place = bisect_right(times, one.log_time) - 1
+        assert one.fields is not None
+        near = others[place].fields if place >= 0 else None
+        distance = times[place] - one.log_time if place >= 0 else None
+        found.append((one.log_time, one.fields["n"], distance, near and near["n"]))
+    return found
+
+
+def regular(known: Known, topic: str, step: int) -> Any:
+    first, last = known.span
+    times = [one.log_time for one in known.of(topic)]
+    grid = range(first, last + 1, step)
+    return [(t, sum(t <= at < t + step for at in times)) for t in grid]
+
+
+def in_force(known: Known, time: int) -> Any:
+    found = [one for one in known.of("/map") if one.log_time < time]
+    return [("/map", time, found[-1].raw)] if found else []
+
+
+def ranged(known: Known, topic: str, clock: str, begin: int | None, end: int | None) -> Any:
+    """Messages between two offsets from the begin; negative ones count from the end."""
+    first, after = known.clock_span(clock, [topic]) if clock != "log" else known.span
+    after += clock == "log"
+    edges = [
+        default if given is None else (after + given if given < 0 else first + given)
+        for given, default in ((begin, -(10**18)), (end, 10**19))
+    ]
+    return sent(known.of(topic, between=(edges[0], edges[1]), clock=clock))
+
+
+def _json_lines(query: Any) -> list[tuple[int, int]]:
+    found = [json.loads(line) for lines in query.to_json_lines() for line in lines]
+    return [(one["n"], one["big"]) for one in found]
+
+
+def _numbers(known: Known) -> list[tuple[int, int]]:
+    return [(m.fields["n"], m.fields["big"]) for m in known.of("/said") if m.fields is not None]
+
+
+def _frame(frame: Any) -> list[tuple[int, int]]:
+    return [*zip(frame.index.astype("int64").tolist(), frame["n"].tolist(), strict=True)]
+
+
+def _times(known: Known, topic: str) -> list[tuple[int, int]]:
+    return [(m.log_time, m.fields["n"]) for m in known.of(topic) if m.fields is not None]
+
+
+def _table(table: Any, *names: str) -> list[tuple[Any, ...]]:
+    import pyarrow as pa
+
+    columns = []
+    for name in names:
+        column = table.column(name)
+        if pa.types.is_timestamp(column.type) or pa.types.is_duration(column.type):
+            column = column.cast(pa.int64())
+        columns.append(column.to_pylist())
+    return [*zip(*columns, strict=True)]
+
+
+def _plotted(store: hl.Store) -> list[list[tuple[int, float]]]:
+    from matplotlib.figure import Figure
+
+    axes = store.topic("/said").plot("x", ax=Figure(figsize=(60, 4)).subplots())
+    found = []
+    for line in axes.get_lines():
+        points = np.asarray(line.get_xydata())
+        kept = points[~np.isnan(points[:, 1])]
+        found.append(sorted({(round(1e3 * x), float(y)) for x, y in kept}))
+    return [points for points in found if points]
+
+
+def _points(known: Known) -> Any:
+    first = known.span[0]
+    return [
+        sorted({(round((m.log_time - first) / MS), m.fields["x"]) for m in known.of("/said")})  # type: ignore[index]
+    ]
+
+
+def _clocks(store: hl.Store) -> Any:
+    said, arm = store.topic("said"), store.topic("arm")
+    return {
+        "publish": rows(said.clock("publish").between("+0s", "+2s")),
+        "publish end": rows(said.clock("publish").between("-1s", "end")),
+        "publish count": said.clock("publish").between("-1s", "end").count(),
+        "publish where": said.clock("publish").where("n >= 3").between("+0.5s", "+1s").count(),
+        "publish absolute": rows(said.clock("publish").between(FIRST_S, LAST_S)),
+        "header": rows(arm.clock("header").between("+0s", "+2s")),
+        "header end": rows(arm.clock("header").between("-1s", "end")),
+        "header count": arm.clock("header").between("-1s", None).count(),
+        "header absolute": rows(arm.clock("header").between(FIRST_S, LAST_S)),
+        "log": rows(arm.clock("log").between("-1s", "end")),
+    }
+
+
+def _right_clocks(known: Known) -> Any:
+    said, arm, one = "/said", "/arm", SECOND
+    first = known.clock_span("publish", [said])[0]
+    wide = known.of(said, between=(first + one // 2, first + one), clock="publish")
+    span = (FIRST_S, LAST_S)
+    return {
+        "publish": ranged(known, said, "publish", 0, 2 * one),
+        "publish end": ranged(known, said, "publish", -one, None),
+        "publish count": len(ranged(known, said, "publish", -one, None)),
+        "publish where": sum(m.fields["n"] >= 3 for m in wide),  # type: ignore[index]
+        "publish absolute": sent(known.of(said, between=span, clock="publish")),
+        "header": ranged(known, arm, "header", 0, 2 * one),
+        "header end": ranged(known, arm, "header", -one, None),
+        "header count": len(ranged(known, arm, "header", -one, None)),
+        "header absolute": sent(known.of(arm, between=span, clock="header")),
+        "log": ranged(known, arm, "log", -one, None),
+    }
+
+
+def _during(store: hl.Store) -> Intervals:
+    recording = store.summaries()[0].id
+    return Intervals.of([(recording, np.array([[FIRST_S, LAST_S, 0]], np.int64))])
+
+
+def _thrice(query: Any) -> Any:
+    """The same question by the three ways of asking."""
+    return query.count(), rows(query), len(query.to_arrow())
+
+
+def _right_thrice(found: list[Sent]) -> Any:
+    return len(found), sent(found), len(found)
+
+
+def _is_high(fields: dict[str, Any]) -> bool:
+    return bool(fields["x"] > 50)
+
+
+def _marks(known: Known) -> list[int]:
+    return [one.log_time for one in known.of("/hybridlog/marks")]
+
+
+def _second(known: Known, *topics: str) -> list[Sent]:
+    return known.of(*topics, between=(FIRST_S, LAST_S))
+
+
+def _lost(store: hl.Store) -> Any:
+    said, arm = store.topic("said").lost(), store.topic("arm").lost()
+    return (said.messages, said.is_exact, bool(arm)), said.told
+
+
+METHODS: dict[str, Rule] = {
+    "__iter__": Rule(lambda s: rows(s.all_topics()), lambda k: sent(k.of())),
+    "__getitem__": Rule(
+        lambda s: s.topic("arm")["n", "position"].to_arrow().column_names[-2:],
+        lambda _: ["n", "position"],
+    ),
+    "__eq__": Rule(lambda s: s.topic("arm") == s["/arm"], lambda _: True),
+    "__hash__": Rule(lambda s: len({s.topic("arm"), s["/arm"]}), lambda _: 1),
+    "__repr__": Rule(
+        lambda s: repr(s.topic("said")), lambda _: f"<Query /said; recording {LABEL}>"
+    ),
+    "_repr_html_": Rule(lambda s: LABEL in s.topic("said")._repr_html_(), lambda _: True),
+    "_ipython_key_completions_": Rule(
+        lambda s: (
+            {"n", "header.stamp", "position"} <= set(s.topic("arm")._ipython_key_completions_())
+        ),
+        lambda _: True,
+    ),
+    "any_within": Rule(
+        lambda s: (
+            s.topic("said")
+            .where("state == 'b'")
+            .any_within(
+                s.summaries()[0].id,
+                np.array([[START + n * SECOND, START + (n + 1) * SECOND] for n in range(20)]),
+            )
+            .tolist()
+        ),
+        lambda k: [
+            any(
+                START + n * SECOND <= m.log_time < START + (n + 1) * SECOND
+                for m in k.of("/said", where=lambda f: f["state"] == "b")
+            )
+            for n in range(20)
+        ],
+    ),
+    "around": Rule(
+        lambda s: seqs(s.topic("arm").around(s.topic("marks"), "0.3s", "0.1s")),
+        lambda k: seqs(around(k, _marks(k), 300 * MS, 100 * MS, "/arm")),
+    ),
+    "before": Rule(
+        lambda s: seqs(s.topic("arm").before(s.topic("marks"), "0.3s")),
+        lambda k: seqs(around(k, _marks(k), 300 * MS, 0, "/arm")),
+    ),
+    "at": Rule(
+        lambda s: [s.topic("said").at(t).seq for t in (FIRST_S, LAST_S + 1, "-0.3s", "end")],
+        lambda k: [
+            current(k, "/said", t).seq
+            for t in (FIRST_S, LAST_S + 1, k.span[1] + 1 - 300 * MS, k.span[1])
+        ],
+    ),
+    "at_time": Rule(
+        lambda s: rows(s.topic("arm").at_time("-0.1s")),
+        lambda k: sent([current(k, "/arm", k.span[1] + 1 - 100 * MS)]),
+    ),
+    "at_all_times": Rule(
+        lambda s: s.topic("arm").between("+1s", "+2s").at_all_times().count(),
+        lambda k: len(k.of("/arm")),
+    ),
+    "batches": Rule(
+        lambda s: batches(s.topic("said", "cam", "opaque").batches()),
+        lambda k: [(m.topic, m.log_time, m.raw) for m in k.of("/said", "/cam", "/opaque")],
+    ),
+    "between": Rule(
+        lambda s: (
+            _thrice(s.topic("said", "arm").between(FIRST_S, LAST_S)),
+            _thrice(s.topic("said").between("-1s", "end")),
+            _thrice(s.topic("said").between("+0.5s", "-0.5s").where("n > 3")),
+        ),
+        lambda k: (
+            _right_thrice(_second(k, "/said", "/arm")),
+            _right_thrice(k.of("/said", between=(k.span[1] + 1 - SECOND, k.span[1] + 1))),
+            _right_thrice(
+                k.of(
+                    "/said",
+                    between=(k.span[0] + SECOND // 2, k.span[1] + 1 - SECOND // 2),
+                    where=lambda f: f["n"] > 3,
+                )
+            ),
+        ),
+    ),
+    "changes": Rule(
+        lambda s: (
+            spans(s.topic("said").changes("state")),
+            spans(s.topic("said").changes("state", pause=0)),
+            spans(s.topic("arm").changes("name", pause="0.1s")),
+        ),
+        lambda k: (
+            changed(k, "/said", "state", SECOND),
+            changed(k, "/said", "state", 0),
+            changed(k, "/arm", "name", SECOND // 10),
+        ),
+    ),
+    "channels": Rule(
+        lambda s: sorted(c.channel.topic for c in s.all_topics().channels()),
+        lambda _: sorted(CHANNELS),
+    ),
+    "check_complete": Rule(
+        lambda s: (
+            refusal(s.topic("said").check_complete),
+            refusal(s.topic("arm").between(FIRST_S, LAST_S).check_complete),
+        ),
+        lambda _: (IncompleteError.__name__, ""),
+    ),
+    "check_range": Rule(
+        lambda s: (
+            refusal(s.topic("said").between(0, SECOND).check_range),
+            refusal(s.topic("said").between("+1s", "+2s").check_range),
+        ),
+        lambda _: (TimeError.__name__, ""),
+    ),
+    "clock": Rule(_clocks, _right_clocks),
+    "copy": Rule(lambda s: s.topic("arm").copy().count(), lambda k: len(k.of("/arm"))),
+    "count": Rule(
+        lambda s: (
+            s.all_topics().count(),
+            s.topic("said").count(),
+            s.topic("said").where("x > 50").count(),
+            s.topic("arm").where("ranges.max > 29 and name == 'arm 2'").count(),
+            s.topic("arm").where("ranges[3:7].min >= 4").count(),
+            s.topic("said").where("n >= 10").limit(7).count(),
+            s.topic("said", "arm").where("n == 9 or n > 20").every(3).count(),
+        ),
+        lambda k: (
+            len(k.of()),
+            len(k.of("/said")),
+            len(k.of("/said", where=_is_high)),
+            len(k.of("/arm", where=lambda f: max(f["ranges"]) > 29 and f["name"] == "arm 2")),
+            len(k.of("/arm", where=lambda f: min(f["ranges"][3:7]) >= 4)),
+            7,
+            sum(
+                -(-len(k.of(topic, where=lambda f: f["n"] == 9 or f["n"] > 20)) // 3)
+                for topic in ("/said", "/arm")
+            ),
+        ),
+    ),
+    "directory": Rule(lambda s: s.topic("arm").directory == s.directory.path, lambda _: True),
+    "doubtful": Rule(
+        lambda s: [entry.label for entry in s.topic("arm").doubtful()], lambda _: [LABEL]
+    ),
+    "during": Rule(
+        lambda s: _thrice(s.topic("said", "cam").during(_during(s))),
+        lambda k: _right_thrice(_second(k, "/said", "/cam")),
+    ),
+    "encodings": Rule(
+        lambda s: s.all_topics().encodings(), lambda _: {"json", "cdr", "ros1", "cbor"}
+    ),
+    "every": Rule(lambda s: seqs(s.topic("said").every(7)), lambda k: seqs(k.of("/said")[::7])),
+    "extras": Rule(
+        lambda s: (
+            sorted(c.topic for c in s.all_topics().extras().channels),
+            len(s.all_topics().extras().problems),
+        ),
+        lambda _: (sorted(CHANNELS), 0),
+    ),
+    "field_types": Rule(
+        lambda s: (s.topic("arm").field_types() or {}).get("position"), lambda _: "float64[]"
+    ),
+    "fields": Rule(
+        lambda s: _table(
+            s.topic("arm").fields("n", "name", "ranges.max").to_arrow(), "n", "name", "ranges.max"
+        ),
+        lambda k: [
+            (m.fields["n"], m.fields["name"], max(m.fields["ranges"]))  # type: ignore[index]
+            for m in k.of("/arm")
+        ],
+    ),
+    "fingerprint": Rule(
+        lambda s: s.topic("said").fingerprint() == s.topic("said").fingerprint(), lambda _: True
+    ),
+    "first": Rule(
+        lambda s: (s.topic("arm").first().seq, s.topic("arm").reverse().first().seq),  # type: ignore[union-attr]
+        lambda k: (k.of("/arm")[0].seq, k.of("/arm")[-1].seq),
+    ),
+    "gaps": Rule(
+        lambda s: (
+            spans(s.topic("said").gaps(longer_than="25ms")),
+            spans(s.topic("cam").gaps(longer_than="100ms")),
+        ),
+        lambda k: (silent(k, "/said", 25 * MS), silent(k, "/cam", 100 * MS)),
+    ),
+    "held": Rule(
+        lambda s: [
+            tuple(row)
+            for _, found in s.topic("said").where("x > 50").held()
+            for row in found.tolist()
+        ],
+        lambda k: held(k, "/said", _is_high),
+    ),
+    "in_recording": Rule(
+        lambda s: _thrice(s.topic("arm").in_recording(LABEL)),
+        lambda k: _right_thrice(k.of("/arm")),
+    ),
+    "intervals": Rule(
+        lambda s: (
+            spans(s.topic("said").where("x > 50").intervals()),
+            spans(s.topic("arm").where("name == 'arm 2'").intervals()),
+        ),
+        lambda k: (
+            held(k, "/said", _is_high),
+            held(k, "/arm", lambda f: f["name"] == "arm 2"),
+        ),
+    ),
+    "latched": Rule(
+        lambda s: [
+            batches(s.all_topics().between(FIRST_S, LAST_S).latched()),
+            batches(s.topic("map").between("-0.2s", "end").latched()),
+        ],
+        lambda k: [in_force(k, FIRST_S), in_force(k, k.span[1] + 1 - 200 * MS)],
+    ),
+    "limit": Rule(lambda s: seqs(s.all_topics().limit(23)), lambda k: seqs(k.of()[:23])),
+    "lost": Rule(_lost, lambda _: ((3, True, False), "3 messages are lost")),
+    "match_times": Rule(
+        lambda s: sorted(
+            pair
+            for found in s.topic("said").where("x > 50").match_times()
+            for pair in zip(found.log_time.tolist(), found.seq.tolist(), strict=True)
+        ),
+        lambda k: [m.order for m in k.of("/said", where=_is_high)],
+    ),
+    "plot": Rule(_plotted, _points),
+    "rate": Rule(
+        lambda s: (
+            _table(
+                s.topic("said", "arm", "opaque").rate().sort_by("topic"),
+                "begin",
+                "end",
+                "topic",
+                "messages",
+                "rate",
+            ),
+            _table(s.topic("arm").rate("0.5s"), "begin", "end", "messages"),
+        ),
+        lambda k: (rates(k, "/said", "/arm", "/opaque"), by_window(k, "/arm", SECOND // 2)),
+    ),
+    "recordings": Rule(
+        lambda s: [s.entry(one).label for one in s.topic("arm").recordings], lambda _: [LABEL]
+    ),
+    "remarks": Rule(
+        lambda s: any("3 messages" in remark for remark in s.topic("said").remarks()),
+        lambda _: True,
+    ),
+    "resample": Rule(
+        lambda s: _table(
+            s.topic("said").resample("100ms", "count").to_arrow(), "log_time", "count"
+        ),
+        lambda k: regular(k, "/said", SECOND // 10),
+    ),
+    "reverse": Rule(lambda s: rows(s.all_topics().reverse()), lambda k: sent(reversed(k.of()))),
+    "schema": Rule(lambda s: s.topic("arm").schema() is None, lambda _: True),
+    "size_hint": Rule(
+        lambda s: s.topic("arm").size_hint(),
+        lambda k: sum(len(m.raw) for m in k.of("/arm")),
+    ),
+    "spans": Rule(
+        lambda s: [*s.topic("arm").spans().values()],
+        lambda k: [k.clock_span("log", ["/arm"])],
+    ),
+    "spent": Rule(lambda s: s.topic("arm").spent.messages, lambda _: 0),
+    "stats": Rule(
+        lambda s: [
+            (f.topic, f.field, f.count, f.nan, f.infinite, f.min, f.max, f.mean, f.std)
+            for f in s.topic("said").stats("x")
+        ],
+        lambda k: numbers(k, "/said", "x"),
+    ),
+    "summaries": Rule(
+        lambda s: [(r.label, r.messages, r.span) for r in s.topic("arm").summaries()],
+        lambda k: [(LABEL, len(k.of()), k.span)],
+    ),
+    "tags": Rule(
+        lambda s: set(s.topic("arm").tags("robot").to_arrow().column("robot").to_pylist()),
+        lambda _: {"7"},
+    ),
+    "to_arrow": Rule(
+        lambda s: (
+            _table(s.topic("arm").to_arrow(), "log_time", "n", "ranges", "position"),
+            _table(s.topic("said").where("n > 20").to_arrow(), "log_time", "n", "list", "state"),
+        ),
+        lambda k: (
+            [
+                (m.log_time, *(m.fields[n] for n in ("n", "ranges", "position")))  # type: ignore[index]
+                for m in k.of("/arm")
+            ],
+            [
+                (m.log_time, *(m.fields[n] for n in ("n", "list", "state")))  # type: ignore[index]
+                for m in k.of("/said", where=lambda f: f["n"] > 20)
+            ],
+        ),
+    ),
+    "to_json_lines": Rule(lambda s: _json_lines(s.topic("said")), _numbers),
+    "to_numpy": Rule(
+        lambda s: [image.tolist() for image in s.topic("cam").to_numpy()],
+        lambda k: [
+            np.array(m.fields["data"]).reshape(6, 8, 3).tolist()  # type: ignore[index]
+            for m in k.of("/cam")
+        ],
+    ),
+    "to_pandas": Rule(
+        lambda s: (_frame(s.topic("said").to_pandas()), _frame(s.topic("arm").to_pandas())),
+        lambda k: (_times(k, "/said"), _times(k, "/arm")),
+    ),
+    "to_tables": Rule(
+        lambda s: [row for t in s.topic("said").to_tables() for row in _table(t, "log_time", "n")],
+        lambda k: _times(k, "/said"),
+    ),
+    "topics": Rule(lambda s: sorted(s.all_topics().topics), lambda _: sorted(CHANNELS)),
+    "where": Rule(
+        lambda s: (
+            _thrice(s.topic("said").where("x > 50 and state == 'b'")),
+            _thrice(s.topic("arm").where("ranges[90:].max < 26")),
+            _thrice(s.topic("said").where("list[0] < 12 or list[2] == 2")),
+            seqs(s.topic("arm").where("/said: x > 50", "10ms")),
+        ),
+        lambda k: (
+            _right_thrice(k.of("/said", where=lambda f: _is_high(f) and f["state"] == "b")),
+            _right_thrice(k.of("/arm", where=lambda f: max(f["ranges"][90:]) < 26)),
+            _right_thrice(k.of("/said", where=lambda f: f["list"][0] < 12 or f["list"][2] == 2)),
+            seqs(
+                around(
+                    k,
+                    [m.log_time for m in k.of("/said", where=_is_high)],
+                    STEP // 2,
+                    STEP // 2 + 1,
+                    "/arm",
+                )
+            ),
+        ),
+    ),
+    "windows": Rule(
+        lambda s: spans(s.topic("cam").windows("10ms", "20ms")),
+        lambda k: [
+            (max(m.log_time - 10 * MS, k.span[0]), min(m.log_time + 20 * MS, k.span[1] + 1), 1)
+            for m in k.of("/cam")
+        ],
+    ),
+    "with_topic": Rule(
+        lambda s: _thrice(s.all_topics().with_topic("/arm")), lambda k: _right_thrice(k.of("/arm"))
+    ),
+}
+"""By name of the method."""
+
+EXEMPT_METHODS: dict[str, str] = {
+    "documents": "MongoDB answers it, which has what is indexed; see test_states",
+}
+"""Methods without a rule here, and why."""
+
+
+def _sql(store: hl.Store, query: str) -> Any:
+    return store.sql(query).rows()
+
+
+def _aligned(found: Any) -> Any:
+    table = found.to_arrow()
+    wanted = [n for n in table.column_names if n.endswith((".n", ".distance"))]
+    return _table(table, "log_time", *wanted)
+
+
+STORE: dict[str, Rule] = {
+    "__repr__": Rule(lambda s: "<Store " in repr(s), lambda _: True),
+    "_repr_html_": Rule(lambda s: LABEL in s._repr_html_(), lambda _: True),
+    "_ipython_key_completions_": Rule(
+        lambda s: s._ipython_key_completions_(), lambda _: sorted(CHANNELS)
+    ),
+    "__getitem__": Rule(lambda s: s["/arm"].count(), lambda k: len(k.of("/arm"))),
+    "align": Rule(
+        lambda s: _aligned(s.align("arm", "said", fields={"arm": ["n"], "said": ["n"]})),
+        lambda k: beside(k, "/arm", "/said"),
+    ),
+    "all_topics": Rule(lambda s: s.all_topics().count(), lambda k: len(k.of())),
+    "choose": Rule(lambda s: [r.messages for r in s.recordings()], lambda k: [len(k.of())]),
+    "entry": Rule(
+        lambda s: {t: n for t, n in s.entry(LABEL).messages_by_topic().items() if n},
+        lambda k: {t: n for t, n in k.counts.items() if n},
+    ),
+    "is_one": Rule(lambda s: s.is_one([LABEL]), lambda _: True),
+    "query": Rule(lambda s: s.query(["/arm"], [LABEL]).count(), lambda k: len(k.of("/arm"))),
+    "recordings": Rule(
+        lambda s: (
+            s.recordings(has="arm").labels,
+            s.recordings(where="said: n == 4").labels,
+            s.recordings(where="said: n < 0").labels,
+            s.recordings(during=(FIRST_S, LAST_S)).labels,
+            s.recordings(tag="robot=7").topic("arm").count(),
+        ),
+        lambda k: ((LABEL,), (LABEL,), (), (LABEL,), len(k.of("/arm"))),
+    ),
+    "select": Rule(
+        lambda s: [(e.label, e.status, e.messages, e.span) for e in s.select(None)],
+        lambda k: [(LABEL, "open", len(k.of()), k.span)],
+    ),
+    "sizes": Rule(
+        lambda s: {
+            row.topic: row.messages for row in s.sizes().rows if row.topic in {"/arm", "/said"}
+        },
+        lambda k: {t: k.counts[t] for t in ("/arm", "/said")},
+    ),
+    "sql": Rule(
+        lambda s: (
+            _sql(s, "select count(*), min(n), max(n), sum(x) from said"),
+            _sql(s, "select n, ranges[3], name from arm where n > 40 order by t"),
+            _sql(s, "select topic, messages from topics order by topic"),
+            _sql(s, "select name, status, messages from recordings"),
+            _sql(s, "select text from marks order by log_time"),
+            _sql(s, "select cause, messages from losses"),
+        ),
+        lambda k: (
+            [
+                (
+                    len(k.of("/said")),
+                    min(m.fields["n"] for m in k.of("/said")),  # type: ignore[index]
+                    max(m.fields["n"] for m in k.of("/said")),  # type: ignore[index]
+                    sum(m.fields["x"] for m in k.of("/said")),  # type: ignore[index]
+                )
+            ],
+            [
+                (m.fields["n"], m.fields["ranges"][2], m.fields["name"])  # type: ignore[index]
+                for m in k.of("/arm", where=lambda f: f["n"] > 40)
+            ],
+            sorted((t, n) for t, n in k.counts.items() if n),
+            [(LABEL, "open", len(k.of()))],
+            [(m.fields["text"],) for m in k.of("/hybridlog/marks")],  # type: ignore[index]
+            [("transport", 3)],
+        ),
+    ),
+    "summaries": Rule(
+        lambda s: [(r.label, r.status, r.messages, r.span) for r in s.summaries()],
+        lambda k: [(LABEL, "open", len(k.of()), k.span)],
+    ),
+    "sync": Rule(
+        lambda s: [
+            (one.log_time_ns, two.log_time_ns)
+            for one, two in s.sync(["said", "arm"], clock="log")
+            if one.log_time_ns == two.log_time_ns
+        ],
+        lambda k: [(m.log_time, m.log_time) for m in k.of("/arm")],
+    ),
+    "topic": Rule(lambda s: s.topic("arm").count(), lambda k: len(k.of("/arm"))),
+    "topics": Rule(lambda s: s.topics(), lambda _: sorted(CHANNELS)),
+}
+"""By name of the method of the store."""
