@@ -14,6 +14,7 @@ from hybridlog.query.engines.base import Need, Outcomes, Values
 from hybridlog.query.predicate.to_mongo import MongoFilter, to_mongo
 from hybridlog.query.predicate.tree import And
 from hybridlog.schema.column import STAMP
+from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import DatabaseError, IndexChangedError
 from hybridlog_storage.index_columns import KEY, REFERENCE, key_columns, reference_columns
 from hybridlog_storage.times import END, placed
@@ -70,7 +71,13 @@ class Mongo:
         self._is_known = self._is_away = False
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
-        """By the number of documents looked at; None without MongoDB, or if it cannot tell."""
+        """By the number of documents looked at; None without MongoDB, or if it cannot tell.
+
+        The index of a running recording is of another moment than its segments.
+        """
+        is_opaque = part.predicate is not None and part.predicate.is_opaque
+        if part.recording.status in UNFINISHED and not is_opaque:
+            return None
         # Documents do not tell the channels of a topic apart, so none may be blind.
         is_answered = part.is_indexed and not part.blind and not _is_older(part)
         if need is Need.VALUES or self._is_away or not is_answered:
