@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog.cli.open_store import opened_store as opened_by_command
 from hybridlog.entries import (
     Inventory,
     journal_from_segments,
@@ -30,7 +31,7 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.opening import current_entry, describe_now, repair_on_open
 from hybridlog.maintenance.report import RepairReport
-from hybridlog_storage import journal
+from hybridlog_storage import catalog, journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -710,3 +711,28 @@ def test_the_catalog_may_go_while_the_store_is_open(made: Made) -> None:
                 check(*opened_store.recordings())
                 assert [m.raw for m in opened_store.all_topics()] == wanted
         assert store.session.connected is None
+
+
+def test_another_process_may_keep_the_catalog_locked(
+    made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(catalog, "_BUSY_S", 0.05)
+    path = made.directory.path / "catalog.sqlite"
+    wanted = [payload(n) for n in range(80)]
+    with (
+        hl.open(made.directory.path) as store,
+        closing(sqlite3.connect(path, isolation_level=None)) as db,
+    ):
+        db.execute("begin exclusive")
+        for opened_store in (store, hl.open(made.directory.path)):
+            with opened_store:
+                check(*opened_store.recordings())
+                assert [m.raw for m in opened_store.all_topics()] == wanted
+                opened_store.tag(opened_store.recordings()[0].label, seen="yes")
+                assert opened_store.catalog.locked == path
+        with opened_by_command(made.directory.path, None):
+            assert f"`fuser -v {path}`" in capsys.readouterr().err
+        db.execute("rollback")
+    with hl.open(made.directory.path) as store:
+        assert [entry.tags["seen"] for entry in store.recordings()] == ["yes"]
+        assert store.catalog.locked is None

@@ -97,6 +97,12 @@ def _print_rebuilt(store: Store) -> None:
     if store.catalog.was_damaged:
         note("The catalog was damaged, and was made again.")
         store.catalog.was_damaged = False
+    if store.catalog.locked is not None:
+        path, store.catalog.locked = store.catalog.locked, None
+        note(
+            f"Another process keeps the catalog locked, so the files answer, more slowly. End it: "
+            f"`fuser -v {path}` shows which one it is."
+        )
     if repairs.tables:
         note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
     indexed = {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}

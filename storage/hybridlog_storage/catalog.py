@@ -59,7 +59,7 @@ CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""
 _JOURNAL: Final = f"{CATALOG}-journal"
 _VERSION: Final = 4
-_BUSY_S: Final = 20.0
+_BUSY_S: Final = 1.0
 _NO_DAMAGE: Final = frozenset(
     {
         sqlite3.SQLITE_BUSY,
@@ -500,10 +500,12 @@ class Catalog:
 
     Attributes:
         was_damaged: True if a damaged file was replaced by an empty one.
+        locked: The file, if another process keeps it locked; a catalog in memory replaces it.
     """
 
     def __init__(self, store: Path | None, store_id: str) -> None:
         self.was_damaged = False
+        self.locked: Path | None = None
         self._path = store / CATALOG if store is not None else None
         self._store_id = store_id
         self._lock = taken_by_forks(RLock())
@@ -530,6 +532,9 @@ class Catalog:
         try:
             return self._connect()
         except sqlite3.Error as error:
+            if _is_locked(error):
+                self.locked, self._path = self._path, None
+                return self._connect()
             if not _is_damage(error) and not self._has_odd_journal():
                 raise self._told(error, "opened") from error
             self.was_damaged = True
@@ -629,7 +634,7 @@ class Catalog:
         """
         with self._lock:
             self._forget()
-            self.was_damaged = True
+            self.was_damaged = self._path is not None
             try:
                 if self._is_sound():
                     # Other processes may still use the open file.
@@ -637,7 +642,10 @@ class Catalog:
                     return
             except sqlite3.Error as error:
                 if not _is_damage(error):
-                    raise self._told(error, "made") from error
+                    told = self._told(error, "made")
+                    if self._path is None:
+                        return
+                    raise told from error
             self._db.close()
             self._delete()
             self._db = self._open()
@@ -694,6 +702,13 @@ class Catalog:
         short = exhausted(_system_error(error), f"using {self._path}")
         if short is not None:
             return short
+        if _is_locked(error):
+            with self._lock:
+                self._db.close()
+                self._forget()
+                self.locked, self._path = self._path, None
+                self._db = self._connect()
+            return CatalogError(f"Another process keeps the catalog {self.locked} locked.")
         name = getattr(error, "sqlite_errorname", "")
         if name == "SQLITE_FULL" or "is full" in str(error):
             return DiskFullError(
@@ -1249,6 +1264,11 @@ def _is_damage(error: sqlite3.Error) -> bool:
     if code is None:
         return "is full" not in str(error) and "I/O error" not in str(error)
     return code & 0xFF not in _NO_DAMAGE
+
+
+def _is_locked(error: sqlite3.Error) -> bool:
+    """True if another process has kept the file locked for too long."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
 
 
 def _system_error(error: sqlite3.Error) -> int | None:
