@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -197,3 +198,59 @@ def test_the_definition_of_the_source_stays_if_it_has_one(tmp_path: Path) -> Non
         (entry,) = store.entry("x").channels
         assert SUPPLIED not in entry.metadata
         assert store.topic("/t").to_arrow()["mine"].to_pylist() == [1.0]
+
+
+@pytest.mark.parametrize("form", ["export.mcap", "slice.mcap", "export.bag", "slice.bag"])
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_exports_have_the_nested_definitions(tmp_path: Path, encoding: str, form: str) -> None:
+    """A definition without those of its standard types is supplied to other readers, too."""
+    if encoding == "cdr" and form.endswith("bag"):
+        pytest.skip("a bag holds ROS 1 messages")
+    name = "geometry_msgs/msg/PoseStamped"
+    store, write = (ROS2, "serialize_cdr") if encoding == "cdr" else (ROS1, "serialize_ros1")
+    sent = messages(store, name, write)
+    rule = "=" * 80
+    nested = f"\n{rule}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    text = f"# incomplete\nHeader header\ngeometry_msgs/Pose pose\n{nested}"
+    if encoding == "cdr":
+        text = text.replace("Header header", "std_msgs/Header header")
+    with (tmp_path / "some.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2" if encoding == "cdr" else "ros1")
+        kind = "ros2msg" if encoding == "cdr" else "ros1msg"
+        spelled = name if encoding == "cdr" else name.replace("/msg/", "/")
+        schema = writer.register_schema(spelled, kind, text.encode())
+        channel = writer.register_channel("/pose", encoding, schema)
+        for at, (_, payload) in enumerate(sent):
+            writer.add_message(channel, START + at, payload, START + at)
+        writer.finish()
+    out = tmp_path / form
+    run("record", tmp_path / "some.mcap", "-q", store=tmp_path / "store")
+    if form.startswith("export"):
+        run("export", out, "-q", store=tmp_path / "store")
+    else:
+        run("fetch", "-t", "/pose", "-o", out, "-q", store=tmp_path / "store")
+    if form.endswith("mcap"):
+        with out.open("rb") as stream:
+            ((definition, *_), *_) = make_reader(stream).iter_messages()
+        assert definition is not None
+        data = definition.data.decode()
+    else:
+        with Reader(out) as bag:
+            data = bag.connections[0].msgdef.data
+    assert data.startswith(text)
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg(data, name))
+    for message, payload in sent:
+        read = "deserialize_cdr" if encoding == "cdr" else "deserialize_ros1"
+        found = plain_of(types, name, getattr(types, read)(payload, name))
+        assert repr(found) == repr(plain_of(store, name, message))
+
+
+def test_an_export_that_rosbags_reads(tmp_path: Path) -> None:
+    run("record", CASES / "mcap223_missing_nested.mcap", "-q", store=tmp_path / "store")
+    run("export", tmp_path / "whole.mcap", "-q", store=tmp_path / "store")
+    with AnyReader([tmp_path / "whole.mcap"]) as reader:
+        found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()]
+    assert len(found) == 2
+    assert found[0].transforms[0].child_frame_id == "b"

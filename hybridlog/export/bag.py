@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.export.base import FileWriter, Target, destination, failures
 from hybridlog.export.mcap import source_metadata
+from hybridlog.schema.completion import with_nested
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.unfinished import beside, scratch_directory
 
@@ -130,7 +131,7 @@ class BagWriter(FileWriter):
                 "came: write --format mcap"
             )
         metadata = source_metadata(channel)
-        schema = channel.schema
+        schema = with_nested(channel.schema)
         md5sum = metadata.get("md5sum") or _md5sum(schema)
         callerid, latching = metadata.get("callerid"), metadata.get("latching")
         key = (channel.topic, schema.name, schema.data, md5sum, callerid, latching)

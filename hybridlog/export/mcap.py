@@ -8,6 +8,7 @@ from typing import IO, TYPE_CHECKING, Any, Literal, cast
 from mcap.writer import CompressionType, Writer
 
 from hybridlog.export.base import FileWriter, Sink, Target
+from hybridlog.schema.completion import with_nested
 from hybridlog_storage.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:
@@ -136,7 +137,8 @@ class McapWriter(FileWriter):
         if schema is None:
             return 0
         if schema not in self._schemas:
-            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            data = with_nested(schema).data
+            number = self._writer.register_schema(schema.name, schema.encoding, data)
             self._schemas[schema] = int(number)
         return self._schemas[schema]
 

@@ -12,6 +12,7 @@ from typing import Final
 
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, TIME
 from hybridlog.playback.played import PlayedChannel
+from hybridlog.schema.completion import with_nested
 
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
 _DATA = Struct("<BIQ")  # opcode, subscription, log time
@@ -222,7 +223,7 @@ def _seconds(time: int) -> dict[str, int]:
 
 def _described(each: PlayedChannel) -> dict[str, object]:
     channel = each.channel
-    schema = channel.schema
+    schema = None if channel.schema is None else with_nested(channel.schema)
     found: dict[str, object] = {
         "id": each.id,
         "topic": channel.topic,

@@ -13,10 +13,11 @@ best is chosen, the newest of equal ones.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 from hybridlog.schema.definition import (
+    DEFAULT_RELEASES,
     MessageType,
     Release,
     parse_definition,
@@ -24,7 +25,7 @@ from hybridlog.schema.definition import (
     releases,
     typestore,
 )
-from hybridlog.schema.definition_text import canonical
+from hybridlog.schema.definition_text import canonical, has_parts
 from hybridlog.schema.wire import WireReader
 from hybridlog.schema.wire_scan import MAX_PADDING, MisfitError
 from hybridlog_storage.errors import DefinitionError
@@ -41,6 +42,7 @@ TRIED_MESSAGES = 64
 _TRIED_BYTES = 1 << 22  # of these, but one message at least
 
 _EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
+_DEFAULTS = {"ros1msg": DEFAULT_RELEASES[1], "ros2msg": DEFAULT_RELEASES[2]}
 _ENCODINGS = {"", "ros1msg", "ros2msg", "ros2idl", "omgidl"}
 
 
@@ -98,6 +100,18 @@ def completed(channel: Channel, payloads: Sequence[Buffer]) -> Channel:
 _WIRES: Mapping[str, Wire] = {"ros1": "ros1", "cdr": "cdr"}
 
 
+@lru_cache(maxsize=1024)
+def with_nested(schema: Schema) -> Schema:
+    """A definition with those of the standard types that reading supplies, for other readers."""
+    if schema.encoding not in _DEFAULTS or has_parts(schema.data.decode(errors="replace")):
+        return schema
+    try:
+        _, supplied = parse_for_release(schema, "")
+    except DefinitionError:
+        return schema
+    return replace(schema, data=schema.data + _sections(_DEFAULTS[schema.encoding], supplied))
+
+
 def has_hidden_fields(channel: Channel) -> bool:
     """True if the MD5 sum of a ROS 1 type proves that its empty definition is not its own."""
     schema = channel.schema
@@ -148,11 +162,11 @@ def _with_nested(
 
 def _sections(release: Release, names: frozenset[str]) -> bytes:
     """The definitions of standard types, to be appended to a definition."""
-    store = typestore(release)
+    store, version = typestore(release), 1 if release.startswith("ROS1") else 2
     texts = []
     for name in sorted(names):
         package, _, leaf = name.rpartition("/")
-        text, _ = store.generate_msgdef(f"{package}/msg/{leaf}", ros_version=2)
+        text, _ = store.generate_msgdef(f"{package}/msg/{leaf}", ros_version=version)
         own = text.split("=" * 80, maxsplit=1)[0]
         texts.append(f"\n{'=' * 80}\nMSG: {name}\n{own}")
     return "".join(texts).encode()

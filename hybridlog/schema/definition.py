@@ -232,12 +232,13 @@ def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
         ros: ROS 1 or ROS 2; headers and times differ.
     """
     key = canonical(name)
-    if _standard_fields(key, _DEFAULT_RELEASES[ros]) is None:
+    if _standard_fields(key, DEFAULT_RELEASES[ros]) is None:
         return None
     return MessageType(name, _Resolver(name, {}, ros).message(key).fields)
 
 
-_DEFAULT_RELEASES: dict[int, Release] = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
+DEFAULT_RELEASES: dict[int, Release] = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
+"""Whose standard types are supplied where none is named, by version of ROS."""
 
 
 def releases(wire: Literal["ros1", "cdr"]) -> list[Release]:
@@ -343,7 +344,7 @@ class _Resolver:
         self._owner = owner
         self._types = types
         self._ros = ros
-        self._release = release or _DEFAULT_RELEASES[ros]
+        self._release = release or DEFAULT_RELEASES[ros]
         self._done: dict[str, tuple[MessageType, _Extent]] = {}
         self._open: set[str] = set()
         self._by_leaf: dict[str, list[str]] = {}

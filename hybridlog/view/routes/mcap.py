@@ -16,6 +16,7 @@ from hybridlog.choice import Choice
 from hybridlog.export.slices import write_mcap
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time
+from hybridlog.schema.completion import with_nested
 from hybridlog.view.context import Context, route
 from hybridlog.view.routes.export import MAX_TOPICS, mcap_response
 from hybridlog_storage.errors import TimeError, UsageError
@@ -121,7 +122,7 @@ def _schema(schema: Schema, number: int) -> dict[str, Any]:
         "id": number,
         "name": schema.name,
         "encoding": schema.encoding,
-        "data": base64.b64encode(schema.data).decode(),
+        "data": base64.b64encode(with_nested(schema).data).decode(),
     }
 
 
