@@ -24,7 +24,8 @@ from hybridlog.maintenance.opening import announce_removal, put_entry, remove_fi
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.errors import DatabaseError, HybridlogError, StoreError
+from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.errors import DatabaseError, HybridlogError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
@@ -245,8 +246,8 @@ class Capture:
         label = self._directory.new_recording(name)
         try:
             path = self._directory.recording(label)
-            if not self._held.enter_context(self._directory.writing(label)):
-                raise StoreError(f"Another process is writing {path}.")
+            lock = self._directory.writing(label, wait_s=LOCK_WAIT_S, records=True)
+            self._held.enter_context(lock)
             entry = RecordingEntry(
                 id=new_id(),
                 label=label,

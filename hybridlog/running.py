@@ -63,7 +63,7 @@ class RunningRecording:
             StoreError: Its files cannot be read.
         """
         look = self._directory.looks([self._label]).get(self._label, "")
-        state = look, self._directory.is_held(self._label)
+        state = look, self._directory.is_recorded(self._label)
         is_same = state == self._state
         if not is_same:
             self._begin()

@@ -206,8 +206,8 @@ class Snapshot:
         return [self.summaries[place] for place in places[np.sort(firsts)].tolist()]
 
     def called(self, name: str) -> list[int]:
-        """Positions of the recordings with exactly this label or id, else with this name."""
-        place = self.by_label.get(name, self.by_id.get(name))
+        """Positions of the recordings with exactly this id or label, else with this name."""
+        place = self.by_id.get(name, self.by_label.get(name))
         if place is not None:
             return [place]
         return [place for place, one in enumerate(self.summaries) if one.name == name]
@@ -215,7 +215,7 @@ class Snapshot:
     def named(self, name: str) -> list[int]:
         """Positions of the recordings that a name may mean.
 
-        It is a label or an id, else a name, else the beginning of a label, else of an id.
+        It is an id or a label, else a name, else the beginning of a label, else of an id.
         """
         found = self.called(name)
         if found:

@@ -19,7 +19,6 @@ from hybridlog.maintenance.report import (
     CompactedTopic,
     Progress,
     RepairReport,
-    being_written,
 )
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
@@ -31,6 +30,7 @@ from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
+    HeldError,
     HybridlogError,
     StoreError,
     TopicError,
@@ -699,7 +699,7 @@ class Store:
             self.directory,
             self.catalog,
             database,
-            [entry.label for entry in chosen],
+            chosen,
             progress,
         )
         if recordings is None:
@@ -707,9 +707,9 @@ class Store:
                 self.directory, self.catalog, database, self.session.recordings(), progress
             )
         elif left:
-            raise being_written(left[0])
+            raise next(iter(left.values()))
         self.refresh()
-        return self._now([entry for entry in chosen if entry.label not in left])
+        return self._now([entry for entry in chosen if entry.id not in left])
 
     @_again_if_lost
     def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
@@ -883,11 +883,13 @@ class Store:
         """
         from hybridlog.maintenance import removal
 
-        self.refresh()
-        self.session.snapshot()
+        if recording not in self.repairs.copies:
+            self.refresh()
+            self.session.snapshot()
         try:
             if recording in self.repairs.copies:
-                removal.remove_copy(self.directory, recording)
+                original = self.entry(self.repairs.copies[recording])
+                removal.remove_copy(self.directory, recording, original.id)
             else:
                 (entry,) = self.select([recording])
                 removal.remove(self.directory, self.catalog, self.session.writable_database, entry)
@@ -917,13 +919,13 @@ class Store:
             if key not in entry.tags:
                 known = ", ".join(sorted(entry.tags)) or "none"
                 raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
-        return self._edit(recording, *[journal.event(journal.UNTAGGED, key=key) for key in keys])
+        return self._edit(entry, *[journal.event(journal.UNTAGGED, key=key) for key in keys])
 
     def note(self, recording: str, note: str) -> RecordingEntry:
         """Write a note about a recording; `info` shows it."""
         return self._edit(recording, journal.event(journal.NOTED, text=text(note)))
 
-    def _edit(self, recording: str, *lines: journal.Event) -> RecordingEntry:
+    def _edit(self, recording: str | RecordingEntry, *lines: journal.Event) -> RecordingEntry:
         from hybridlog.maintenance import edit, index
 
         self.refresh()
@@ -957,7 +959,12 @@ class Store:
         (entry,) = self.select([recording])
         start, end = extent_of(entry)
         time = parse_time(moment, start=start, end=end)
-        edit.mark(self.directory, self.catalog, entry, time, text=text(note), tags=tags or {})
+        try:
+            edit.mark(self.directory, self.catalog, entry, time, text=text(note), tags=tags or {})
+        except HeldError as error:
+            if error.is_recording:
+                raise StoreError(f"{error} To mark it now, mark it without --at.") from error
+            raise
         self.refresh()
         return self.entry(entry.id)
 
@@ -1003,8 +1010,8 @@ class Store:
 
         self.refresh()
         chosen = [] if recordings is None else self.select(recordings)
-        labels = None if recordings is None else [entry.label for entry in chosen]
-        done = repair(self.directory, self.catalog, self.repairs, labels)
+        entries = None if recordings is None else chosen
+        done = repair(self.directory, self.catalog, self.repairs, entries)
         self.refresh()
         database = self.session.writable_database
         if database is not None:

@@ -579,7 +579,7 @@ class Recording:
                 yield _row(f"payloads/{file['file']}", None, file["bytes"], *about)
 
     def _status(self) -> str:
-        if self._is_held() and (self.end is None or self.open):
+        if self._is_recorded() and (self.end is None or self.open):
             return "open"
         if self.open:
             return "unfinished"
@@ -589,7 +589,7 @@ class Recording:
             return "unproven"
         return str(self.end["status"]) if self.end is not None else "recovered"
 
-    def _is_held(self) -> bool:
+    def _is_recorded(self) -> bool:
         try:
             fd = os.open(self.path / "writer.lock", os.O_RDONLY | os.O_NOFOLLOW)
         except FileNotFoundError:
@@ -597,7 +597,7 @@ class Recording:
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            return True
+            return os.pread(fd, 256, 0).split(b" ")[1:2] == [b"1"]
         finally:
             os.close(fd)
         return False

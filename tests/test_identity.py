@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.maintenance import imports
+from hybridlog.maintenance.imports import ImportReport
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
-from hybridlog_storage import journal
+from hybridlog.session import Session
+from hybridlog_storage import files, journal
 from hybridlog_storage.database import Database
-from hybridlog_storage.errors import DatabaseError, StoreError, TimeError, TopicError, UsageError
+from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.errors import (
+    DatabaseError,
+    HybridlogError,
+    StoreError,
+    TimeError,
+    TopicError,
+    UsageError,
+)
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.segment_writer import SegmentSettings
+from tests.faults import logs
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 COUNT = 60
@@ -365,3 +382,230 @@ def test_a_removal_that_was_announced_is_finished(place: Path, uri: str) -> None
         database = store.database_for("This")
         assert database.count("n", {}) == 0
         assert IndexState(database).of() == {}
+
+
+class Exchange:
+    """Another process gives labels away, before or after a folder is opened.
+
+    Args:
+        store: The store.
+        change: Changes the labels.
+        step: The opening, from 0.
+        after: Whether the folder is open already.
+    """
+
+    def __init__(self, store: Path, change: Callable[[Path], None], step: int, *, after: bool):
+        self.recordings = store / "recordings"
+        self.change = change
+        self.left = step
+        self.after = after
+        self.is_over = False
+
+    @contextmanager
+    def folder(self, path: Path, depth: int) -> Iterator[int]:
+        if not self.after:
+            self.take()
+        with FOLDER(path, depth) as fd:
+            if self.after:
+                self.take()
+            yield fd
+
+    def take(self) -> None:
+        self.left -= 1
+        if self.left == -1:
+            self.is_over = True
+            with ExitStack() as held:
+                for path in [self.recordings, *self.recordings.glob("*/writer.lock")]:
+                    fd = os.open(path, os.O_RDONLY)
+                    held.callback(os.close, fd)
+                    try:
+                        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except BlockingIOError:
+                        return  # who changes a label holds these locks
+                self.change(self.recordings)
+
+
+def swap(recordings: Path) -> None:
+    if (recordings / "a").exists():
+        (recordings / "a").rename(recordings / ".x")
+    replace(recordings)
+    if (recordings / ".x").exists():
+        (recordings / ".x").rename(recordings / "b")
+
+
+def replace(recordings: Path) -> None:
+    if (recordings / "a").exists():
+        (recordings / "a").rename(recordings / "kept")
+    (recordings / "b").rename(recordings / "a")
+
+
+def remove(recordings: Path) -> None:
+    if (recordings / "a").exists():
+        (recordings / "a").rename(recordings / ".removed-a")
+    replace(recordings)
+
+
+def replace_segments(recording: Path) -> None:
+    """Exchange the names of two segments."""
+    for old, new in ((0, 9), (1, 0), (9, 1)):
+        (recording / f"{old:06d}.mcap").rename(recording / f"{new:06d}.mcap")
+
+
+def content_of(store: Path, recording: str) -> dict[str, bytes]:
+    """Files of a recording, by its id, and their content; empty if it is gone."""
+    directory = StoreDirectory(store)
+    found = {}
+    for label in directory.labels_of(recording):
+        for top in (directory.recording(label), store / "tables" / f"recording=r{recording}"):
+            for path in top.rglob("*"):
+                if path.is_file() and path.name != "writer.lock":
+                    found[str(path.relative_to(top))] = path.read_bytes()
+    return found
+
+
+FOLDER = files.folder
+CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
+    "rm": lambda store, one: store.remove(one),
+    "tag": lambda store, one: store.tag(one, b="2"),
+    "untag": lambda store, one: store.untag(one, "a"),
+    "note": lambda store, one: store.note(one, "seen"),
+    "rename": lambda store, one: store.rename(one, "new"),
+    "mark": lambda store, one: store.mark(one, "+1s", "seen"),
+    "compact": lambda store, one: store.compact([one], ["/scan"], drop_mcap=True),
+    "repair": lambda store, one: store.repair([one]),
+}
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
+    """A store of two recordings, and their ids."""
+    base = tmp_path_factory.mktemp("two")
+    ids = []
+    with hl.open(base / "store", create=True) as store:
+        for name, messages in (("a", 3), ("b", 4)):
+            log = logs.write(base / f"{name}.mcap", logs.content(0, messages, scans=True))
+            ids.append(
+                store.record(log, name=name, tags={"a": "1"}, settings=logs.SETTINGS).entry.id
+            )
+    shutil.rmtree(base / "store" / "mongod")
+    return base / "store", *ids
+
+
+@pytest.mark.parametrize("command", CHANGES)
+def test_a_command_changes_the_recording_that_was_chosen(
+    command: str,
+    two: tuple[Path, str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    base, one, other = two
+    others = content_of(base, other)
+    monkeypatch.setattr(files.System, "sync", lambda *_: None)
+    monkeypatch.setattr(Session, "database", None)
+    for change, after in [(swap, False), (swap, True), (replace, False), (remove, True)]:
+        for step in count():
+            place = tmp_path / "store"
+            shutil.rmtree(place, ignore_errors=True)
+            shutil.copytree(base, place)
+            if command == "repair":
+                replace_segments(place / "recordings" / "a")
+            with hl.open(place, mongo=NOWHERE) as store:
+                before = content_of(place, one)
+                exchange = Exchange(place, change, step, after=after)
+                problem = None
+                with monkeypatch.context() as patch:
+                    patch.setattr(files, "folder", exchange.folder)
+                    try:
+                        CHANGES[command](store, one)
+                    except HybridlogError as error:
+                        problem = error
+            about = (change.__name__, after, step, problem)
+            assert content_of(place, other) == others, about
+            if problem is not None:
+                assert change is remove, about
+            elif not (place / "recordings" / ".removed-a").exists():
+                assert content_of(place, one) != before, about
+            if not exchange.is_over:
+                assert step > 10
+                break
+
+
+@pytest.mark.parametrize("change", [swap, replace, remove])
+def test_an_import_takes_the_recording_that_was_chosen(
+    change: Callable[[Path], None],
+    two: tuple[Path, str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    base, one, _ = two
+    monkeypatch.setattr(files.System, "sync", lambda *_: None)
+    for step in count():
+        place, target = tmp_path / "store", tmp_path / "target"
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(target, ignore_errors=True)
+        shutil.copytree(base, place)
+        exchange = Exchange(place, change, step, after=bool(step % 2))
+        with hl.open(target, mongo=NOWHERE, create=True) as store:
+            run = imports.run
+
+            def armed(*args: Any, run: Any = run, exchange: Exchange = exchange) -> ImportReport:
+                patch.setattr(files, "folder", exchange.folder)  # it is chosen
+                report: ImportReport = run(*args)
+                return report
+
+            with monkeypatch.context() as patch:
+                patch.setattr(imports, "run", armed)
+                try:
+                    done = store.import_from(place, [one])
+                except HybridlogError:
+                    if change is not remove:
+                        raise
+                    done = store.import_from(base, [one])  # goes on where it stopped
+        assert len(done.imported) == 1, step
+        with hl.open(target, mongo=NOWHERE) as store:
+            assert [entry.id for entry in store.recordings()] == [one], step
+            assert not store.verify().findings, step
+        if not exchange.is_over:
+            assert step > 10
+            break
+
+
+def test_an_index_is_made_of_the_recording_that_was_chosen(
+    place: Path, uri: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hl.open(place, mongo=uri) as store:
+        one = store.entry("one").id
+        other = store.record(make_log(tmp_path / "b.mcap", 500), name="b").entry
+        store.rename("one", "a")
+        for step in range(12):
+            exchange = Exchange(place, swap, 40 * step, after=False)
+            turns = IndexState(store.connect()).of([one[:16], other.key])
+            with monkeypatch.context() as patch:
+                patch.setattr(files, "folder", exchange.folder)
+                assert [entry.id for entry in store.reindex([one])] == [one]
+            found = IndexState(store.connect()).of([one[:16], other.key])
+            assert found[other.key].turn == turns[other.key].turn, step
+            assert found[one[:16]].turn > turns[one[:16]].turn, step
+            assert not store.verify().findings
+
+
+@pytest.mark.parametrize("label", ["copy", "other"])
+def test_a_copy_is_removed_only_while_it_is_one(place: Path, uri: str, label: str) -> None:
+    recordings = place / "recordings"
+    shutil.copytree(recordings / "one", recordings / "copy")
+    with hl.open(place, mongo=uri) as store:
+        assert store.repairs.copies == {"copy": "one"}
+        (recordings / "one").rename(place / "away")
+        (recordings / "copy").rename(recordings / label)
+        with pytest.raises(TopicError, match="no longer"):
+            store.remove("copy")
+        assert answers(store) == right()
+
+
+def test_an_id_comes_before_a_label(place: Path, uri: str, tmp_path: Path) -> None:
+    with hl.open(place, mongo=uri) as store:
+        one = store.entry("one").id
+        other = store.record(make_log(tmp_path / "b.mcap", 500), name=one).entry
+        assert (other.label, store.select([one])[0].label) == (one, "one")
+        store.remove(one)
+        assert [entry.id for entry in store.recordings()] == [other.id]

@@ -55,7 +55,7 @@ def command(
             done = opened.reindex(None if choice.is_everything else chosen, Stages(bar))
     left = [entry.label for entry in chosen.summaries if entry.id not in {r.id for r in done}]
     for label in left:
-        output.note(f"Recording {label} is being written, and was left as it is.")
+        output.note(f"Recording {label} is in use, and was left as it is.")
     for entry in done:
         if entry.status == "damaged":
             output.note(f"{entry.label} is damaged: `hybridlog losses {entry.label}` shows where.")

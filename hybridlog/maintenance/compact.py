@@ -20,12 +20,13 @@ import numpy as np
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog.maintenance.opening import put_entry
-from hybridlog.maintenance.report import CompactedTopic, being_written
+from hybridlog.maintenance.report import CompactedTopic
 from hybridlog.payloads import files as payload_files
 from hybridlog.payloads.contents import open_segment
 from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
 from hybridlog.tables.layout import table_schema_of, topic_folder
 from hybridlog_storage import durability, files, journal
+from hybridlog_storage.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import DefinitionError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
@@ -98,14 +99,11 @@ def compact(
 
     Raises:
         StoreError: The recording is being written, or files cannot be read or written.
+        TopicError: It is gone.
         DiskFullError: There is no room; the recording is as it was.
     """
-    if entry.status in {"open", "unfinished"}:
-        raise being_written(entry.label)
-    with directory.writing(entry.label) as mine:
-        if not mine:
-            raise being_written(entry.label)
-        work = _Compaction(directory, entry.label, progress)
+    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        work = _Compaction(directory, label, progress)
         chosen = work.choose(topics)
         reports = [*work.refused, *(topic.report for topic in chosen)]
         if dry_run or not (chosen or drop_mcap):
@@ -124,11 +122,11 @@ def compact(
             raise
         try:
             if drop_mcap:
-                reports = thinning.drop(directory, entry.label, topics, reports, progress)
+                reports = thinning.drop(directory, label, topics, reports, progress)
         except OSError as error:
             raise durability.explain(error, work.path, "replacing segments of") from error
         finally:
-            put_entry(directory, catalog, entry.label)
+            put_entry(directory, catalog, label)
         return reports
 
 
@@ -143,7 +141,9 @@ class _Compaction:
         self._inventory: Inventory = take_inventory(directory, label)
         state = self._inventory.state
         if state is None or state.end is None:
-            raise StoreError(f"Recording {label!r} has no journal: run `hybridlog repair` first.")
+            raise StoreError(
+                f"The journal of recording {label!r} has no end: run `hybridlog repair` first."
+            )
         self._state = state
         self._total = 2 * sum(len(s.chunks) for s in self._inventory.summaries.values())
         self._done = 0

@@ -14,12 +14,12 @@ from hybridlog.entries import (
     take_inventory,
 )
 from hybridlog.maintenance.opening import finish_renaming, put_entry
-from hybridlog.maintenance.report import being_written
 from hybridlog.marks import mark_channel, mark_payload
 from hybridlog_storage import files, journal
 from hybridlog_storage.chunk import pack
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
+from hybridlog_storage.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.messages import Batch, Channel
@@ -44,13 +44,12 @@ def append(
 
     Raises:
         StoreError: It is being written, or its journal cannot be written.
+        TopicError: It is gone.
     """
-    with directory.writing(entry.label) as mine:
-        if not mine:
-            raise being_written(entry.label)
-        path = directory.recording(entry.label)
-        Journal(path).append(*[_with_labels(directory, entry.label, line) for line in lines])
-        put_entry(directory, catalog, finish_renaming(directory, entry.label, journal.read(path)))
+    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        path = directory.recording(label)
+        Journal(path).append(*[_with_labels(directory, label, line) for line in lines])
+        put_entry(directory, catalog, finish_renaming(directory, label, journal.read(path)))
 
 
 def _with_labels(directory: StoreDirectory, label: str, line: journal.Event) -> journal.Event:
@@ -82,21 +81,17 @@ def mark(
 
     Raises:
         StoreError: The recording is being written, or a segment of it cannot be read.
+        TopicError: It is gone.
     """
-    with directory.writing(entry.label) as mine:
-        if not mine:
-            raise StoreError(
-                f"Recording {entry.label!r} is being written. Mark it without --at, or wait "
-                "until it has ended."
-            )
-        path = directory.recording(entry.label)
-        inventory = take_inventory(directory, entry.label)
+    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        path = directory.recording(label)
+        inventory = take_inventory(directory, label)
         numbers = {*inventory.listing.sealed, *inventory.listing.open}
         numbers.update(inventory.state.sealed if inventory.state is not None else ())
         number = max(numbers, default=-1) + 1
         channel, channel_id, schema_id = _channel(inventory)
         payload = mark_payload(text, tags)
-        seq = _next_seq(directory, entry.label, inventory)
+        seq = _next_seq(directory, label, inventory)
         segment = SegmentFile.create(path, number, recording_metadata(entry), seq)
         marked = journal.event(
             journal.MARKED, time=moment, text=text, tags=dict(tags), segment=number
@@ -114,7 +109,7 @@ def mark(
             segment.abandon()
             _take_back(segment)
             raise
-        put_entry(directory, catalog, entry.label)
+        put_entry(directory, catalog, label)
 
 
 def _take_back(segment: SegmentFile) -> None:

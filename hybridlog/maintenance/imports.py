@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +14,8 @@ from hybridlog.entries import Inventory, take_inventory
 from hybridlog.maintenance.opening import clear_away
 from hybridlog.payloads.layout import IN_PAYLOADS
 from hybridlog_storage import durability, files, journal
-from hybridlog_storage.directory import IMPORTING, PAYLOADS, payload_names
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.directory import IMPORTING, LOCK_WAIT_S, PAYLOADS, payload_names
+from hybridlog_storage.errors import SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL, Journal
 from hybridlog_storage.segment_check import SegmentCheck
 
@@ -65,7 +66,7 @@ def run(
     """
     target.check_writable()
     report = ImportReport()
-    present = _present(target)
+    present = _present(target, {})
     for entry in entries:
         if entry.id in present:
             report.known.append(present[entry.id])
@@ -80,61 +81,90 @@ def run(
                 f"Recording {entry.label!r} of {source.path} was cut short by a crash. Open that "
                 "store once with write permission, which recovers it, then import it."
             )
-        report.imported.append(_import_one(source, target, entry, report, progress))
+        with _importing(target, entry.id) as hidden:
+            present = _present(target, present)
+            if entry.id in present:  # another process has imported it meanwhile
+                target.sweep(hidden)
+                report.known.append(present[entry.id])
+                continue
+            clear_away(target, hidden)
+            path = target.recording(hidden)
+            _copy_recording(source, target, path, entry, report, progress=progress)
+            Journal(path).append(journal.event(journal.ADOPTED, store=target.settings.store_id))
+            with target.alone():
+                label = target.free_label(entry.label)
+                target.move(hidden, label)
+            report.imported.append(label)
     return report
 
 
-def _present(directory: StoreDirectory) -> dict[str, str]:
-    """Labels of the recordings of a store, by id."""
+def _present(directory: StoreDirectory, known: Mapping[str, str]) -> dict[str, str]:
+    """Labels of the recordings of a store, by id.
+
+    Args:
+        directory: The store.
+        known: What was found before.
+    """
+    ids = {label: recording for recording, label in known.items()}
     found = {}
     for label in directory.labels():
-        try:
-            found[take_inventory(directory, label).id] = label
-        except StoreError:
-            continue
+        with suppress(StoreError):
+            found[ids.get(label) or directory.id_of(label)] = label
     return found
 
 
-def _import_one(
+@contextmanager
+def _importing(directory: StoreDirectory, recording: str) -> Iterator[str]:
+    """Make and lock the hidden directory that a recording is copied into; yield its name."""
+    hidden = f"{IMPORTING}{recording}"
+    path = directory.recording(hidden)
+    with ExitStack() as held:
+        while True:
+            try:
+                files.make_folder(path, depth=files.IN_FOLDER)
+            except FileExistsError:
+                pass  # an import was interrupted, or another process imports it
+            except OSError as error:
+                raise durability.explain(error, path, "importing into") from error
+            with suppress(TopicError):  # another process has given it its label
+                held.enter_context(directory.writing(hidden, wait_s=LOCK_WAIT_S))
+                break
+        yield hidden
+
+
+def _copy_recording(
     source: StoreDirectory,
     target: StoreDirectory,
+    path: Path,
     entry: RecordingEntry,
     report: ImportReport,
+    *,
     progress: Progress | None,
-) -> str:
-    inventory = take_inventory(source, entry.label)
-    if inventory.misfits or not inventory.is_proven:
-        raise StoreError(
-            f"Recording {entry.label!r} of {source.path} is incomplete: "
-            f"`hybridlog verify --store {source.path} {entry.label}` shows what is missing. "
-            "It was not imported."
-        )
-    hidden = f"{IMPORTING}{entry.id}"
-    path = target.recording(hidden)
-    try:
-        files.make_folder(path, depth=files.IN_FOLDER)
-    except FileExistsError:
-        pass  # an import was interrupted
-    except OSError as error:
-        raise durability.explain(error, path, "importing into") from error
-    with target.writing(hidden) as mine:
-        if not mine:
-            raise StoreError(
-                f"Another process is importing {entry.label!r}. Wait until it is done."
-            )
-        clear_away(target, hidden)
-        # An interrupted import may have copied what the source does not list any more.
-        for number, name in target.listing(hidden).sealed.items():
-            if number not in inventory.summaries:
-                files.unlink(path / name)
-        _copy_segments(source, path, inventory, report, progress)
-        _copy_payloads(source.recording(inventory.label), path, inventory, report)
-        durability.write_new(path / JOURNAL, _journal(source, inventory), depth=files.IN_RECORDING)
-        Journal(path).append(journal.event(journal.ADOPTED, store=target.settings.store_id))
-        with target.alone():
-            label = target.free_label(entry.label)
-            target.move(hidden, label)
-    return label
+) -> None:
+    """Copy a recording, whatever label it has now, and check every byte."""
+    while True:
+        label = source.label_now(entry.label, entry.id)
+        try:
+            inventory = take_inventory(source, label)
+            if inventory.id != entry.id or inventory.misfits or not inventory.is_proven:
+                raise StoreError(
+                    f"Recording {label!r} of {source.path} is incomplete: "
+                    f"`hybridlog verify --store {source.path} {label}` shows what is missing. "
+                    "It was not imported."
+                )
+            # An interrupted import may have copied what the source does not list any more.
+            for number, name in target.listing(path.name).sealed.items():
+                if number not in inventory.summaries:
+                    files.unlink(path / name)
+            _copy_segments(source, path, inventory, report, progress)
+            _copy_payloads(source.recording(label), path, inventory, report)
+            lines = _journal(source, inventory)
+        except StoreError:
+            if source.has_label(label, entry.id):
+                raise
+        else:
+            durability.write_new(path / JOURNAL, lines, depth=files.IN_RECORDING)
+            return
 
 
 def _journal(source: StoreDirectory, inventory: Inventory) -> bytes:
@@ -145,7 +175,10 @@ def _journal(source: StoreDirectory, inventory: Inventory) -> bytes:
     """
     path, state = source.recording(inventory.label) / JOURNAL, inventory.state
     assert state is not None  # it is proven
-    data = files.read_file(path, journal.MAX_JOURNAL)[: state.length]
+    try:
+        data = files.read_file(path, journal.MAX_JOURNAL)[: state.length]
+    except OSError as error:
+        raise unreadable(error, path) from error
     if replace(journal.parse(data), torn=state.torn) != state:
         raise StoreError(f"{path} has changed meanwhile. Run the import again.")
     return data

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -17,11 +18,17 @@ from hybridlog.maintenance.opening import describe_inventory, put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.payloads.contents import MovedContents, open_segment
 from hybridlog.tables.writer import TableWriter
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import stamps_of
-from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
+from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.errors import (
+    CatalogError,
+    HeldError,
+    HybridlogError,
+    SegmentError,
+    StoreError,
+    TopicError,
+)
 from hybridlog_storage.index_state import Indexed, IndexState
-from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
@@ -101,6 +108,8 @@ def bring_up_to_date(
         if indexed is not None and is_whole and _recall(catalog, entry, indexed):
             has_changed = True
             entry = put_entry(directory, catalog, entry.label)
+            if entry.id != summary.id:  # another recording has the label now
+                continue
         if is_whole and _is_settled(indexed, entry):
             settled.append(entry.id)
         elif directory.is_writable:  # else the segments answer, without an index
@@ -122,16 +131,15 @@ def _bring_one(
     progress: Progress | None,
 ) -> None:
     """Bring one recording up to date, unless another process is writing it."""
-    with directory.writing(entry.label) as mine:
-        if not mine:
-            return  # the process that holds the lock indexes it
+    # The process that holds the lock indexes it.
+    with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
         try:
-            chunks = _tend(directory, catalog, database, entry, progress)
+            chunks = _tend(directory, catalog, database, replace(entry, label=label), progress)
         except SegmentError as error:
-            report.unreadable[entry.label] = str(error)
+            report.unreadable[label] = str(error)
         else:
             if chunks is not None:
-                report.indexed[entry.label] = chunks
+                report.indexed[label] = chunks
 
 
 def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
@@ -204,30 +212,13 @@ def ids_present(directory: StoreDirectory) -> set[str] | None:
     """
     for _ in range(_TRIES):
         labels = directory.labels()
-        found = _ids_of(directory, labels)
+        try:
+            found = {directory.id_of(label)[:16] for label in labels}
+        except StoreError:
+            return None
         if directory.labels() == labels:
             return found
     return None
-
-
-def _ids_of(directory: StoreDirectory, labels: Iterable[str]) -> set[str] | None:
-    found: set[str] = set()
-    for label in labels:
-        try:
-            listing = directory.listing(label)
-            state = journal.read(directory.recording(label)) if listing.journal else None
-        except StoreError:
-            return None
-        if state is not None and state.id:
-            found.add(state.id[:16])
-            continue
-        for number, name in [*listing.sealed.items(), *listing.open.items()]:
-            try:
-                with SegmentReader(directory.recording(label) / name, number) as reader:
-                    found.add(str(reader.summary().recording["id"])[:16])
-            except (SegmentError, KeyError):
-                return None
-    return found
 
 
 def forget(database: Database, key: str, indexed: Indexed | None) -> None:
@@ -496,9 +487,9 @@ def reindex(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database,
-    labels: Iterable[str],
+    entries: Iterable[RecordingEntry],
     progress: Progress | None = None,
-) -> list[str]:
+) -> dict[str, HybridlogError]:
     """Rebuild the index of recordings from their segments, one after the other.
 
     The other recordings can be asked meanwhile. The next opening finishes an interrupted
@@ -508,24 +499,23 @@ def reindex(
         directory: The store.
         catalog: Its catalog.
         database: The index.
-        labels: The recordings.
+        entries: The recordings.
         progress: Called after each chunk.
 
     Returns:
-        Labels of those that are being written, which are unchanged.
+        Why some are unchanged, by id: another process holds them, or they are gone.
 
     Raises:
         DatabaseError: MongoDB fails.
     """
-    left = []
-    for label in labels:
-        with directory.writing(label) as mine:
-            if not mine:
-                left.append(label)
-                continue
-            entry = put_entry(directory, catalog, label)
-            _clear(database, entry)
-            catch_up(directory, catalog, database, label, progress)
+    left: dict[str, HybridlogError] = {}
+    for chosen in entries:
+        try:
+            with directory.writing(chosen.label, chosen.id, wait_s=LOCK_WAIT_S) as label:
+                _clear(database, put_entry(directory, catalog, label))
+                catch_up(directory, catalog, database, label, progress)
+        except (HeldError, TopicError) as error:
+            left[chosen.id] = error
     return left
 
 
@@ -592,10 +582,9 @@ def remove_rest(
             state.clear(key)
     for key in sorted(again):
         entry = known[key]
-        with directory.writing(entry.label) as mine:
-            if mine:
-                _clear(database, entry, everywhere=True)
-                catch_up(directory, catalog, database, entry.label, progress)
+        with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
+            _clear(database, entry, everywhere=True)
+            catch_up(directory, catalog, database, label, progress)
 
 
 def _places(database: Database, entries: Iterable[RecordingEntry]) -> dict[str, TopicPlace]:

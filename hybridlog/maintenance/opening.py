@@ -26,7 +26,14 @@ from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage import durability, files, journal
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.directory import LOCK, REMOVED
-from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, StoreError
+from hybridlog_storage.errors import (
+    CatalogError,
+    DiskFullError,
+    HeldError,
+    SegmentError,
+    StoreError,
+    TopicError,
+)
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.segment_file import sealed_name
 
@@ -209,7 +216,8 @@ def _is_current(
     if looks != listing.print:
         return False
     if listing.open or entry.status == "open" or any(map(is_left_over, listing.others)):
-        return directory.is_held(entry.label)
+        holder = directory.holder(entry.label)
+        return holder is not None and (holder.is_recording or entry.status != "open")
     return True
 
 
@@ -225,24 +233,21 @@ def _refresh(
     is_empty = not (listing.journal or listing.sealed or listing.open)
     if is_empty and not _OURS.issuperset(listing.others):
         raise StoreError("it has neither a journal nor a segment, but other files")
-    if is_empty and (not may_write or directory.is_beginning(label)):
+    if is_empty and not may_write:
         return None
-    if not may_write:
-        return put_described(directory, catalog, label, is_open=directory.is_held(label))
-    with directory.writing(label) as mine:
-        if not mine and not _has_begun(directory, label):
-            return None  # a process is about to begin it
-        now = recover(directory, label, report) if mine else label
-        return put_described(directory, catalog, now, is_open=not mine) if now else None
-
-
-def _has_begun(directory: StoreDirectory, label: str) -> bool:
-    """True if a recording can be identified, by the first line of its journal or a segment."""
-    listing = directory.listing(label)
-    if listing.sealed or listing.open:
-        return True
-    state = journal.read(directory.recording(label)) if listing.journal else None
-    return state is not None and bool(state.id)
+    if may_write:
+        try:
+            with directory.writing(label):
+                if is_empty and directory.is_beginning(label):
+                    return None
+                now = recover(directory, label, report)
+                return put_described(directory, catalog, now) if now else None
+        except HeldError:
+            if not directory.id_of(label):
+                return None  # a process is about to begin it
+        except TopicError:
+            return None
+    return put_described(directory, catalog, label, is_open=directory.is_recorded(label))
 
 
 def _one_of(
@@ -406,10 +411,12 @@ def finish_renaming(directory: StoreDirectory, label: str, state: JournalState |
     if state is None or state.moving is None:
         return label
     before, after = state.moving
-    if label == before and after in directory.labels():
-        after = directory.free_label(state.name, but=label)
-    if label == before and label != after:
-        directory.move(label, after)
+    if label == before:
+        with directory.alone():  # a recording that begins takes a label, too
+            if after in directory.labels():
+                after = directory.free_label(state.name, but=label)
+            if label != after:
+                directory.move(label, after)
         label = after
     Journal(directory.recording(label)).append(journal.event(journal.RENAMED, name=state.name))
     return label
@@ -510,7 +517,7 @@ def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry
     """
     catalog.mend()
     for _ in range(2):
-        put_entry(directory, catalog, entry.label, is_open=directory.is_held(entry.label))
+        put_entry(directory, catalog, entry.label, is_open=directory.is_recorded(entry.label))
         try:
             for number, _, _ in entry.spans:
                 catalog.table(entry, number)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import forget
 from hybridlog.maintenance.opening import announce_removal
-from hybridlog.maintenance.report import being_written
+from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.errors import TopicError
 from hybridlog_storage.index_state import IndexState
 
 if TYPE_CHECKING:
@@ -36,13 +37,12 @@ def remove(
 
     Raises:
         StoreError: It is being written, or cannot be removed.
+        TopicError: It is gone.
         DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
     """
-    with directory.writing(entry.label) as mine:
-        if not mine:
-            raise being_written(entry.label)
-        announce_removal(directory, entry.label)
-        hidden = directory.hide(entry.label)
+    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        announce_removal(directory, label)
+        hidden = directory.hide(label)
         try:
             catalog.remove(entry.id)
             with suppress(OSError):  # the next connection removes them
@@ -63,13 +63,14 @@ def _clear(database: Database, entry: RecordingEntry) -> None:
     forget(database, entry.key, indexed)
 
 
-def remove_copy(directory: StoreDirectory, label: str) -> None:
+def remove_copy(directory: StoreDirectory, label: str, recording: str) -> None:
     """Delete a directory with a copy of a recording; the index stays.
 
     Raises:
         StoreError: It is being written, or cannot be removed.
+        TopicError: It is no copy of the recording any more.
     """
-    with directory.writing(label) as mine:
-        if not mine:
-            raise being_written(label)
+    with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
+        if now != label or directory.labels_of(recording) == [label]:
+            raise TopicError(f"{label!r} is no longer a copy of another recording.")
         directory.sweep(directory.hide(label))

@@ -13,7 +13,8 @@ from hybridlog.maintenance.index import catch_up, reindex
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
 from hybridlog.payloads.contents import open_segment
 from hybridlog_storage import durability, files
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.recovery import rebuild_summary
@@ -49,7 +50,7 @@ def repair(
     directory: StoreDirectory,
     catalog: Catalog,
     repairs: RepairReport,
-    labels: Iterable[str] | None,
+    entries: Iterable[RecordingEntry] | None,
 ) -> list[Repaired]:
     """Repair files, journals and the catalog.
 
@@ -57,7 +58,7 @@ def repair(
         directory: The store.
         catalog: Its catalog.
         repairs: The report of the store's opening.
-        labels: The recordings; None for all.
+        entries: The recordings; None for all.
 
     Raises:
         StoreError: The store cannot be written.
@@ -67,25 +68,28 @@ def repair(
     if not catalog.is_sound():
         catalog.rebuild()
         done.append(Repaired("", "catalog", "rebuilt"))
-        labels = None  # all other rows are lost, too
-    for label in directory.labels() if labels is None else labels:
+        entries = None  # all other rows are lost, too
+    chosen = [(label, "") for label in directory.labels()]
+    for label, recording in chosen if entries is None else [(e.label, e.id) for e in entries]:
         if label in repairs.copies:
             original = repairs.copies[label]
             what = f"it is a copy of {original}; remove one: `hybridlog rm {label}`"
             done.append(Repaired(label, "recording", what, is_cured=False))
             continue
         try:
-            with directory.writing(label) as mine:
-                if mine:
-                    done += _repair_one(directory, catalog, label)
-            if mine:
-                done += _repair_tables(directory, catalog, label)
-        except StoreError as error:
+            with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
+                done += _repair_one(directory, now)
+                entry = put_entry(directory, catalog, now)
+            done += _repair_tables(directory, entry)
+        except HeldError as error:
+            if recording:
+                done.append(Repaired(label, "recording", str(error), is_cured=False))
+        except (StoreError, TopicError) as error:
             done.append(Repaired(label, "recording", str(error), is_cured=False))
     return done
 
 
-def _repair_one(directory: StoreDirectory, catalog: Catalog, label: str) -> list[Repaired]:
+def _repair_one(directory: StoreDirectory, label: str) -> list[Repaired]:
     done = _put_segments_right(directory, label)
     done += _put_journal_right(directory, label)
     inventory = take_inventory(directory, label)
@@ -93,19 +97,17 @@ def _repair_one(directory: StoreDirectory, catalog: Catalog, label: str) -> list
         what = f"{misfit.reason}; restore it from a copy, if there is one"
         place = misfit.file or f"segment {misfit.segment}"
         done.append(Repaired(label, place, what, is_cured=False))
-    put_entry(directory, catalog, label)
     return done
 
 
-def _repair_tables(directory: StoreDirectory, catalog: Catalog, label: str) -> list[Repaired]:
+def _repair_tables(directory: StoreDirectory, entry: RecordingEntry) -> list[Repaired]:
     """Rebuild damaged tables."""
-    entry = put_entry(directory, catalog, label)
     if entry.status == "damaged":
         return []  # tables of lost data are valid again after its restoration
     damaged = tables.damage(directory, entry)
     if not damaged or not tables.make(directory, entry, damaged):
         return []
-    return [Repaired(label, f"table of {topic}", "made again") for topic in damaged]
+    return [Repaired(entry.label, f"table of {topic}", "made again") for topic in damaged]
 
 
 def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:
@@ -186,15 +188,14 @@ def repair_index(
         if entry.status == "open":
             continue
         if _is_restored(directory, catalog, entry):
-            if not reindex(directory, catalog, database, [entry.label], progress):
+            if not reindex(directory, catalog, database, [entry], progress):
                 done.append(Repaired(entry.label, "index", "damaged chunks are readable again"))
             continue
         if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
             continue
-        with directory.writing(entry.label) as mine:
-            if mine:
-                chunks = catch_up(directory, catalog, database, entry.label, progress)
-                done.append(Repaired(entry.label, "index", f"{chunks} chunks indexed"))
+        with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
+            chunks = catch_up(directory, catalog, database, label, progress)
+            done.append(Repaired(label, "index", f"{chunks} chunks indexed"))
     return done
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.errors import DiskFullError, StoreError
+from hybridlog_storage.errors import DiskFullError
 
 if TYPE_CHECKING:
     from hybridlog_storage.recovery import Recovered
@@ -70,8 +70,3 @@ class CompactedTopic:
     both: int = 0
     kept: int = 0
     reason: str = ""
-
-
-def being_written(label: str) -> StoreError:
-    """The error for a recording that another process holds."""
-    return StoreError(f"Recording {label!r} is being written. Wait until it is done, or stop it.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +25,7 @@ from hybridlog.tables.layout import (
 )
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import files
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -86,9 +87,8 @@ def make(
     if not wanted:
         return True
     try:
-        with directory.writing(entry.label) as mine:
-            if not mine:
-                return False
+        with directory.writing(entry.label, entry.id) as label:
+            entry = replace(entry, label=label)
             writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=False)
             try:
                 for chunk, channels in _chunks(directory, entry, wanted, writer):
@@ -96,7 +96,7 @@ def make(
                 writer.close(entry)
             finally:
                 writer.discard()
-    except StoreError:
+    except (StoreError, TopicError):
         return False
     return not writer.has_failed
 
@@ -220,10 +220,9 @@ def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
         place = snapshot.by_id.get(name.removeprefix("r"))
         if place is None:
             continue
-        label = snapshot.summaries[place].label
-        with suppress(OSError, StoreError), directory.writing(label) as mine:
-            if mine:
-                files.remove_tree(directory.path / PARTS / name, depth=files.IN_FOLDER)
+        one = snapshot.summaries[place]
+        with suppress(OSError, StoreError, TopicError), directory.writing(one.label, one.id):
+            files.remove_tree(directory.path / PARTS / name, depth=files.IN_FOLDER)
 
 
 def are_more_than(directory: StoreDirectory, recordings: int) -> bool:

@@ -202,7 +202,8 @@ class _Check:
                 f"it is a copy of {repairs.copies[self._label]}, which answers",
                 cure,
             )
-        is_held = self._directory.is_held(self._label)
+        holder = self._directory.holder(self._label)
+        is_held = holder is not None
         self._has_index = not is_held and self._label not in repairs.copies
         inventory = take_inventory(self._directory, self._label)
         self._indexer = ChunkIndexer(inventory.id)
@@ -221,7 +222,8 @@ class _Check:
             before += inventory.summaries[number].size if number in inventory.summaries else 0
         if self._label in repairs.copies or not inventory.id:
             return
-        entry = describe_inventory(self._catalog, inventory, is_open=is_held).entry
+        is_open = holder is not None and holder.is_recording
+        entry = describe_inventory(self._catalog, inventory, is_open=is_open).entry
         self._row(entry)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":

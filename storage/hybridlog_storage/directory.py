@@ -19,22 +19,28 @@ import os
 import re
 import secrets
 import stat
+import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Final
 
-from hybridlog_storage import durability, files
-from hybridlog_storage.errors import StoreError, unreadable
+from hybridlog_storage import durability, files, journal
+from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
 from hybridlog_storage.sharing import make_shared
+from hybridlog_storage.stopping import pause
 
 LOCK: Final = "writer.lock"
+LOCK_WAIT_S: Final = 10.0
+"""Seconds that a command waits for another one that holds its recording."""
 PAYLOADS: Final = "payloads"
 """Folder of a recording that holds its columns of payloads."""
 REMOVED: Final = ".removed-"
@@ -43,6 +49,23 @@ IMPORTING: Final = ".importing-"
 """Prefix of the directory of a recording that is being imported."""
 _RECORDINGS: Final = "recordings"
 _TICK_NS: Final = 50_000_000
+_POLL_S = 0.02
+_RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
+_MAX_HOLDER = 256  # bytes of the line in a lock
+_TRIES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """The process that holds a recording's lock, by its own account.
+
+    Attributes:
+        name: Its id and its command, for messages.
+        is_recording: Whether it records, instead of changing an ended recording.
+    """
+
+    name: str
+    is_recording: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,37 +414,168 @@ class StoreDirectory:
         except OSError as error:
             raise durability.explain(error, self.path, "locking") from error
 
-    @contextmanager
-    def writing(self, label: str) -> Iterator[bool]:
-        """Lock a recording for writing; False if another process holds the lock."""
-        path = self.recording(label) / LOCK
-        try:
-            fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
-        except OSError as error:
-            raise durability.explain(error, path, "locking") from error
-        try:
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                yield False
-                return
-            yield True
-        finally:
-            os.close(fd)
+    def id_of(self, label: str) -> str:
+        """The id of a recording: by its journal, else by most of its segments.
 
-    def is_held(self, label: str) -> bool:
-        """True if a process holds a recording's lock at this moment."""
+        Returns:
+            Empty if it has no segments yet that could say it.
+
+        Raises:
+            StoreError: Nothing says it, or it cannot be read.
+        """
+        from hybridlog_storage.segment_reader import SegmentReader
+
+        path, listing = self.recording(label), self.listing(label)
+        state = journal.read(path) if listing.journal else None
+        if state is not None and state.id:
+            return state.id
+        found: Counter[str] = Counter()
+        for number, name in listing.sealed.items():
+            with suppress(SegmentError), SegmentReader(path / name, number) as reader:
+                found[str(reader.summary().recording.get("id", ""))] += 1
+        if not found and (listing.sealed or listing.open):
+            raise StoreError(f"Nothing readable says which recording {label!r} is.")
+        return found.most_common(1)[0][0] if found else ""
+
+    def labels_of(self, recording: str) -> list[str]:
+        """Labels of a recording, by its id; several are copies of one."""
+        found: list[str] = []
+        for _ in range(_TRIES):
+            labels = self.labels()
+            found = [label for label in labels if self.has_label(label, recording)]
+            # One that is renamed meanwhile must not be missed.
+            if found or self.labels() == labels:
+                break
+        return found
+
+    def label_now(self, label: str, recording: str) -> str:
+        """The present label of a recording that had a label.
+
+        Raises:
+            TopicError: It is gone, or several copies of it are left.
+        """
+        if self.has(label) and self.has_label(label, recording):
+            return label
+        found = self.labels_of(recording) if recording else []
+        if len(found) == 1:
+            return found[0]
+        raise TopicError(f"Recording {label!r} is no longer in the store.")
+
+    def has_label(self, label: str, recording: str) -> bool:
+        """True if a recording, by its id, has a label; empty for any recording."""
+        try:
+            return not recording or self.id_of(label) == recording
+        except StoreError:
+            return False
+
+    @contextmanager
+    def writing(
+        self, label: str, recording: str = "", *, wait_s: float = 0.0, records: bool = False
+    ) -> Iterator[str]:
+        """Lock a recording for writing.
+
+        Nobody gives a locked recording another label, so the label is right until the end.
+
+        Args:
+            label: Its label when it was chosen.
+            recording: Its id. If the label belongs to another recording by now, it is looked
+                for. Empty for any recording that has the label.
+            wait_s: Seconds to wait for another command that holds it. A recorder may hold it
+                for hours, so it is not waited for.
+            records: Whether this process records it.
+
+        Yields:
+            Its present label.
+
+        Raises:
+            HeldError: Another process holds it.
+            TopicError: It is gone.
+        """
+        begun = time.monotonic()
+        while True:
+            try:
+                fd = files.open_file(self.recording(label) / LOCK, os.O_RDWR | os.O_CREAT)
+            except FileNotFoundError:
+                label = self.label_now(label, recording)
+                continue
+            except OSError as error:
+                raise durability.explain(error, self.recording(label) / LOCK, "locking") from error
+            is_mine = False
+            try:
+                with suppress(BlockingIOError):
+                    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    is_mine = True
+                if not self._is_lock_of(fd, label, recording):
+                    label = self.label_now(label, recording)
+                    continue
+                if is_mine:
+                    _say_holder(fd, records=records)
+                    try:
+                        yield label
+                    finally:
+                        with suppress(OSError):
+                            files.system.truncate(fd, 0)
+                    return
+                holder = _read_holder(fd)
+            finally:
+                os.close(fd)
+            most = min(wait_s, _RECORDER_WAIT_S) if holder.is_recording else wait_s
+            if time.monotonic() - begun >= most:
+                what = "being written" if holder.is_recording else "being changed"
+                raise HeldError(
+                    f"Recording {label!r} is {what} by {holder.name}. Wait until it is done, or "
+                    "stop it.",
+                    is_recording=holder.is_recording,
+                )
+            pause(_POLL_S)
+
+    def _is_lock_of(self, fd: int, label: str, recording: str) -> bool:
+        """True if an open lock is that of a label, and the label that of a recording."""
+        try:
+            there = files.status(self.recording(label) / LOCK)
+        except OSError:
+            return False
+        return os.path.samestat(os.fstat(fd), there) and self.has_label(label, recording)
+
+    def holder(self, label: str) -> Holder | None:
+        """The process that holds a recording's lock at this moment."""
         try:
             fd = files.open_file(self.recording(label) / LOCK, os.O_RDONLY | os.O_NONBLOCK)
         except OSError:
-            return False
+            return None
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            return True
+            return _read_holder(fd)
         finally:
             os.close(fd)
-        return False
+        return None
+
+    def is_recorded(self, label: str) -> bool:
+        """True if a process records into a directory at this moment."""
+        holder = self.holder(label)
+        return holder is not None and holder.is_recording
+
+
+def _say_holder(fd: int, *, records: bool) -> None:
+    """Write into a lock who holds it. Of arguments only words: options may hold passwords."""
+    program = Path(sys.argv[0] if sys.argv else "")
+    name = program.parent.name if program.name == "__main__.py" else program.name
+    name = "python" if name in {"", "-c"} else name
+    words = takewhile(lambda word: not word.startswith("-"), sys.argv[1:])
+    command = " ".join([name, *(words if name == "hybridlog" else ())]).encode("ascii", "replace")
+    line = f"{os.getpid()} {int(records)} ".encode() + command
+    with suppress(OSError):  # a full disk must not keep a recording from being removed
+        files.system.pwritev(fd, [memoryview(line[:_MAX_HOLDER].ljust(_MAX_HOLDER))], 0)
+
+
+def _read_holder(fd: int) -> Holder:
+    """The last holder of a lock, from its line; the store may come from another user."""
+    line = os.pread(fd, _MAX_HOLDER, 0).decode("ascii", "replace").strip()
+    found = re.fullmatch(r"(\d+) ([01]) (.*)", line)
+    if found is None or not line.isprintable():
+        return Holder("another process", is_recording=False)
+    return Holder(f"process {found[1]} ({found[3]})", is_recording=found[2] == "1")
 
 
 @contextmanager

@@ -91,6 +91,18 @@ class StoreError(HybridlogError):
     exit_code = 5
 
 
+class HeldError(StoreError):
+    """Another process holds a recording's lock.
+
+    Attributes:
+        is_recording: Whether it records.
+    """
+
+    def __init__(self, message: str, *, is_recording: bool) -> None:
+        super().__init__(message)
+        self.is_recording = is_recording
+
+
 class SegmentError(StoreError):
     """A segment of the store that cannot be read."""
 

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import threading
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from hybridlog_storage.directory import REMOVED, StoreDirectory
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage import files, journal
+from hybridlog_storage.directory import LOCK, REMOVED, Holder, StoreDirectory
+from hybridlog_storage.errors import HeldError, StoreError, TopicError
+from hybridlog_storage.journal import Journal
 from tests.other_user import User, needs_root, open_place
 
 
@@ -198,34 +205,154 @@ def test_a_label_that_is_free(store: StoreDirectory) -> None:
 HOLD = """
 import sys
 from pathlib import Path
-from hybridlog_storage.directory import REMOVED, StoreDirectory
-with StoreDirectory(Path(sys.argv[1])).writing("r") as mine:
-    print(mine, flush=True)
+from hybridlog_storage.directory import StoreDirectory
+store, *sys.argv = sys.argv[1:]
+with StoreDirectory(Path(store)).writing("r", records=sys.argv.pop() == "records"):
+    print("held", flush=True)
     sys.stdin.read()
 """
 
 
-def test_one_process_writes_a_recording(store: StoreDirectory) -> None:
-    store.new_recording("r")
+@contextmanager
+def holding(store: StoreDirectory, *command: str, as_: str = "changes") -> Iterator[int]:
+    """A process that holds the recording `r` until it is killed; its id."""
     other = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(store.path)],
+        [sys.executable, "-c", HOLD, str(store.path), *command, as_],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert other.stdout is not None
-    assert other.stdout.readline() == "True\n"
-    with store.writing("r") as mine:
-        assert not mine
+    try:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        yield other.pid
+    finally:
+        other.kill()
+        other.communicate()
+
+
+def begun(store: StoreDirectory, label: str, recording: str) -> str:
+    """Make a recording that has only begun; return its id of 32 digits."""
+    recording = (recording * 32)[:32]
+    line = {"id": recording, "store": "", "name": label, "tags": {}, "source": {}, "created": 0}
+    Journal(store.recording(store.new_recording(label))).append(
+        journal.event(journal.BEGUN, **line)
+    )
+    return recording
+
+
+def test_one_process_writes_a_recording(store: StoreDirectory) -> None:
+    store.new_recording("r")
+    with (
+        holding(store) as pid,
+        pytest.raises(HeldError, match=rf"'r' is being changed by process {pid} \("),
+        store.writing("r"),
+    ):
+        pass
     # What is killed lets go.
-    other.kill()
-    other.communicate()
-    with store.writing("r") as mine:
-        assert mine
-        with store.writing("r") as again:
-            assert not again
-    with store.writing("r") as mine:
-        assert mine
+    with store.writing("r") as label:
+        assert label == "r"
+        with pytest.raises(HeldError, match=f"process {os.getpid()} "), store.writing("r"):
+            pass
+        assert store.holder("r") is not None
+    assert store.holder("r") is None
+    assert (store.recording("r") / LOCK).read_bytes() == b""
+
+
+def test_a_lock_says_the_words_of_a_command_and_no_options(store: StoreDirectory) -> None:
+    store.new_recording("r")
+    command = ("/usr/bin/hybridlog", "tag", "a", "x=\x1b[1mé", "--mongo", "mongodb://me:pass@h")
+    with holding(store, *command) as pid:
+        assert store.holder("r") == Holder("another process", is_recording=False)
+        line = (store.recording("r") / LOCK).read_bytes()
+        assert line.startswith(b"%d 0 hybridlog tag a x=" % pid)
+        assert b"pass" not in line
+    with holding(store, "/x/hybridlog/__main__.py", "rm", "a b", "-y", as_="records") as pid:
+        assert store.holder("r") == Holder(f"process {pid} (hybridlog rm a b)", is_recording=True)
+    with holding(store, "robot.py", "pass") as pid:
+        assert store.holder("r") == Holder(f"process {pid} (robot.py)", is_recording=False)
+    for odd in (b"", b"1", b"1 2 x", b"\xff" * 300, b"7 1 x\ny"):
+        with store.writing("r"):
+            (store.recording("r") / LOCK).write_bytes(odd)
+            assert store.holder("r") == Holder("another process", is_recording=False)
+
+
+def test_a_command_waits_for_another_one_and_not_for_a_recorder(store: StoreDirectory) -> None:
+    store.new_recording("r")
+    with ExitStack() as held, ThreadPoolExecutor(1) as pool:
+        held.enter_context(store.writing("r"))
+
+        def wait() -> str:
+            with store.writing("r", wait_s=60) as label:
+                return label
+
+        waiting = pool.submit(wait)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.2)
+        held.close()
+        assert waiting.result(60) == "r"
+    with (
+        holding(store, as_="records") as pid,
+        pytest.raises(HeldError, match=f"being written by process {pid}") as error,
+        store.writing("r", wait_s=600),
+    ):
+        pass
+    assert error.value.is_recording
+    # A look at the lock takes it for a moment, when its line may be that of a killed recorder.
+    with ExitStack() as held, ThreadPoolExecutor(1) as pool:
+        fd = os.open(store.recording("r") / LOCK, os.O_RDONLY)
+        held.callback(os.close, fd)
+        fcntl.flock(fd, fcntl.LOCK_SH)
+        waiting = pool.submit(wait)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.1)
+        held.close()
+        assert waiting.result(60) == "r"
+
+
+def test_a_lock_follows_the_recording_and_not_its_label(store: StoreDirectory) -> None:
+    one, two = begun(store, "r", "1"), begun(store, "s", "2")
+    with store.writing("r", one) as label:
+        assert label == "r"
+    with store.writing("r", two) as label:
+        assert label == "s"
+        with store.writing("gone", one) as other:
+            assert other == "r"
+        # Another recording gets the label that it had.
+        store.move("r", "t")
+        with pytest.raises(HeldError, match="'s' is being changed"), store.writing("r", two):
+            pass
+    for chosen in (("t", "3" * 32), ("gone", "3" * 32), ("gone", "")):
+        with pytest.raises(TopicError, match="no longer in the store"), store.writing(*chosen):
+            pass
+    # Of several copies none is meant more than the others.
+    shutil.copytree(store.recording("t"), store.recording("u"))
+    with store.writing("u", one) as label:
+        assert label == "u"
+    with pytest.raises(TopicError, match="no longer"), store.writing("r", one):
+        pass
+
+
+def test_a_lock_is_that_of_the_label_when_it_is_got(
+    store: StoreDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, _ = begun(store, "r", "1"), begun(store, "s", "2")
+    for recording in (one, ""):
+        open_file = files.open_file
+
+        def opened(path: Path, *args: Any, again: Any = open_file, **options: Any) -> int:
+            found: int = again(path, *args, **options)
+            if path.name == LOCK and path.parent.name == "r":
+                monkeypatch.undo()
+                for old, new in (("r", "x"), ("s", "r"), ("x", "s")):
+                    store.move(old, new)
+            return found
+
+        monkeypatch.setattr(files, "open_file", opened)
+        with store.writing("r", recording) as label:
+            assert label == ("s" if recording else "r")
+            assert store.holder("r" if recording else "s") is None
+            assert store.id_of(label) == one
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
