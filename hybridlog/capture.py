@@ -25,7 +25,7 @@ from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import DatabaseError, HybridlogError
+from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
@@ -175,12 +175,17 @@ class Capture:
             Why the index is not complete, None when it is.
 
         Raises:
-            DiskFullError: No room for that either.
+            DiskFullError: No room for that either. Without any message, the recording is gone.
         """
         self._end = end  # the segment holds the last losses
-        self.writer.give_up(
-            [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
-        )
+        try:
+            self.writer.give_up(
+                [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
+            )
+        except DiskFullError:
+            if not self.writer.written.total():
+                self.forget()
+            raise
         return self._finish()
 
     def _announce(self, sealed: Sealed) -> None:

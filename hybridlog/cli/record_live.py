@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import sys
 import threading
@@ -35,7 +36,7 @@ _SNAPSHOT = re.compile(r"snapshot \S+ because of ")
 
 def record_live(choices: RecordChoices) -> None:
     """Record until a bound is reached, the replay has ended, or Ctrl-C."""
-    from hybridlog.live.recorder import Recorder
+    from hybridlog.live.recorder import Recorder, check_room
 
     # Wrong options are found before a store is made.
     options = recorder_options(choices)
@@ -46,6 +47,7 @@ def record_live(choices: RecordChoices) -> None:
         for source in sources:
             held.enter_context(source).check()
         store = held.enter_context(opened_to_record(choices))
+        check_room(shutil.disk_usage(store.directory.path).free, options.reserve_bytes)
         with _stop_flag() as stop:
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()

@@ -280,7 +280,8 @@ class Recorder:
     def stop(self) -> list[RecordReport]:
         """Stop the sources; flush, index and seal everything.
 
-        If no source was ever reached and no message came, the recording is removed.
+        The recording is removed if no source was ever reached and no message came, or if the
+        disk had no room for any.
 
         Returns:
             A report for each recording.
@@ -296,7 +297,9 @@ class Recorder:
         self._control.close()
         if isinstance(self._target, Snapshots):
             reports = self._target.close()
-        elif self._recorded_by_content or any(source.was_reached for source in self._sources):
+        elif not (self.stopped_for_disk and self._target.is_empty) and (
+            self._recorded_by_content or any(source.was_reached for source in self._sources)
+        ):
             reports = [self._target.close()]
         else:
             self._target.abort()
@@ -684,12 +687,10 @@ class Recorder:
         grown, self._stored_bytes = state.stored_bytes - self._stored_bytes, state.stored_bytes
         # Messages in memory will be written, and as many new ones before the next check.
         coming = state.filled * options.budget_bytes + grown
-        if state.free_bytes - coming < options.reserve_bytes:
-            self._refuse(
-                Cause.DISK,
-                f"The disk has only {_megabytes(state.free_bytes)} left: free some, or lower "
-                "--reserve.",
-            )
+        try:
+            check_room(state.free_bytes, options.reserve_bytes + coming)
+        except DiskFullError as error:
+            self._refuse(Cause.DISK, str(error))
         failure = self._target.failure
         if isinstance(failure, DiskFullError):
             self._refuse(Cause.DISK, str(failure))
@@ -712,6 +713,17 @@ class Recorder:
                 f"the clock of this machine was set {'forward' if jump > 0 else 'back'} by "
                 f"{abs(jump):.1f} s; log times jump with it"
             )
+
+
+def check_room(free_bytes: int, reserve_bytes: float) -> None:
+    """Check that a disk has as much free space as the reserve.
+
+    Raises:
+        DiskFullError: It has less.
+    """
+    if free_bytes < reserve_bytes:
+        left = _megabytes(free_bytes)
+        raise DiskFullError(f"The disk has only {left} left: free some, or lower --reserve.")
 
 
 def _megabytes(count: float) -> str:

@@ -330,6 +330,11 @@ class LiveRecording:
         return totals.messages, totals.payload_bytes
 
     @property
+    def is_empty(self) -> bool:
+        """True if it has taken no message."""
+        return not any(self._taken)
+
+    @property
     def lag(self) -> int:
         """Messages that are not indexed yet."""
         return max(self._capture.writer.totals.messages - self._capture.index.indexed, 0)

@@ -26,7 +26,7 @@ from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
-from hybridlog_storage.errors import StoreError, UsageError
+from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import MAX_CHANNELS, Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import OnSealing, SegmentFile
@@ -321,10 +321,13 @@ class RecordingWriter:
             extras: Last records, written if they fit.
 
         Raises:
-            DiskFullError: No room; the next opening of the store seals the segment.
+            DiskFullError: No room; the next opening of the store seals the segment. Or no
+                message is in the files.
         """
         self._syncing = None
         self._shut_down()
+        if not self.written.total():
+            raise DiskFullError("No space left for any message. Free some, and record again.")
         if self._segment is not None and self._segment.is_complete:
             self._seal()
         segment = self._open_segment()

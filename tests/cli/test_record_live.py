@@ -349,6 +349,7 @@ def test_nothing_is_left_is_told_and_a_disk_without_room_is_code_7(
     done = run(*arguments, "4000TB", "-q", store=tmp_path / "store", code=7)
     assert "--reserve" in done.err
     assert done.out == ""
+    assert recordings(tmp_path / "store") == []
     done = run(*arguments, 0, "-t", "/imu/*", "-x", "/imu/*", store=tmp_path / "store")
     assert "no topic is left" in done.err
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog_storage.errors import HeldError
 from hybridlog_storage.messages import Channel, Schema
 
 FLUSH_S = 0.4
@@ -78,3 +79,32 @@ def test_a_kill_costs_no_more_than_the_flush_interval(tmp_path: Path, seed: int)
             if flushed:
                 assert set(range(max(flushed) + 1)) <= found.keys()
         assert store.verify().findings == []
+
+
+def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    process = subprocess.Popen(
+        [sys.executable, "-c", LOAD, str(path), "0.05"], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    try:
+        assert process.stdout.readline() == "running\n"
+        before = hl.open(path)
+        while not before.summaries()[0].messages:
+            time.sleep(0.02)
+        assert [entry.status for entry in before.recordings()] == ["open"]
+        with pytest.raises(HeldError, match=f"is being written by process {process.pid} "):
+            before.tag("load", a="1")
+    finally:
+        process.kill()
+        process.communicate()
+    with before:
+        # Another process is about to recover it, so nobody else can.
+        with before.directory.writing("load"), hl.open(path) as after:
+            for store in (before, after):
+                assert [one.status for one in store.summaries()] == ["unfinished"]
+                assert [entry.status for entry in store.recordings()] == ["unfinished"]
+                assert store.recordings()[0].messages > 0
+        with hl.open(path) as after:
+            for store in (after, before):
+                assert [entry.status for entry in store.recordings()] == ["recovered"]

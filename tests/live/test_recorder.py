@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import random
 import shutil
 import signal
 import socket
@@ -261,6 +262,41 @@ def test_a_disk_that_has_room_for_little_more(
     assert report.entry.messages >= 5
     assert [m.raw for m in store.topic("/scan")][:5] == [scan(n, 400_000) for n in range(5)]
     assert store.verify().findings == []
+
+
+@pytest.mark.parametrize("room", [0, 1 << 16], ids=["nothing", "an empty segment"])
+def test_a_disk_without_room_for_a_message_leaves_no_recording(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    robot, noise = Running(store), random.Random(1)
+    pwritev = os.pwritev
+
+    def full(fd: int, pieces: list[memoryview], position: int) -> int:
+        if position + len(pieces[0]) <= room or position < room <= len(pieces[0]):
+            return pwritev(fd, [pieces[0][: room - position]], position)
+        raise OSError(errno.ENOSPC, "full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(append_file.os, "pwritev", full)
+        for number in range(200):
+            robot.speaker.say(text_channel(), noise.randbytes(3_000_000), number)
+            if robot.recorder.wait(0.01):
+                break
+        with pytest.raises(DiskFullError):
+            robot.recorder.stop()
+    assert robot.recorder.stopped_for_disk
+    store.refresh()
+    assert not store.recordings()
+    assert not store.directory.names()
+
+
+def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store) -> None:
+    robot = Running(store, RecorderOptions(reserve_bytes=1 << 62))
+    robot.recorder.look()
+    robot.speaker.say(text_channel(), text("a"))
+    assert robot.recorder.stop() == []
+    assert robot.recorder.look().lost == {"disk": 1}
+    assert not store.directory.names()
 
 
 def test_it_stops_before_the_disk_is_full(store: hl.Store) -> None:
