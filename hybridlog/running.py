@@ -7,6 +7,7 @@ the rest is read from the open segments, each byte once.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,9 @@ from hybridlog.indexing import ChunkIndexer
 from hybridlog.losses import Cause, joined
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelEntry, ChannelStats, channel_entry, channel_totals
+from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.open_segment import OpenSegment
+from hybridlog_storage.segment_file import OPEN_SUFFIX
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
@@ -48,6 +51,7 @@ class RunningRecording:
         self._sealed: RecordingEntry | None = None
         self._state = "", False  # the look of its directory, and whether it is being written
         self._segments: dict[int, OpenSegment] = {}
+        self._unreadable: dict[int, str] = {}  # why, by number of the segment
         self._indexer: ChunkIndexer | None = None
         self.entry: RecordingEntry | None = None
         self.topics: set[TopicType] = set()
@@ -67,8 +71,11 @@ class RunningRecording:
         is_same = state == self._state
         if not is_same:
             self._begin()
-        is_new = [segment.follow() for segment in self._segments.values()]
-        if is_same and not any(is_new):
+        is_new = False
+        for number, segment in self._segments.items():
+            with self._noting(number):
+                is_new |= segment.follow()
+        if is_same and not is_new:
             return False
         self._state = state
         self.entry = None if self._sealed is None else self._with_flushed(self._sealed)
@@ -80,17 +87,29 @@ class RunningRecording:
         segment = self._segments.get(number)
         return None if segment is None else segment.reader
 
+    @contextmanager
+    def _noting(self, number: int) -> Iterator[None]:
+        """Note why a segment cannot be read; the other ones answer."""
+        try:
+            yield
+            self._unreadable.pop(number, None)
+        except SegmentError as error:
+            self._unreadable[number] = str(error)
+
     def _begin(self) -> None:
         """Read again what is sealed, and open the segments that are not."""
         # Listed first: what is sealed meanwhile is then in neither, or in both.
         opened = self._directory.listing(self._label).open
         self._sealed = self._read_sealed()
         before, self._segments = self._segments, {}
+        self._unreadable.clear()
         if self._sealed is None or self._sealed.status not in UNFINISHED:
             return
         path = self._directory.recording(self._sealed.label)
         for number in opened:
-            if str(number) not in self._sealed.digests:
+            if str(number) in self._sealed.digests:
+                continue
+            with self._noting(number):
                 self._segments[number] = before.get(number) or OpenSegment(path, number)
         if self._indexer is None:
             self._indexer = ChunkIndexer(self._sealed.id)
@@ -116,7 +135,7 @@ class RunningRecording:
             found.attachments += len(attachments)
             found.metadata_records += len(metadata)
         found.channels = [channels[number] for number in sorted(channels)]
-        losses = list(_losses(sealed, self._segments))
+        losses = list(_losses(sealed, self._segments, self._unreadable))
         if losses:
             found.end["losses"] = losses
         return found
@@ -138,18 +157,24 @@ def _sum(one: ChannelStats, other: ChannelStats) -> ChannelStats:
 
 
 def _losses(
-    sealed: RecordingEntry, segments: Mapping[int, OpenSegment]
+    sealed: RecordingEntry, segments: Mapping[int, OpenSegment], unreadable: Mapping[int, str]
 ) -> Iterator[dict[str, Any]]:
     """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
     before = sealed.end.get("losses", ())
     rows = [row for row in before if row["cause"] != Cause.SEGMENT]
     yield from joined([*rows, *(row for one in segments.values() for row in one.losses)])
     yield from (row for row in before if row["cause"] == Cause.SEGMENT)
-    for segment in segments.values():
+    for number, segment in segments.items():
         for damage in segment.damaged:
-            place = {"file": segment.reader.path.name, "offset": damage.offset}
-            count = {"length": damage.length, "reason": damage.reason, "count": None}
-            yield {"cause": Cause.SEGMENT.value, **place, **count, **_ANYWHERE}
+            yield _damaged(number, damage.reason, damage.offset, damage.length)
+    for number, reason in unreadable.items():
+        yield _damaged(number, reason)
 
 
-_ANYWHERE: dict[str, None] = {"topic": None, "from": None, "to": None}
+def _damaged(
+    number: int, reason: str, offset: int | None = None, length: int | None = None
+) -> dict[str, Any]:
+    """A row for an unknown number of messages at unknown times."""
+    place = {"file": f"{number:06d}{OPEN_SUFFIX}", "offset": offset, "length": length}
+    nothing = {"count": None, "topic": None, "from": None, "to": None}
+    return {"cause": Cause.SEGMENT.value, **place, "reason": reason, **nothing}

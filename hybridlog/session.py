@@ -601,7 +601,8 @@ class Session:
         except CatalogError:
             self.catalog.rebuild()
             self.invalidate()
-            if self.connected is not None:
+            # Not under the lock of `_follow`: who connects may wait for it.
+            if self.connected is not None and summary.status not in UNFINISHED:
                 # Only the index has the list of unreadable chunks now.
                 with suppress(HybridlogError):
                     self.connect()

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
+_MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 _PASSED: Final = frozenset({Opcode.HEADER, Opcode.METADATA_INDEX, PADDING_OPCODE})
 
@@ -177,6 +178,10 @@ class OpenSegment:
         elif opcode == ARRIVAL_OPCODE and self._chunk is not None:
             (offset, size), self._chunk = self._chunk, None
             self._add_chunk(offset, size, at + length - offset - size)
+        elif opcode == Opcode.ATTACHMENT:
+            self._add_attachment(at, length)
+        elif length > _MAX_RECORD:
+            raise SegmentError("the record is too large")
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             record, _ = read_record(opcode, self._content(at, length))
             if isinstance(record, SchemaRecord):
@@ -185,8 +190,6 @@ class OpenSegment:
                 self.channels[record.id] = channel_of(record, self._schemas)
         elif opcode == Opcode.METADATA:
             self._add_metadata(at, length)
-        elif opcode == Opcode.ATTACHMENT:
-            self._add_attachment(at, length)
         else:
             return opcode in _PASSED
         return True
@@ -196,6 +199,8 @@ class OpenSegment:
 
     def _add_chunk(self, offset: int, length: int, trailer: int) -> None:
         """Add a chunk, by its message indexes; if they are damaged, by its messages."""
+        if trailer > _MAX_RECORD:
+            raise SegmentError("the message indexes are too large")
         head = CHUNK_HEAD.unpack(self.reader.read(offset, CHUNK_HEAD.size))
         behind = self.reader.read(offset + length, trailer)
         first, last, size = int(head[2]), int(head[3]), int(head[4])

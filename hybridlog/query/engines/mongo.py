@@ -75,11 +75,10 @@ class Mongo:
 
         The index of a running recording is of another moment than its segments.
         """
-        is_opaque = part.predicate is not None and part.predicate.is_opaque
-        if part.recording.status in UNFINISHED and not is_opaque:
-            return None
         # Documents do not tell the channels of a topic apart, so none may be blind.
         is_answered = part.is_indexed and not part.blind and not _is_older(part)
+        if part.recording.status in UNFINISHED:
+            is_answered &= part.predicate is not None and part.predicate.is_opaque
         if need is Need.VALUES or self._is_away or not is_answered:
             return None
         if not self.reaches(part):
