@@ -76,6 +76,7 @@ _RECORD_LIMIT = 64 << 10
 _LOG_TAIL = 256 << 10
 _MAX_DEPTH = 8  # most folders in the directory
 _MAX_FILES = 1 << 20
+_MAX_STARTS = 3  # of a mongod that others end while it starts
 _ROOM = 1 << 30  # free bytes below which damaged files are removed at once
 _ASIDE = ".damaged-"
 _FILES = ("mongod.log", "mongod.log.1", "mongod.json", "mongod.json.new")
@@ -255,6 +256,7 @@ class EmbeddedMongod:
         patience = _Patience(self.log)
         log_start: int | None = None
         damage: str | None = None
+        starts = 0
         self._aside = self.damage = None
         while True:
             keeper = self._open("keeper.lock")
@@ -267,13 +269,16 @@ class EmbeddedMongod:
                 else:
                     if log_start is not None:
                         failure, is_damage = self._failure(log_start)
-                        if self._aside is not None:
-                            self._put_back()
-                        if damage is not None or not is_damage:
-                            self._clear_files()
-                            raise failure
-                        damage, patience = str(failure), _Patience(self.log)
+                        if not isinstance(failure, _EndedError) or starts == _MAX_STARTS:
+                            if self._aside is not None:
+                                self._put_back()
+                            if damage is not None or not is_damage:
+                                self._clear_files()
+                                raise failure
+                            damage = str(failure)
+                        patience = _Patience(self.log)
                     log_start = self._launch(keeper, damage)
+                    starts += log_start is not None
             finally:
                 os.close(keeper)
             if patience.is_over():
@@ -498,7 +503,8 @@ class EmbeddedMongod:
         found = _other_cause(text)
         if found is None:
             is_damage = "ended by itself" in text and not _was_ended(text)
-            return DatabaseError(f"{message} The whole log is {self.log}."), is_damage
+            message = f"{message} The whole log is {self.log}."
+            return DatabaseError(message) if is_damage else _EndedError(message), is_damage
         kind, cure = found
         if kind is ResourceError:
             return self._shortage(cure), False
@@ -535,7 +541,8 @@ def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
 
 def _was_ended(text: str) -> bool:
     """True if somebody else ended mongod, for example for lack of memory."""
-    return any(f"killed by signal {number}\n" in text for number in (1, 2, 9, 15))
+    ways = [f"killed by signal {number}\n" for number in (1, 2, 9, 15)]
+    return any(way in text for way in (*ways, "with exit status 0\n"))
 
 
 _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
@@ -587,6 +594,10 @@ _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
         "The embedded MongoDB needs a directory that it can write: use a server with --mongo URI.",
     ),
 )
+
+
+class _EndedError(DatabaseError):
+    """Somebody else ended mongod while it started."""
 
 
 class _Patience:

@@ -411,6 +411,33 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
         assert ping(user.start()), "nothing stays behind"
 
 
+@pytest.mark.parametrize("times", [1, 2, 9])
+@pytest.mark.parametrize("end", ["kill -9 $$", "kill -15 $$", "exit 0", "kill -9 $PPID; sleep 9"])
+def test_one_that_others_end_while_it_starts_is_started_again(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, times: int
+) -> None:
+    """A signal to mongod or to its keeper, or an orderly end that a signal asked for."""
+    ended = tmp_path / "ended"
+    with EmbeddedMongod(directory, linger_s=0) as user, MongoClient(user.start()) as client:
+        client.some.thing.insert_one({"kept": True})
+        started = pids(directory)
+    gone(*started)
+    script = (
+        f"echo >> {ended}; test $(wc -l < {ended}) -gt {times} || {{ {end}; }}; "
+        f'exec {find_mongod()} "$@"'
+    )
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    user = EmbeddedMongod(directory, linger_s=LINGER_S)
+    if times == 9:
+        with pytest.raises(DatabaseError, match="did not come up"):
+            user.start()
+        assert len(ended.read_text().splitlines()) == 3
+        monkeypatch.delenv("HYBRIDLOG_MONGOD")
+    with user, MongoClient(user.start()) as client:
+        assert client.some.thing.count_documents({"kept": True}) == 1
+        assert user.damage is None
+
+
 @pytest.mark.parametrize(
     ("script", "error", "words"),
     [
@@ -594,7 +621,7 @@ def test_other_causes_leave_the_data_files_alone(
     data = marked(directory)
     with pytest.raises(error, match=told):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    assert starts.read_text() == "x\n"
+    assert starts.read_text() == "x\n" * (3 if "kill" in end else 1)
     assert (data / "WiredTiger.turtle").read_bytes() == b"old"
 
 
