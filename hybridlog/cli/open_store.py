@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,8 +27,9 @@ def opened_store(
     needs_database: bool = False,
     cache_mb: int | None = None,
     quiet: bool = False,
+    is_lasting: bool = False,
 ) -> Iterator[Store]:
-    """The open store.
+    """The open store; what a command asks is of one moment.
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
@@ -38,6 +39,8 @@ def opened_store(
         needs_database: Fail when MongoDB is unavailable.
         cache_mb: Size of the embedded MongoDB's cache in MiB.
         quiet: No progress while the index is brought up to date.
+        is_lasting: The command goes on while recordings change: each question is of its own
+            moment.
     """
     from hybridlog.store import open_store
 
@@ -54,7 +57,7 @@ def opened_store(
         )
     finally:
         bar.close()
-    with store:
+    with store, nullcontext() if is_lasting else store.at_one_moment():
         _print_repairs(store)
         try:
             yield store

@@ -171,4 +171,5 @@ def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
         needs_database=True,
         cache_mb=choices.cache_size,
         quiet=choices.quiet,
+        is_lasting=True,
     )

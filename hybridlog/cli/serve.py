@@ -89,7 +89,7 @@ def command(
 
     from hybridlog.playback.played import PlayedLog
 
-    with opened_store(store, mongo, quiet=quiet) as opened:
+    with opened_store(store, mongo, quiet=quiet, is_lasting=True) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
         log = PlayedLog(query)
         name = " ".join(["hybridlog", *choice.name])

@@ -62,7 +62,8 @@ def command(
     is_prompt = query is None and sys.stdin.isatty()
     if query is None and not is_prompt:
         query = sys.stdin.read()
-    with opened_store(store, mongo, quiet=quiet) as opened, ExitStack() as stack:
+    opening = opened_store(store, mongo, quiet=quiet, is_lasting=is_prompt)
+    with opening as opened, ExitStack() as stack:
         connection = opened.sql_engine.connect(most)
         stack.enter_context(limited_memory(connection.memory))
 

@@ -86,7 +86,9 @@ def command(
     with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
         database = None
         if fields:
-            opened = held.enter_context(opened_store(store, mongo, needs_database=True))
+            opened = held.enter_context(
+                opened_store(store, mongo, needs_database=True, is_lasting=True)
+            )
             database = opened.database_for("top --field")
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for raw in states(path, name, _EVERY_S):

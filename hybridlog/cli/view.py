@@ -75,7 +75,7 @@ def command(
         store = _only_store_near()
     if origins and not mcap:
         raise UsageError("--allow-origin is about --mcap: add that.")
-    with opened_store(store, mongo, quiet=as_json) as opened:
+    with opened_store(store, mongo, quiet=as_json, is_lasting=True) as opened:
         allowed = (*_FOXGLOVE, *origins) if mcap else ()
         server = ViewServer(opened, port, origins=allowed)
         url = server.url

@@ -1,0 +1,96 @@
+"""Every command about a recording that goes on, at rest and while segments are sealed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.cli import app, open_store
+from tests.cli.running import run
+from tests.cli.within import Answer, answer
+from tests.running.commands import COMMANDS, EXEMPT, Asked, place_for
+from tests.running.methods import LABEL, same
+from tests.running.running import NO_MONGODB, Running, begun
+from tests.running.sequence import Known
+
+EVERY = [one for rules in COMMANDS.values() for one in rules]
+
+
+def _id(one: Asked) -> str:
+    return " ".join(one.words)
+
+
+@pytest.fixture(scope="module", params=["one", "many"])
+def running(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Running]:
+    with begun(tmp_path_factory.mktemp("running") / "store", request.param) as found:
+        yield found
+
+
+def test_every_command_has_a_rule() -> None:
+    """A new command needs a rule, or a reason why it has none."""
+    assert sorted([*COMMANDS, *EXEMPT]) == sorted(app.COMMANDS)
+    assert all(EXEMPT.values())
+    assert all(one.words[0] == name for name, rules in COMMANDS.items() for one in rules)
+
+
+@pytest.mark.parametrize("mongo", ["", NO_MONGODB], ids=["mongodb", "without"])
+@pytest.mark.parametrize("one", EVERY, ids=_id)
+def test_at_rest(
+    running: Running, one: Asked, mongo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if mongo:
+        if one.words[0] in {"index", "reindex", "verify"}:
+            pytest.skip("needs MongoDB")
+        monkeypatch.setenv("HYBRIDLOG_MONGO_URI", mongo)
+    words, out = place_for(one.words, tmp_path / "out")
+    done = answer(*words, store=running.path, code=one.code)
+    found, wanted = one.read(done, out), one.right(running.flushed())
+    assert same(found, wanted), (found, wanted, done.err)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("one", EVERY, ids=_id)
+def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
+    words, out = place_for(one.words, tmp_path / "out")
+    done = run(*words, store=running.path, code=one.code)
+    found = one.read(Answer(done.out, done.err, done.code), out)
+    wanted = one.right(running.flushed())
+    assert same(found, wanted), (found, wanted, done.err)
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, int]]:
+    """What the recording has for each command, when it ends."""
+    found: list[dict[str, int]] = []
+    rebuilt = open_store._print_rebuilt
+
+    def look(store: hl.Store) -> None:
+        found.append(dict(store.entry(LABEL).messages_by_topic()))
+        rebuilt(store)
+
+    monkeypatch.setattr(open_store, "_print_rebuilt", look)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("one", EVERY, ids=_id)
+def test_while_segments_are_sealed(
+    running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
+) -> None:
+    """A command is of one state: what it sees at its end is what it has answered about."""
+    with running.writing(40, 0.004) as writing:
+        asked = 0
+        while writing.is_alive() or not asked:
+            words, out = place_for(one.words, tmp_path / "out")
+            before = running.before.entry(LABEL).messages_by_topic()
+            done = answer(*words, store=running.path, code=one.code)
+            assert all(seen[-1].get(topic, 0) >= count for topic, count in before.items())
+            known = Known(running.sent, seen[-1])
+            found, wanted = one.read(done, out), one.right(known)
+            assert same(found, wanted), (found, wanted, done.err)
+            asked += 1
