@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +36,7 @@ class Running:
     Attributes:
         sent: Messages written so far.
         step: The next step of the sequence.
+        times: When each step was written, by `monotonic`.
     """
 
     def __init__(self, recording: LiveRecording, store: hl.Store, before: hl.Store) -> None:
@@ -43,6 +45,7 @@ class Running:
         self.before = before
         self.sent: list[Sent] = []
         self.step = 0
+        self.times: list[float] = []
 
     @property
     def path(self) -> Path:
@@ -60,8 +63,13 @@ class Running:
                     publish_time=one.publish_time,
                 )
             self.step = step + 1
+            self.times.append(time.monotonic())
             if pause_s:
                 time.sleep(pause_s)
+
+    def written_before(self, time: float) -> int:
+        """The number of steps that were written by a time."""
+        return bisect_right(self.times, time)
 
     def lose(self) -> None:
         """Note three lost messages."""

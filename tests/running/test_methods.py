@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
+import json
+import time
+from collections.abc import Callable, Iterator
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.query.query import Query
-from tests.running.methods import EXEMPT_METHODS, METHODS, STORE, same
+from tests.running.methods import EXEMPT_METHODS, LABEL, METHODS, STORE, same
 from tests.running.running import NO_MONGODB, Running, begun
+from tests.running.sequence import Known
 
 SPECIAL = {"__iter__", "__getitem__", "__eq__", "__hash__", "__repr__"}
 PRIVATE = {"_repr_html_", "_ipython_key_completions_"}
@@ -61,3 +64,82 @@ def test_store_at_rest(running: Running, reader: hl.Store, name: str) -> None:
     rule = STORE[name]
     found, wanted = rule.ask(reader), rule.right(running.flushed())
     assert same(found, wanted), (found, wanted)
+
+
+def sent_of(store: hl.Store, running: Running) -> Known:
+    """What the recording has at the moment."""
+    return Known(running.sent, store.entry(LABEL).messages_by_topic())
+
+
+def check_all(store: hl.Store, running: Running) -> None:
+    """Ask everything in one block: all answers are of one moment."""
+    with store.at_one_moment():
+        known = sent_of(store, running)
+        for name, rule in [*METHODS.items(), *STORE.items()]:
+            found, wanted = rule.ask(store), rule.right(known)
+            assert same(found, wanted), (name, found, wanted)
+        assert sent_of(store, running).counts == known.counts
+
+
+def test_one_moment_while_segments_are_sealed(running: Running) -> None:
+    """The block sees one state of the recording, whatever is sealed meanwhile."""
+    segments = running.before.entry(LABEL).segments
+    with running.writing(30, 0.01) as writing, hl.open(running.path, mongo=NO_MONGODB) as store:
+        while writing.is_alive():
+            check_all(store, running)
+    running.flushed()
+    check_all(running.before, running)
+    assert running.before.entry(LABEL).segments > segments or not segments > 3
+
+
+CALLS: dict[str, Callable[[hl.Store], list[int]]] = {
+    "rows": lambda s: [json.loads(m.raw)["n"] for m in s.topic("said")],
+    "fields": lambda s: [m.fields["n"] for m in s.topic("said").where("n >= 0")],  # type: ignore[misc]
+    "frame": lambda s: s.topic("said").to_pandas()["n"].tolist(),
+    "table": lambda s: s.topic("said").where("x > -1000").to_arrow().column("n").to_pylist(),
+    "tables": lambda s: [
+        n for table in s.topic("said").to_tables() for n in table.column("n").to_pylist()
+    ],
+    "lines": lambda s: [
+        json.loads(line)["n"] for lines in s.topic("said").to_json_lines() for line in lines
+    ],
+    "count": lambda s: [*range(s.topic("said").count())],
+    "count where": lambda s: [*range(s.topic("said").where("n >= 0").count())],
+    "count in time": lambda s: [*range(s.topic("said").between("start", "end").count())],
+    "intervals": lambda s: [
+        *range(sum(one.messages for one in s.topic("said").where("n >= 0").intervals()))
+    ],
+    "rate": lambda s: [*range(s.topic("said").rate().column("messages").to_pylist()[0])],
+    "stats": lambda s: [*range(s.topic("said").stats("n")[0].count)],
+    "resample": lambda s: [
+        *range(sum(s.topic("said").resample("1s", "count").to_arrow().column("count").to_pylist()))
+    ],
+    "sql": lambda s: [n for (n,) in s.sql("select n from said").rows()],
+    "entry": lambda s: [*range(s.entry(LABEL).messages_by_topic()["/said"])],
+    "synced": lambda s: [
+        json.loads(one.raw)["n"]
+        for one, _ in s.sync([s.topic("said"), s.topic("said").where("n >= 0")], clock="log")
+    ],
+}
+"""The numbers of the messages of `/said`, from one call; a count stands for the first ones."""
+MAX_BEHIND_S = 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mongo", [None, NO_MONGODB], ids=["mongodb", "without"])
+def test_each_call_while_segments_are_sealed(running: Running, mongo: str | None) -> None:
+    """Each answer is a beginning of the sequence, without a gap, and at most 2 s short."""
+    with hl.open(running.path, mongo=mongo) as store:
+        with running.writing(250, 0.02) as writing:
+            while writing.is_alive():
+                for name, call in CALLS.items():
+                    begun = time.monotonic()
+                    behind = running.recording.filled  # a busy machine writes late
+                    found = sorted(call(store))
+                    assert found == [*range(len(found))], (name, found)
+                    assert len(found) <= running.step
+                    due = running.written_before(begun - MAX_BEHIND_S)
+                    assert len(found) >= due or behind > 0, (name, len(found), due)
+        running.flushed()
+        for name, call in CALLS.items():
+            assert sorted(call(store)) == [*range(running.step)], name
