@@ -142,7 +142,9 @@ class _Placed(NamedTuple):
     @classmethod
     def of(cls, parts: Parts, edges: NDArray[np.int64]) -> _Placed:
         """Parts in a picture."""
-        low, high = (np.searchsorted(edges, t, "right") - 1 for t in (parts.first, parts.last))
+        low, high = (
+            np.searchsorted(edges, placed(t), "right") - 1 for t in (parts.first, parts.last)
+        )
         return cls(parts, low, high)
 
     @property

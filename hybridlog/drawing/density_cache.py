@@ -20,6 +20,7 @@ from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog.drawing.density import MOST_WORK, Density, count, reading_work
 from hybridlog.drawing.silence import sampled_period
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.stopping import held
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,7 +87,7 @@ class DensityCache:
             TopicError: The recording has no such topic.
         """
         recorded = self._of(recording)
-        with recorded.lock:
+        with held(recorded.lock):
             return recorded.density(recording, span, pixels, topics)
 
     def periods(
@@ -100,7 +101,7 @@ class DensityCache:
             topics: Full names.
         """
         recorded = self._of(recording)
-        with recorded.lock:
+        with held(recorded.lock):
             return [recorded.period(recording, span, topic) for topic in topics]
 
     def _of(self, recording: RecordingEntry) -> _Recorded:

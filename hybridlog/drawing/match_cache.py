@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.drawing.matches import AskedMatches, Matches, Rows
+from hybridlog_storage.stopping import held
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -75,7 +77,7 @@ class KeptMatches:
 
     def count_until(self, end: int) -> int:
         """See `Matches`."""
-        return int(np.searchsorted(self._times, end))
+        return len(self._times) if end == END else int(np.searchsorted(self._times, end))
 
 
 _Answer = tuple[KeptMatches | None]
@@ -100,7 +102,7 @@ class MatchCache:
         found = self._known(key)
         if found is None:
             # A second client that asks the same waits, which takes no longer than to ask itself.
-            with self._asking:
+            with held(self._asking):
                 found = self._known(key) or (KeptMatches.of(ask()),)
                 with self._lock:
                     self._kept[key] = found

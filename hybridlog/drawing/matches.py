@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 import numpy as np
 
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.times import placed, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -124,7 +125,7 @@ def ticks(matches: Matches, span: Span, pixels: int) -> Ticks:
     first = np.full(pixels, np.iinfo(np.int64).max)
     for found, _ in matches.rows(*span):
         place, begins, count = np.unique(
-            (found - span[0]) // width, return_index=True, return_counts=True
+            (placed(found) - span[0]) // width, return_index=True, return_counts=True
         )
         counts[place] += count
         first[place] = np.minimum(first[place], found[begins])
@@ -191,7 +192,7 @@ def matches_after(matches: Matches, place: Match, count: int) -> list[Match]:
 def matches_before(matches: Matches, place: Match, count: int) -> list[Match]:
     """The last matches in front of a place, in order; see `matches_after`."""
     found: list[Match] = []
-    end = place.time + 1
+    end = span_of(place.time, place.time)[1]
     for begin in _earlier(place.time):
         earlier: deque[Match] = deque(maxlen=count - len(found))
         for times, seqs in matches.rows(begin, end):
@@ -207,9 +208,11 @@ def matches_before(matches: Matches, place: Match, count: int) -> list[Match]:
 
 def count_before(matches: Matches, place: Match) -> int:
     """Number of matches in front of a place; see `matches_after`."""
-    count = matches.count_until(place.time)
-    for _, seqs in matches.rows(place.time, place.time + 1):
-        count += int(np.count_nonzero(seqs < place.seq))
+    low, high = span_of(place.time, place.time)
+    count = matches.count_until(low)
+    for times, seqs in matches.rows(low, high):
+        in_front = (times < place.time) | ((times == place.time) & (seqs < place.seq))
+        count += int(np.count_nonzero(in_front))
     return count
 
 

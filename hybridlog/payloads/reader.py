@@ -18,6 +18,7 @@ from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import journal
 from hybridlog_storage.directory import PAYLOADS
 from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -127,6 +128,7 @@ class PayloadReader:
         Raises:
             StoreError: They are damaged.
         """
+        check_wanted()
         return self.file.read(group, self.leaves(columns))
 
     def columns_of(self, kind: Any) -> list[str] | None:

@@ -21,6 +21,7 @@ import numpy as np
 from hybridlog.query.counters import Counters
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
+from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches
 
 if TYPE_CHECKING:
@@ -261,6 +262,7 @@ class ChunkScan:
                 loading.append((item[0], start(*item)))
             if not loading:
                 return
+            check_wanted()
             run, size, unreadable = loading.popleft()[1].result()
             counters.chunks_read += 1
             counters.bytes_read += size

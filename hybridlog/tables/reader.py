@@ -39,6 +39,7 @@ from hybridlog.tables.layout import (
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import files
 from hybridlog_storage.errors import StoreError, exhausted
+from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
 
 if TYPE_CHECKING:
@@ -278,6 +279,7 @@ class TopicTable:
         Raises:
             StoreError: the data read is damaged.
         """
+        check_wanted()
         leaves = self._leaves[part.file.number]
         by_top: dict[str, list[int]] = {}
         for number in self._chosen(part.file, paths, own):

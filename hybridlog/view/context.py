@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
 
@@ -20,8 +22,9 @@ from hybridlog.export.slice_cache import SliceCache
 from hybridlog.losses import extent_of
 from hybridlog.view.asked import Asked
 from hybridlog.view.sql_process import SqlProcess
-from hybridlog_storage.errors import HybridlogError, TopicError
+from hybridlog_storage.errors import HybridlogError, ResourceError, TopicError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.stopping import GivenUpError, held, until_given_up
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -49,13 +52,15 @@ class Context:
 
     Attributes:
         store: That store.
+        turns: Held by each answer that is worked out.
     """
 
     def __init__(self, store: Store) -> None:
         self.store = store
         self._refreshing = threading.Lock()
-        self._next_look = time.monotonic() + REFRESH_S
-        self._working = threading.BoundedSemaphore(MAX_WORKING)
+        self._looked = time.monotonic()
+        self._took = 0.0
+        self.turns = threading.BoundedSemaphore(MAX_WORKING)
 
     @lazy
     def densities(self) -> DensityCache:
@@ -77,24 +82,15 @@ class Context:
         """MCAP files of selections."""
         return SliceCache()
 
-    @contextmanager
-    def turn(self) -> Iterator[None]:
-        """Wait until few enough answers are being worked out, and be one of them.
-
-        The answer is about the recordings of one moment.
-        """
-        with self._working, self.store.at_one_moment():
-            yield
-
-    def refresh(self) -> None:
+    def refresh(self, least_s: float = REFRESH_S) -> None:
         """See what other processes have recorded since, unless the last look was just now."""
         with self._refreshing:
             begun = time.monotonic()
-            if begun >= self._next_look:
+            if begun >= self._looked + max(least_s, self._took / REFRESH_SHARE):
                 self.store.refresh()
                 self.store.session.snapshot()
-                ended = time.monotonic()
-                self._next_look = ended + max(REFRESH_S, (ended - begun) / REFRESH_SHARE)
+                self._looked = time.monotonic()
+                self._took = self._looked - begun
 
     def recording(self, asked: Asked) -> RecordingEntry:
         """The recording that the parameter `recording` names by its label or id.
@@ -103,7 +99,11 @@ class Context:
             TopicError: There is none.
             UsageError: The parameter is missing.
         """
-        return self.store.entry(asked.text("recording"))
+        name = asked.text("recording")
+        with suppress(TopicError):
+            return self.store.entry(name)
+        self.refresh(0.0)  # it may be new
+        return self.store.entry(name)
 
     def query(self, recording: RecordingEntry, *topics: str) -> Query:
         """A query about topics, by their full names, of one recording.
@@ -144,25 +144,49 @@ Answer: TypeAlias = "Callable[[Context, Asked], Any]"
 """Works out an answer: plain values, which become JSON, or a response."""
 
 
-def route(path: str, answer: Answer) -> Route:
-    """A route that answers in a thread, when it is its turn.
+def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -> Route:
+    """A route that answers in a thread when it is its turn, and stops when the client has gone.
 
     Args:
         path: Path below the token.
         answer: Works out the answer.
+        turns: Held by the answer in the place of the context's.
     """
 
-    def endpoint(request: Request) -> Response:
+    def answered(request: Request, given_up: threading.Event) -> Response:
         context: Context = request.app.state.context
+        asked = Asked(request.query_params, request.headers.get("if-none-match"))
         try:
-            with context.turn():
-                tag = request.headers.get("if-none-match")
-                found = answer(context, Asked(request.query_params, tag))
+            with (
+                until_given_up(given_up),
+                held(turns or context.turns),
+                context.store.at_one_moment(),
+            ):
+                found = answer(context, asked)
             return found if isinstance(found, Response) else json_response(found)
         except HybridlogError as error:
             return error_response(error)
+        except GivenUpError:
+            return error_response(ResourceError("The query was stopped."))
+
+    async def endpoint(request: Request) -> Response:
+        given_up = threading.Event()
+        watching = asyncio.create_task(_wait_until_gone(request, given_up))
+        try:
+            return await run_in_threadpool(answered, request, given_up)
+        finally:
+            given_up.set()
+            watching.cancel()
+            with suppress(asyncio.CancelledError):
+                await watching
 
     return Route(path, endpoint, name=path)
+
+
+async def _wait_until_gone(request: Request, given_up: threading.Event) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+    given_up.set()
 
 
 def json_response(values: Any, status: int = 200) -> Response:

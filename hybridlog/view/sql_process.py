@@ -13,6 +13,7 @@ from multiprocessing.reduction import send_handle
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from hybridlog_storage.errors import ResourceError
+from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
@@ -38,22 +39,20 @@ class SqlProcess:
         self._lock = threading.Lock()
         self._control: Connection[Any, Any] | None = None
 
-    def ask(self, work: Callable[..., _T], *arguments: Any, stopped: threading.Event) -> _T:
+    def ask(self, work: Callable[..., _T], *arguments: Any) -> _T:
         """Call a function of a module in the process.
 
         Args:
-            work: It gets a `Context` of the process, and an event that is set when nobody waits
-                for its answer any more.
+            work: It gets a `Context` of the process. It is given up when the caller is.
             arguments: Further arguments, and the answer, are pickled.
-            stopped: Set it to give the answer up.
 
         Raises:
-            ResourceError: It was stopped, or the process has ended twice.
+            ResourceError: The process has ended twice.
             HybridlogError: As the function raises it.
         """
         for _ in range(2):
             with suppress(EOFError, ConnectionError):
-                is_answer, found = self._asked((work, arguments), stopped)
+                is_answer, found = self._asked((work, arguments))
                 if is_answer:
                     return cast("_T", found)
                 raise found
@@ -62,7 +61,7 @@ class SqlProcess:
             "time, or ask in `hybridlog sql` with more --memory."
         )
 
-    def _asked(self, call: Any, stopped: threading.Event) -> Any:
+    def _asked(self, call: Any) -> Any:
         ours, theirs = Pipe()
         with ours:
             with theirs, self._lock:
@@ -73,8 +72,7 @@ class SqlProcess:
                     self._send(theirs)
             ours.send(call)
             while not ours.poll(_POLL_S):
-                if stopped.is_set():
-                    raise ResourceError("The query was stopped.")
+                check_wanted()
             return ours.recv()
 
     def _send(self, theirs: Connection[Any, Any]) -> None:

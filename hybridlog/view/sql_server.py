@@ -15,6 +15,7 @@ from hybridlog.sql.duck import shortage_of
 from hybridlog.sql.memory_limit import OWN_MEMORY, limited_memory, private_bytes
 from hybridlog.view.context import SQL_MEMORY, Context
 from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.stopping import GivenUpError, until_given_up
 
 
 class _GivenUp(threading.Event):
@@ -55,14 +56,15 @@ def _opened(path: str, mongo: str | None) -> Context | HybridlogError:
 
 
 def _answer(context: Context | HybridlogError, asked: Connection[Any, Any]) -> None:
-    with asked, suppress(EOFError, ConnectionError):
+    with asked, suppress(EOFError, ConnectionError, GivenUpError):
         work, arguments = asked.recv()
         if isinstance(context, HybridlogError):
             asked.send((False, context))
             os._exit(1)  # the next one may be able to open it
         try:
             context.refresh()
-            answer = True, work(context, *arguments, _GivenUp(asked))
+            with until_given_up(_GivenUp(asked)):
+                answer = True, work(context, *arguments)
         except HybridlogError as error:
             answer = False, error
         except Exception as error:

@@ -57,6 +57,7 @@ from hybridlog_storage.segment_format import (
     messages_at,
     split_trailer,
 )
+from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -466,6 +467,7 @@ class SegmentReader:
 
         A segment is written again when chunks are moved. Numbers of chunks stay.
         """
+        check_wanted()
         try:
             return read(place)
         except SegmentError:

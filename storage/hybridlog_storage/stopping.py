@@ -1,10 +1,13 @@
-"""Points at which a signal may stop the process.
+"""Points at which a signal may stop the process, and an answer that nobody waits for ends.
 
 Python runs a signal handler between any two instructions of the main thread. An exception
 raised there can leave a lock of the standard library held for ever, such as that of a
 `Condition`, a `Future` or a pool. Threads that need it then never end, and cleanup waits for
 them. So work that shares locks with threads, or that must be taken back when it is stopped,
 runs in `at_safe_points`: handlers only note the signal, and `safe_point` raises.
+
+An answer that is worked out in a thread for a client runs in `until_given_up`. It ends where
+something is read next, by `check_wanted`, or while it waits for a lock, by `held`.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from typing import NoReturn, Self
 
 Action = Callable[[], NoReturn]
 """Raises the exception that stops the work."""
+_POLL_S = 0.05
 
 
 class Flag:
@@ -93,8 +97,53 @@ def is_delayed() -> bool:
     return _block is not None
 
 
+class GivenUpError(BaseException):
+    """Nobody waits for the answer. It is no `Exception`, so that nothing takes it for damage."""
+
+
+class _Answer(threading.local):
+    """The answer that a thread works out."""
+
+    given_up: threading.Event | None = None
+
+
+_answer = _Answer()
+
+
+@contextmanager
+def until_given_up(given_up: threading.Event) -> Iterator[None]:
+    """Work out an answer in this thread until the event is set.
+
+    Raises:
+        GivenUpError: It was set.
+    """
+    _answer.given_up = given_up
+    try:
+        yield
+    finally:
+        _answer.given_up = None
+
+
+def check_wanted() -> None:
+    """Raise `GivenUpError` if nobody waits for the answer of this thread."""
+    if _answer.given_up is not None and _answer.given_up.is_set():
+        raise GivenUpError
+
+
+@contextmanager
+def held(lock: threading.Lock | threading.Semaphore) -> Iterator[None]:
+    """Hold a lock. While the thread waits for it, its answer may be given up."""
+    while not lock.acquire(timeout=_POLL_S):
+        check_wanted()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def safe_point() -> None:
     """Raise what a signal asked for, if the block of this thread is to stop."""
+    check_wanted()
     block = _block
     if block is not None and block.action is not None and block.thread == threading.get_ident():
         action, block.action = block.action, None

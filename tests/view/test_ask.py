@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import shlex
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -198,21 +199,21 @@ def test_sql_is_bounded(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def asked_for(
-    app: Any, path: str, params: dict[str, Any], *, leaves_after: float
+    app: Any, path: str, params: dict[str, Any], *, leaves_after: float | threading.Event
 ) -> list[dict[str, Any]]:
-    """What the application says to a client that leaves, after seconds or a number of parts."""
+    """What is said to a client that leaves: after seconds, a number of parts, or an event."""
     with ThreadPoolExecutor(1) as pool:  # playwright has a loop in this thread
         return pool.submit(asyncio.run, _asked_for(app, path, params, leaves_after)).result()
 
 
 async def _asked_for(
-    app: Any, path: str, params: dict[str, Any], leaves_after: float
+    app: Any, path: str, params: dict[str, Any], leaves_after: float | threading.Event
 ) -> list[dict[str, Any]]:
     scope = {
         "type": "http",
         "method": "GET",
         "path": f"/{TOKEN}/{path}",
-        "query_string": urlencode(params).encode(),
+        "query_string": urlencode(params, doseq=True).encode(),
         "headers": [(b"host", f"127.0.0.1:{PORT}".encode())],
     }
     said: list[dict[str, Any]] = []
@@ -221,6 +222,9 @@ async def _asked_for(
     async def receive() -> dict[str, Any]:
         if isinstance(leaves_after, float):
             await asyncio.sleep(leaves_after)
+        elif isinstance(leaves_after, threading.Event):
+            while not leaves_after.is_set():
+                await asyncio.sleep(0.01)
         else:
             await heard.wait()
         return {"type": "http.disconnect"}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.view import context
+from hybridlog_storage.messages import Channel
+from tests.view.conftest import Asking, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -45,6 +48,20 @@ def test_a_row_says_what_the_store_says(client: TestClient, demo_store: hl.Store
 def test_conditions(client: TestClient, conditions: dict[str, str], found: int) -> None:
     answer = client.get("recordings", params=conditions).json()
     assert (answer["all"], answer["found"], len(answer["rows"])) == (1, found, found)
+
+
+def test_a_new_recording_is_found_by_its_name(tmp_path: Path, asking: Asking) -> None:
+    with hl.open(tmp_path / "store", create=True) as store, hl.open(tmp_path / "store") as other:
+        client = asking(other)
+        assert client.get("recordings").json()["all"] == 0
+        for label in ("first", "second"):
+            with store.start(label) as recording:
+                recording.write(Channel("/a", "raw", None), b"", log_time=1)
+            answer = client.get("recording", params={"recording": label})
+            assert answer.json()["messages"] == 1
+            named = {"recording": label, "topic": "/a", "at": 0}
+            assert client.get("message", params=named).json()["time"] == "0"
+        assert client.get("recording", params={"recording": "third"}).status_code == 404
 
 
 @pytest.mark.parametrize(
@@ -128,3 +145,19 @@ def test_a_recording_is_found_and_opened(page: Page, demo_url: str) -> None:
     assert "#recording=robot" in page.url
     page.go_back()
     page.wait_for_selector("text=1 recording:")
+
+
+@pytest.mark.peer("browser")
+def test_a_new_recording_comes_into_the_list(page: Page, tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store, hl.open(tmp_path / "store") as other:
+        with served(other) as url:
+            page.goto(url)
+            page.get_by_text("The store is empty").wait_for()
+            with store.start("new") as recording:
+                recording.write(Channel("/a", "raw", None), b"", log_time=1)
+            row = page.get_by_role("link", name="new", exact=True)
+            row.focus()
+            with store.start("newer") as recording:
+                recording.write(Channel("/a", "raw", None), b"", log_time=1)
+            page.get_by_role("link", name="newer").wait_for()
+            assert row.evaluate("link => link === document.activeElement")

@@ -15,7 +15,7 @@ from tests.view.test_timeline import picture_of
 
 MS = 10**6
 LAST = 2**63 - 1
-"""The last time: a message of it is in no interval."""
+"""The last time that can be written."""
 FAR = 2 * 10**18 + 2**62
 COUNT = 300
 TIMES: Mapping[str, list[int]] = {
@@ -43,20 +43,19 @@ def client(tmp_path_factory: pytest.TempPathFactory, asking: Asking) -> Iterator
 def test_pictures_at_the_ends_of_time(client: TestClient, label: str) -> None:
     times = TIMES[label]
     start, behind = times[0], times[-1] - times[0] + 1
-    inside = [n for n, time in enumerate(times) if time < LAST]
     asked = {"recording": label, "topic": "/v", "pixels": 100}
     for span in (EVERYTHING, {"begin": -start, "end": min(behind, LAST)}):
         drawn = picture_of(client, {**asked, **span})
-        assert int(drawn.lanes[0].counts.sum()) == len(inside)
+        assert int(drawn.lanes[0].counts.sum()) == COUNT
         rest = {**asked, **span, "pixels": 20}
         (series,) = client.get("series", params={**rest, "field": "v"}).json()["fields"]
         assert min(v for v in series["least"] if v is not None) == 0
-        assert max(v for v in series["greatest"] if v is not None) == inside[-1]
+        assert max(v for v in series["greatest"] if v is not None) == COUNT - 1
         for where in ("v > 9", "a[1] < -9"):
             found = client.get("matches", params={**rest, "where": where})
-            assert sum(found.json()["counts"]) == len(inside) - 10
+            assert sum(found.json()["counts"]) == COUNT - 10
         found = client.get("export-command", params={**span, "recording": label})
-        assert found.json()["count"] == len(inside)
+        assert found.json()["count"] == COUNT
 
 
 def test_pixels_of_late_years(client: TestClient) -> None:
@@ -77,4 +76,11 @@ def test_messages_at_the_ends_of_time(client: TestClient, label: str) -> None:
         found = client.get("message", params={**asked, "at": at[n]}).json()
         assert (found["time"], found["until"]) == (str(at[n]), str(at[n + 1]))
     rows = client.get("match-list", params={**asked, "where": "v > 5", "at": at[-2], "count": 9})
-    assert rows.status_code == 200
+    assert [int(time) for time, _ in rows.json()["rows"]] == at[-2:]
+    assert rows.json()["before"] == COUNT - 8
+    asked = {**asked, "where": "v > 5", "at": at[-1], "seq": 2**62, "direction": "earlier"}
+    rows = client.get("match-list", params={**asked, "count": 1}).json()
+    assert (rows["rows"][0][0], rows["before"]) == (str(at[-1]), COUNT - 7)
+    text = f"select t, v from v where recording = '{label}' order by t desc limit 2"
+    found = client.get("sql", params={"text": text}).json()
+    assert found["at"] == [str(at[-1]), str(at[-2])]

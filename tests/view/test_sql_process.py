@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from hybridlog.sql.memory_limit import OWN_MEMORY
 from hybridlog.view.context import SQL_MEMORY
 from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import HybridlogError, ResourceError, StoreError
+from hybridlog_storage.stopping import GivenUpError, check_wanted, until_given_up
 from tests.imports import ROOT
 
 if TYPE_CHECKING:
@@ -31,44 +31,45 @@ START = 400 << 20  # what the process has before its first query, and files that
 reserved: list[Any] = []
 
 PAGE = """
-import sys, threading
+import sys
 import hybridlog as hl
 from hybridlog.view.sql_process import SqlProcess
 from tests.view.test_sql_process import pid, wait
 
 if __name__ == "__main__":
     process = SqlProcess(hl.open(sys.argv[1]))
-    print(process.ask(pid, stopped=threading.Event()), flush=True)
-    process.ask(wait, stopped=threading.Event())
+    print(process.ask(pid), flush=True)
+    process.ask(wait)
 """
 
 
 # In the process.
 
 
-def pid(_context: object, _stopped: object) -> int:
+def pid(_context: object) -> int:
     return os.getpid()
 
 
-def peak(_context: object, _stopped: object) -> int:
+def peak(_context: object) -> int:
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) << 10
 
 
-def wait(_context: object, stopped: threading.Event) -> None:
-    while not stopped.is_set():
+def wait(_context: object) -> None:
+    while True:
+        check_wanted()
         time.sleep(0.01)
 
 
-def reserve(_context: object, _stopped: object) -> None:
+def reserve(_context: object) -> None:
     reserved.append(np.empty(SQL_MEMORY + OWN_MEMORY * 3 // 4, np.uint8))
 
 
-def end(_context: object, _stopped: object) -> None:
+def end(_context: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def refuse(_context: object, _stopped: object) -> None:
+def refuse(_context: object) -> None:
     raise HybridlogError("no")
 
 
@@ -78,10 +79,6 @@ def refuse(_context: object, _stopped: object) -> None:
 @pytest.fixture
 def process(demo_store: hl.Store) -> SqlProcess:
     return SqlProcess(demo_store)
-
-
-def asked(process: SqlProcess, work: Callable[..., Any]) -> Any:
-    return process.ask(work, stopped=threading.Event())
 
 
 def assert_ends(number: int) -> None:
@@ -108,54 +105,55 @@ def test_a_query_takes_no_more_than_it_may(client: TestClient, demo_store: hl.St
         assert rows("select count(*) from scan")["rows"] == [
             [str(demo_store.topic("/base/scan").count())]
         ]
-    assert asked(process_of(client), peak) < SQL_MEMORY + OWN_MEMORY + START
+    assert process_of(client).ask(peak) < SQL_MEMORY + OWN_MEMORY + START
     assert psutil.Process().memory_info().rss - before < 200 << 20
 
 
 def test_all_questions_share_one_process(process: SqlProcess) -> None:
-    number = asked(process, pid)
+    number = process.ask(pid)
     stopped = threading.Event()
     problems: list[BaseException] = []
 
     def ask() -> None:
         try:
-            process.ask(wait, stopped=stopped)
-        except ResourceError as error:
+            with until_given_up(stopped):
+                process.ask(wait)
+        except GivenUpError as error:
             problems.append(error)
 
     thread = threading.Thread(target=ask)
     thread.start()
     try:
-        assert asked(process, pid) == number != os.getpid()
+        assert process.ask(pid) == number != os.getpid()
     finally:
         stopped.set()
         thread.join()
-    assert "was stopped" in str(problems[0])
+    assert len(problems) == 1
     with pytest.raises(HybridlogError, match="no"):
-        asked(process, refuse)
-    assert asked(process, pid) == number
+        process.ask(refuse)
+    assert process.ask(pid) == number
 
 
 def test_a_process_that_has_ended_is_started_again(process: SqlProcess) -> None:
-    number = asked(process, pid)
+    number = process.ask(pid)
     os.kill(number, signal.SIGKILL)
-    again = asked(process, pid)
+    again = process.ask(pid)
     assert again != number
     with pytest.raises(ResourceError, match="ask for less"):
-        asked(process, end)
-    assert asked(process, pid) not in {number, again}
+        process.ask(end)
+    assert process.ask(pid) not in {number, again}
 
 
 def test_a_process_whose_memory_is_reserved_is_replaced(process: SqlProcess) -> None:
-    number = asked(process, pid)
-    asked(process, reserve)
-    assert asked(process, pid) != number
+    number = process.ask(pid)
+    process.ask(reserve)
+    assert process.ask(pid) != number
     assert_ends(number)
 
 
 def test_it_ends_with_its_page(demo_store: hl.Store) -> None:
     process = SqlProcess(demo_store)
-    number = asked(process, pid)
+    number = process.ask(pid)
     del process
     assert_ends(number)
     page = subprocess.Popen(
@@ -176,6 +174,6 @@ def test_a_store_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
         process = SqlProcess(store)
         (tmp_path / "store").rename(tmp_path / "elsewhere")
         with pytest.raises(StoreError, match="no such directory"):
-            asked(process, pid)
+            process.ask(pid)
         (tmp_path / "elsewhere").rename(tmp_path / "store")
-        assert asked(process, pid) != os.getpid()
+        assert process.ask(pid) != os.getpid()

@@ -221,7 +221,8 @@ def test_a_recording_that_goes_on_is_followed(
 
     write(recording, A, 0, 50)
     (topic,) = wait_for(50)["topics"]
-    assert (topic["topic"], topic["messages"], topic["last"]) == ("/a", 50, 49 * SECOND // 100)
+    assert (topic["topic"], topic["messages"]) == ("/a", 50)
+    assert topic["last"] == str(49 * SECOND // 100)
     with served(store) as url:
         page.goto(f"{url}#recording=live&panels=[]")
         page.wait_for_selector("text=being recorded")
@@ -272,7 +273,7 @@ def test_an_answer_is_of_one_moment_on_any_thread(
     sent = store.session.all_at_one_moment(steps())
     shown = Context(store)
     with ThreadPoolExecutor(1) as pool:
-        with shown.turn():
+        with shown.store.at_one_moment():
             assert store.entry("live").messages == next(sent) == 50
             write(recording, A, 50, 50)
             pool.submit(wait_for, 100).result()

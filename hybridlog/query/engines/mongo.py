@@ -17,6 +17,7 @@ from hybridlog.schema.column import STAMP
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import DatabaseError, IndexChangedError
 from hybridlog_storage.index_columns import KEY, REFERENCE, key_columns, reference_columns
+from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
@@ -389,6 +390,7 @@ class Mongo:
             place.collection, asked, KEY, sort=[("_id", 1)], batch_size=_BATCH
         )
         for raw in found:
+            check_wanted()
             keys = key_columns(raw)
             self._counters.documents_read += len(keys)
             if len(keys):

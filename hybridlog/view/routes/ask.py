@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -22,13 +22,12 @@ from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
-from hybridlog.query.times import TIME_LIMIT
 from hybridlog.query.topics import resolve
 from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
 from hybridlog.view.question import program, question_of
-from hybridlog.view.stopping import stoppable_route
 from hybridlog_storage.distinct import distinct
-from hybridlog_storage.errors import HybridlogError, ResourceError, TopicError
+from hybridlog_storage.errors import HybridlogError, TopicError
+from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -47,9 +46,6 @@ SQL_ROWS: Final = 1000
 _SQL_BYTES: Final = 32 << 20
 SQL_COLUMNS: Final = 200
 _MAX_CANDIDATES: Final = 50
-_POLL_S: Final = 0.1
-
-_sql_turns = threading.BoundedSemaphore(2)
 
 
 def ask(context: Context, asked: Asked) -> dict[str, Any]:
@@ -89,7 +85,7 @@ def match_list(context: Context, asked: Asked) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
     question = question_of(context, asked)
     start = start_of(question.recording)
-    place = Match(asked.moment(start), asked.integer("seq", -1, TIME_LIMIT - 1, -1))
+    place = Match(asked.moment(start), asked.integer("seq", -1, END, -1))
     count = asked.integer("count", 1, MAX_LISTED, MAX_LISTED)
     find = {"later": matches_after, "earlier": matches_before}
     asked_for = _matches(context, question)
@@ -114,7 +110,7 @@ def completion(context: Context, asked: Asked) -> dict[str, Any]:
     text = asked.text("text", "", longest=MAX_TEXT)
     place = min(asked.integer("place", 0, MAX_TEXT), len(text))
     if asked.word("language", ("predicate", "sql"), "predicate") == "sql":
-        return context.sql.ask(sql_completion, text, place, stopped=threading.Event())
+        return context.sql.ask(sql_completion, text, place)
     recording = context.recording(asked)
     own = asked.text("topic")
     topics = {channel.topic for channel in recording.channels}
@@ -135,7 +131,7 @@ def completion(context: Context, asked: Asked) -> dict[str, Any]:
     return {"begin": found.begin, "candidates": offered}
 
 
-def sql_completion(context: Context, text: str, place: int, _: threading.Event) -> dict[str, Any]:
+def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
     """Candidates for completing SQL, worked out in the process for SQL."""
     from hybridlog.sql.completion import candidates, word_before
 
@@ -149,21 +145,17 @@ def sql_completion(context: Context, text: str, place: int, _: threading.Event) 
     return {"begin": place - len(word), "candidates": offered}
 
 
-def sql(context: Context, asked: Asked, stopped: threading.Event) -> dict[str, Any]:
+def sql(context: Context, asked: Asked) -> dict[str, Any]:
     """The first rows of a query in SQL."""
     text = asked.text("text", longest=MAX_TEXT)
-    with _sql_turn(stopped):
-        return context.sql.ask(sql_answer, text, SQL_SECONDS, stopped=stopped)
+    return context.sql.ask(sql_answer, text, SQL_SECONDS)
 
 
-def sql_answer(
-    context: Context, text: str, seconds: float, stopped: threading.Event
-) -> dict[str, Any]:
+def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
     """The first rows of a query, worked out in the process for SQL."""
     from hybridlog.sql.shown import shown
 
     connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
-    connection.stopped = stopped
     try:
         answer = connection.query(text, timeout=seconds)
         table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
@@ -210,30 +202,17 @@ def _messages_in(
     context: Context, entry: RecordingEntry, topics: Collection[str], spans: Sequence[range]
 ) -> list[int | None]:
     """The only log time of messages of some topics in each span, ns; None for none or several."""
-    last = TIME_LIMIT - 1
-    bounds = np.array(
-        [[min(max(time, 0), last) for time in (one.start, one.stop)] + [0] for one in spans],
-        np.int64,
-    ).reshape(-1, 3)
+    ends = [[min(max(time, BEGIN), END) for time in (one[0], one[-1])] for one in spans]
+    bounds = np.array([(*span_of(*pair), 0) for pair in ends], np.int64).reshape(-1, 3)
     own = {channel.topic for channel in entry.channels}
     query = context.store.query(sorted(own & {*topics} or own), [entry.id])
     asked = query.during(Intervals.of([(entry.id, bounds)]))
     known = distinct(
         np.concatenate([one.log_time for one in asked.match_times()] or [bounds[0:0, 0]])
     )
-    low, high = np.searchsorted(known, bounds[:, :2]).T
-    return [int(known[a]) if b - a == 1 else None for a, b in zip(low, high, strict=True)]
-
-
-@contextmanager
-def _sql_turn(stopped: threading.Event) -> Iterator[None]:
-    while not _sql_turns.acquire(timeout=_POLL_S):
-        if stopped.is_set():
-            raise ResourceError("The query was stopped.")
-    try:
-        yield
-    finally:
-        _sql_turns.release()
+    first, last = np.array(ends, np.int64).reshape(-1, 2).T
+    places = zip(np.searchsorted(known, first), np.searchsorted(known, last, "right"), strict=True)
+    return [int(known[low]) if high - low == 1 else None for low, high in places]
 
 
 routes = [
@@ -241,5 +220,5 @@ routes = [
     route("/matches", matches),
     route("/match-list", match_list),
     route("/complete", completion),
-    stoppable_route("/sql", sql),
+    route("/sql", sql, threading.BoundedSemaphore(2)),
 ]

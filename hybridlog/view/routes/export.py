@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
+import asyncio
+from collections.abc import AsyncIterator, Generator
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeAlias, cast
+
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import StreamingResponse
 
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.view.context import Context, route, start_of
 from hybridlog.view.question import PageQuestion
-from hybridlog.view.stopping import Pieces, file_response
 
 if TYPE_CHECKING:
     from starlette.responses import Response
@@ -20,6 +24,11 @@ MAX_TOPICS: Final = 200
 """Greatest number of topics that are named; without any, all are meant."""
 PIECE: Final = 256 << 10
 """Least size of a piece that is sent, bytes."""
+MAX_STREAMS: Final = 4
+"""Number of files that are sent at once; others wait for their turn."""
+
+Pieces: TypeAlias = "Generator[bytes, None, None]"
+_streams = asyncio.Semaphore(MAX_STREAMS)
 
 
 def command(context: Context, asked: Asked) -> dict[str, Any]:
@@ -52,7 +61,7 @@ def mcap_response(query: Query, name: str) -> Response:
     """
     pieces = query.session.all_at_one_moment(pieces_of(query))
     # Most errors come before the first piece, and can still be told.
-    return file_response(_with(next(pieces), pieces), name)
+    return _file_response(_with(next(pieces), pieces), name)
 
 
 def _with(first: bytes, rest: Pieces) -> Pieces:
@@ -61,6 +70,26 @@ def _with(first: bytes, rest: Pieces) -> Pieces:
         yield from rest
     finally:
         rest.close()
+
+
+def _file_response(pieces: Pieces, name: str) -> Response:
+    """A file that is made while it is sent; nothing more is made when the client has gone.
+
+    Args:
+        pieces: Its bytes, none of them empty.
+        name: Its name, of plain characters.
+    """
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(_sent(pieces), headers=headers, media_type="application/octet-stream")
+
+
+async def _sent(pieces: Pieces) -> AsyncIterator[bytes]:
+    try:
+        async with _streams:
+            while piece := await run_in_threadpool(next, pieces, b""):
+                yield piece
+    finally:
+        pieces.close()
 
 
 def _question(context: Context, asked: Asked) -> PageQuestion:

@@ -3,15 +3,12 @@
 /** An answer that is an error; `message` may have several lines, with a caret in the last. */
 export class ApiError extends Error {}
 
-const running = new Map();
-
 /**
  * An answer as JSON.
  *
  * @param {string} path such as `recordings`
  * @param {Object} [parameters] lists are repeated; null and undefined are left out
- * @param {{slot?: string, signal?: AbortSignal}} [options] a newer request of the same slot aborts
- *     an older one, which then throws an `AbortError`
+ * @param {{signal?: AbortSignal}} [options] when it is aborted, this throws an `AbortError`
  */
 export async function get(path, parameters = {}, options = {}) {
   return request(path, parameters, options, (response) => response.json());
@@ -35,23 +32,46 @@ export function address(path, parameters = {}) {
 }
 
 /** What `read` makes of the response, whose status is 200; until then, it can be aborted. */
-export async function request(path, parameters = {}, { slot, signal } = {}, read = (all) => all) {
-  const own = new AbortController();
-  signal?.addEventListener("abort", () => own.abort());
-  if (slot) {
-    running.get(slot)?.abort();
-    running.set(slot, own);
-  }
+export async function request(path, parameters = {}, { signal } = {}, read = (all) => all) {
   try {
-    const response = await fetch(address(path, parameters), { signal: own.signal });
+    const response = await fetch(address(path, parameters), { signal });
     if (response.ok) return await read(response);
     const text = await response.text();
     throw new ApiError(messageOf(text) || `The server answered ${response.status}.`);
   } catch (error) {
     if (error instanceof TypeError) throw new ApiError("The server does not answer: has it ended?");
     throw error;
-  } finally {
-    if (slot && running.get(slot) === own) running.delete(slot);
+  }
+}
+
+/** Questions of one kind, of which only the newest matters. Those before throw an `AbortError`. */
+export class Question {
+  #stop = new AbortController();
+  #answer = Promise.resolve();
+  #newest = 0;
+
+  /** Asks, by `get` or `bytes`, and gives up what is under way. */
+  ask(path, parameters, by = get) {
+    this.stop();
+    return this.update(path, parameters, by);
+  }
+
+  /** Asks the same of a recording that has gone on, once what is under way is answered. */
+  async update(path, parameters, by = get) {
+    const { signal } = this.#stop;
+    const own = (this.#newest += 1);
+    await this.#answer;
+    if (signal.aborted || own !== this.#newest) throw new DOMException("Given up", "AbortError");
+    const answer = by(path, parameters, { signal });
+    this.#answer = answer.catch(() => {});
+    return answer;
+  }
+
+  /** Gives up what is under way: it stops on the server, too. */
+  stop() {
+    this.#stop.abort();
+    this.#stop = new AbortController();
+    this.#answer = Promise.resolve();
   }
 }
 

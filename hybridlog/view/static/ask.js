@@ -1,6 +1,6 @@
 /** The bar that takes questions, and below it their answers. */
 
-import { ApiError, get, isAborted } from "./api.js";
+import { ApiError, Question, isAborted } from "./api.js";
 import { completed, questionHistory } from "./completion.js";
 import { element, fill, notice } from "./dom.js";
 import { exportForm } from "./export.js";
@@ -68,7 +68,7 @@ export function mountAsk(main, recording) {
     button("Export", "Export this range or the matches", files.toggle),
   );
   let python = "";
-  let asking = new AbortController();
+  const asking = new Question();
   const place = element(
     "section",
     { class: "ask", "aria-label": "Questions" },
@@ -89,7 +89,7 @@ export function mountAsk(main, recording) {
   answer();
   return () => {
     ends.forEach((end) => end());
-    asking.abort();
+    asking.stop();
     list.destroy();
     files.destroy();
     document.removeEventListener("keydown", key);
@@ -130,9 +130,7 @@ export function mountAsk(main, recording) {
 
   /** Asks the question of the state. */
   async function answer() {
-    asking.abort();
-    asking = new AbortController();
-    const { signal } = asking;
+    asking.stop();
     const question = state.get("ask");
     list.show(null);
     steps.hidden = true;
@@ -145,8 +143,8 @@ export function mountAsk(main, recording) {
     }
     write(question);
     try {
-      if (question.kind === "sql") await answerSql(question, signal);
-      else await answerPredicate(signal);
+      if (question.kind === "sql") await answerSql(question);
+      else await answerPredicate();
     } catch (error) {
       if (isAborted(error)) return;
       if (!(error instanceof ApiError)) throw error;
@@ -156,10 +154,10 @@ export function mountAsk(main, recording) {
     }
   }
 
-  async function answerPredicate(signal) {
+  async function answerPredicate() {
     const asked = predicate(recording);
     if (!asked) throw new ApiError("Choose a topic for the question.");
-    const found = await get("ask", asked, { slot: "ask", signal });
+    const found = await asking.ask("ask", asked);
     tell(found);
     list.show(found.count);
   }
@@ -169,7 +167,7 @@ export function mountAsk(main, recording) {
     const asked = predicate(recording);
     if (!asked || body.querySelector(".problem")) return;
     try {
-      const found = await get("ask", asked, { slot: "ask", signal: asking.signal });
+      const found = await asking.update("ask", asked);
       tell(found);
       list.update(found.count);
     } catch (error) {
@@ -185,8 +183,8 @@ export function mountAsk(main, recording) {
     steps.hidden = !found.count;
   }
 
-  async function answerSql(question, signal) {
-    const found = await get("sql", { text: question.text }, { slot: "ask", signal });
+  async function answerSql(question) {
+    const found = await asking.ask("sql", { text: question.text });
     python = found.python;
     told.textContent = "";
     fill(body, sqlTable(recording, found));

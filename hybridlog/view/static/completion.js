@@ -1,6 +1,6 @@
 /** Completion of a question, and its history, at an input. */
 
-import { ApiError, get, isAborted } from "./api.js";
+import { ApiError, Question, isAborted } from "./api.js";
 import { element, fill } from "./dom.js";
 
 const HISTORY = "hybridlog.questions";
@@ -15,6 +15,7 @@ const MOST = 100;
  *     `close` says whether it was open
  */
 export function completed(input, context) {
+  const asking = new Question();
   const list = element("ul", { class: "candidates", role: "listbox", id: "candidates", hidden: true });
   let found = null; // { begin, candidates, place, taken }
   let waiting = 0;
@@ -48,7 +49,7 @@ export function completed(input, context) {
     let answer = null;
     try {
       const asked = { ...context(), text: input.value, place };
-      answer = await get("complete", asked, { slot: "complete" });
+      answer = await asking.ask("complete", asked);
     } catch (error) {
       if (isAborted(error)) return;
       if (!(error instanceof ApiError)) throw error; // what is wrong is said when it is asked
@@ -99,6 +100,7 @@ export function completed(input, context) {
 
   function close() {
     clearTimeout(waiting);
+    asking.stop();
     turn += 1;
     const wasOpen = !list.hidden;
     found = null;

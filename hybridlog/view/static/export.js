@@ -1,6 +1,6 @@
 /** Parts of the recording as a file: the command line that writes it, and the file itself. */
 
-import { ApiError, address, get, isAborted } from "./api.js";
+import { ApiError, Question, address, isAborted } from "./api.js";
 import { element, fill, notice } from "./dom.js";
 import { predicate } from "./matches.js";
 import * as state from "./state.js";
@@ -40,7 +40,7 @@ export function exportForm(recording) {
   const download = element("a", { class: "button", download: true }, "Download");
   const problem = element("pre", { class: "problem", role: "alert", hidden: true });
   let python = "";
-  let newest = 0;
+  const asking = new Question();
   const copies = element(
     "span",
     { class: "copies" },
@@ -57,13 +57,18 @@ export function exportForm(recording) {
     problem,
   );
   const end = state.on(["ask", "begin", "end"], () => form.hidden || draw());
-  return { form, toggle, destroy: end };
+  return { form, toggle, destroy };
+
+  function destroy() {
+    end();
+    asking.stop();
+  }
 
   function toggle() {
     form.hidden = !form.hidden;
-    if (form.hidden) return;
+    if (form.hidden) return asking.stop();
     draw();
-    part.focus();
+    return part.focus();
   }
 
   function draw() {
@@ -82,10 +87,9 @@ export function exportForm(recording) {
       recording: recording.info.id,
       ...PARTS[part.value].ask(predicate(recording) ?? {}, range, around.value),
     };
-    const mine = ++newest;
     try {
-      const found = await get("export-command", asked, { slot: "export" });
-      if (mine !== newest) return;
+      const ask = recording.isUpdating ? "update" : "ask";
+      const found = await asking[ask]("export-command", asked);
       told.textContent = found.lost ?? counted(found.count, "message");
       command.textContent = found.command;
       python = found.python;

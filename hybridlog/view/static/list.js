@@ -1,11 +1,14 @@
 /** The list of recordings: search, filter, order, and a bar for what is there and what is lost. */
 
-import { ApiError, get, isAborted } from "./api.js";
+import { ApiError, Question, isAborted } from "./api.js";
 import { element, fill } from "./dom.js";
 import * as state from "./state.js";
 import { count, counted, duration, moment, size } from "./words.js";
 
 const ROWS = 100;
+const MOST_ROWS = 200; // of an answer
+const EVERY_MS = 3000;
+const REST = 10; // times as long as the last answer took
 
 const COLUMNS = [
   { key: "name", title: "Recording" },
@@ -35,6 +38,8 @@ export function mountList(main) {
   let shown = 0;
   let found = 0;
   let timer = 0;
+  let looking = 0; // for what is new
+  const asking = new Question();
 
   const summary = element("p", { class: "summary", "aria-live": "polite" }, "…");
   const body = element("tbody");
@@ -107,16 +112,21 @@ export function mountList(main) {
     return asked;
   }
 
-  async function load(isMore) {
+  async function load(isMore, isNew = true) {
+    clearTimeout(looking);
     drawHead();
     const first = isMore ? shown : 0;
+    const rows = isNew ? ROWS : Math.max(shown, ROWS);
     more.hidden = !isMore;
-    if (!isMore) summary.textContent = "…";
-    const asked = { ...conditions(), order: order.key, direction: order.direction };
+    if (!isMore && isNew) summary.textContent = "…";
+    const asked = { ...conditions(), order: order.key, direction: order.direction, first, count: rows };
+    const begun = performance.now();
     try {
-      const answer = await get("recordings", { ...asked, first, count: ROWS }, { slot: "list" });
+      const answer = await asking.ask("recordings", asked);
+      const focused = body.contains(document.activeElement) && document.activeElement.href;
       if (!isMore) fill(body);
       body.append(...answer.rows.map(row));
+      [...body.querySelectorAll("a")].find((link) => link.href === focused)?.focus();
       shown = first + answer.rows.length;
       found = answer.found;
       problem.hidden = true;
@@ -128,12 +138,23 @@ export function mountList(main) {
       problem.textContent = error.message;
     }
     more.hidden = shown >= found;
+    looking = setTimeout(look, EVERY_MS + REST * (performance.now() - begun));
+  }
+
+  /** Recordings that were made since are in the list, too. */
+  function look() {
+    if (document.hidden || shown > MOST_ROWS) looking = setTimeout(look, EVERY_MS);
+    else load(false, false);
   }
 
   drawHead();
   load(false);
   inputs.get("name").focus({ preventScroll: true });
-  return () => clearTimeout(timer);
+  return () => {
+    clearTimeout(timer);
+    clearTimeout(looking);
+    asking.stop();
+  };
 }
 
 function summaryOf(answer) {

@@ -41,6 +41,17 @@ export function followLive(recording) {
     const found = timed(await get("recording", parameters, { signal: stop.signal }));
     const { info } = recording;
     if (found.messages === info.messages && found.status === info.status) return;
+    recording.isUpdating = true;
+    try {
+      take(found);
+    } finally {
+      recording.isUpdating = false;
+    }
+  }
+
+  /** Shows what is new. */
+  function take(found) {
+    const { info } = recording;
     const isAtEnd = state.get("at") >= lastTime(recording);
     const before = info.end;
     moveStart(BigInt(found.start));

@@ -1,6 +1,6 @@
 /** The list of matches, a page at a time, and the steps from one to the next. */
 
-import { ApiError, get, isAborted } from "./api.js";
+import { ApiError, Question, isAborted } from "./api.js";
 import { element, fill, notice } from "./dom.js";
 import { predicate } from "./matches.js";
 import { seek } from "./range.js";
@@ -35,39 +35,50 @@ export function matchList(recording) {
   );
   let total = 0;
   let shown = { rows: [], before: 0 };
+  const [pages, steps] = [new Question(), new Question()];
   const end = state.on(["at"], mark);
-  return { side, show, update, step, destroy: end };
+  return { side, show, update, step, destroy };
+
+  function destroy() {
+    end();
+    pages.stop();
+    steps.stop();
+  }
 
   function show(number) {
     total = number ?? 0;
     side.hidden = number === null;
     shown = { rows: [], before: 0 };
+    pages.stop();
+    steps.stop();
     draw();
     if (number) load({ at: recording.info.begin, seq: -1, direction: "later" });
   }
 
   function update(number) {
+    if (side.hidden) return show(number); // there was an error before
     if (number === total) return;
     total = number;
     const [first] = shown.rows;
-    if (!first) load({ at: recording.info.begin, seq: -1, direction: "later" });
-    else if (shown.rows.length < PAGE) load({ at: first[0], seq: first[1] - 1, direction: "later" });
+    if (!first) load({ at: recording.info.begin, seq: -1, direction: "later" }, "update");
+    else if (shown.rows.length < PAGE)
+      load({ at: first[0], seq: first[1] - 1, direction: "later" }, "update");
     else draw();
   }
 
-  async function load(place) {
-    const found = await list({ ...place, count: PAGE }, "match-page");
+  async function load(place, ask = "ask") {
+    const found = await list({ ...place, count: PAGE }, pages, ask);
     if (!found?.rows.length) return;
     shown = found;
     draw();
   }
 
   /** Some matches at a place; null if there is no question, or a newer one. */
-  async function list(place, slot) {
+  async function list(place, question, ask) {
     const asked = predicate(recording);
     if (!asked) return null;
     try {
-      const found = await get("match-list", { ...asked, ...place }, { slot });
+      const found = await question[ask]("match-list", { ...asked, ...place });
       return { ...found, rows: found.rows.map(([time, seq]) => [state.instant(time), seq]) };
     } catch (error) {
       if (isAborted(error)) return null;
@@ -84,7 +95,7 @@ export function matchList(recording) {
 
   async function step(direction) {
     const at = state.get("at") + (direction === "later" ? 1n : 0n);
-    const found = await list({ at, seq: -1, direction, count: 1 }, "match-step");
+    const found = await list({ at, seq: -1, direction, count: 1 }, steps, "ask");
     if (!found) return;
     if (!found.rows.length) {
       notice(direction === "later" ? "No later match." : "No earlier match.");
@@ -115,7 +126,7 @@ export function matchList(recording) {
             "button",
             { type: "button", class: "plain", onclick: () => seek(recording, time) },
             element("small", {}, `#${count(shown.before + number + 1)} `),
-            offset(time),
+            offset(time, 9),
           ),
         ),
       ),

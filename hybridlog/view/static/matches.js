@@ -1,6 +1,6 @@
 /** The matches of the question, drawn over the timeline in the visible range. */
 
-import { ApiError, get, isAborted } from "./api.js";
+import { ApiError, Question, isAborted } from "./api.js";
 import * as overlays from "./overlays.js";
 import { exactRange } from "./range.js";
 import * as state from "./state.js";
@@ -19,18 +19,19 @@ export function predicate(recording) {
 
 /** Draws the matches as ticks, and bands where the predicate holds. Returns a function that ends it. */
 export function drawMatches(recording) {
-  const stop = new AbortController();
+  const asking = new Question();
   let waiting = 0;
-  const ends = [state.on(["ask", "begin", "end"], soon), recording.on(soon)];
+  const ends = [state.on(["ask", "begin", "end"], soon), recording.on(load)];
   load();
   return () => {
     ends.forEach((end) => end());
     clearTimeout(waiting);
-    stop.abort();
+    asking.stop();
     overlays.draw(NAME, null);
   };
 
   function soon() {
+    if (recording.isUpdating) return; // which is told when all is known
     clearTimeout(waiting);
     waiting = setTimeout(load, PAUSE_MS);
   }
@@ -38,15 +39,15 @@ export function drawMatches(recording) {
   async function load() {
     const asked = predicate(recording);
     if (!asked) {
+      asking.stop();
       overlays.draw(NAME, null);
       return;
     }
     const pixels = Math.min(window.innerWidth, MOST_PIXELS);
     const picture = { ...exactRange(recording), pixels };
     try {
-      const options = { slot: NAME, signal: stop.signal };
-      const { first, counts, bands } = await get("matches", { ...asked, ...picture }, options);
-      if (stop.signal.aborted) return;
+      const ask = recording.isUpdating ? "update" : "ask";
+      const { first, counts, bands } = await asking[ask]("matches", { ...asked, ...picture });
       const ticks = first.map((time, n) => [time, counts[n]]);
       overlays.draw(NAME, { title: `${asked.topic}: ${asked.where}`, ticks, bands });
     } catch (error) {

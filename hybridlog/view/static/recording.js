@@ -18,6 +18,8 @@ import { count, counted, duration, moment, size } from "./words.js";
  * @property {function(function()): function()} on calls back when `info` has changed, of a
  *     recording that goes on; returns a function that ends this
  * @property {function()} tell calls them back
+ * @property {boolean} isUpdating whether the state changes because the recording has gone on:
+ *     what is under way is answered before it is asked again
  */
 
 /** Shows a recording in an element. Returns a function that takes it away. */
@@ -68,6 +70,7 @@ function made(info) {
       return () => listeners.delete(callback);
     },
     tell: () => listeners.forEach((callback) => callback()),
+    isUpdating: false,
   };
   return recording;
 }

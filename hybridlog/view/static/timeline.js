@@ -1,6 +1,6 @@
 /** The timeline: a lane a topic with its messages by pixel, gaps, losses, marks and matches. */
 
-import { get } from "./api.js";
+import { Question } from "./api.js";
 import { labelOf, stepOf, ticksOf } from "./axis.js";
 import { element, fill } from "./dom.js";
 import { countBetween, Lanes } from "./lanes.js";
@@ -41,6 +41,7 @@ export function mountTimeline(parent, recording) {
   section.append(corner, axis, scroller, tip);
   parent.append(section);
 
+  const asking = new Question();
   const lanes = new Lanes(recording, schedule);
   const colours = new Colours(section);
   const sizes = new ResizeObserver(schedule);
@@ -77,6 +78,7 @@ export function mountTimeline(parent, recording) {
     ends.forEach((end) => end());
     sizes.disconnect();
     lanes.destroy();
+    asking.stop();
     section.remove();
   };
 
@@ -102,7 +104,7 @@ export function mountTimeline(parent, recording) {
     }
     const { begin, end } = recording.info;
     const asked = { recording: recording.info.id, begin, end };
-    marks = await get("marks", asked, { slot: "marks" }).then((answer) => answer.marks, () => marks);
+    marks = await asking.update("marks", asked).then((answer) => answer.marks, () => marks);
     schedule();
   }
 

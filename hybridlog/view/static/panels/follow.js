@@ -22,8 +22,8 @@ const STILL_PLAYING = 160; // ms between two steps of a cursor that plays
  * for the time at which the answer will have come.
  *
  * @param {Object} parts
- * @param {function(BigInt): Promise<Answer>} parts.load asks for the message at a time; its times
- *     are texts still
+ * @param {function(BigInt, AbortSignal): Promise<Answer>} parts.load asks for the message at a
+ *     time; its times are texts still
  * @param {function(Answer)} parts.show shows one
  * @param {function(Error)} parts.fail shows why there is none
  * @param {import("../recording.js").Recording} parts.recording
@@ -38,6 +38,7 @@ export function follow({ load, show, fail, recording }) {
   let latency = 30; // ms
   let isRunning = false;
   let isGone = false;
+  const stopped = new AbortController();
   let stopping = 0;
 
   const covers = ({ time, until }, at) => (time ?? -Infinity) <= at && at < (until ?? Infinity);
@@ -80,14 +81,14 @@ export function follow({ load, show, fail, recording }) {
     isRunning = true;
     const begun = performance.now();
     try {
-      const answer = await load(at);
+      const answer = await load(at, stopped.signal);
       if (isGone) return;
       for (const name of ["time", "until"]) answer[name] &&= instant(answer[name]);
       if (recording.start === start) received(answer, at);
       latency += (performance.now() - begun - latency) / 4;
     } catch (error) {
-      if (!(error instanceof ApiError)) throw error;
       if (isGone) return;
+      if (!(error instanceof ApiError)) throw error;
       shown = null;
       fail(error);
       if (wanted === at) return; // not again before the cursor moves
@@ -129,6 +130,7 @@ export function follow({ load, show, fail, recording }) {
     },
     destroy() {
       isGone = true;
+      stopped.abort();
       clearTimeout(stopping);
       kept = [];
     },

@@ -45,8 +45,8 @@ function mount(body, panel) {
   });
 
   /** The picture, decoded already, so that it takes the place of another one at once. */
-  async function load(at) {
-    const response = await request("image", { ...asked, at });
+  async function load(at, signal) {
+    const response = await request("image", { ...asked, at }, { signal });
     const time = response.headers.get("Hybridlog-Time");
     const until = response.headers.get("Hybridlog-Until");
     const type = response.headers.get("Content-Type");

@@ -1,6 +1,6 @@
 /** Lines of a text log around the cursor; only those that can be seen are elements. */
 
-import { ApiError, get, isAborted } from "../api.js";
+import { ApiError, Question, isAborted } from "../api.js";
 import { element, fill } from "../dom.js";
 import { instant } from "../state.js";
 import { counted, offset } from "../words.js";
@@ -20,8 +20,6 @@ const PAGE = 200; // lines of a request
 const MOST_LINES = 2000;
 const BEYOND = 10; // lines above and below what is seen
 const TYPING = 250; // ms
-
-let mounted = 0;
 
 export default {
   kind: "log",
@@ -54,7 +52,7 @@ function filtersOf({ level, text }) {
 }
 
 function mount(body, panel) {
-  const slot = `log ${(mounted += 1)}`;
+  const [asking, counting] = [new Question(), new Question()];
   const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
   const hasLevels = !/String$/.test(panel.topic.type);
   let lines = [];
@@ -113,7 +111,7 @@ function mount(body, panel) {
     known = { ...panel.recording.info, start: panel.recording.start };
     isLoading = true;
     const parameters = { ...asked, ...chosen(), at, before: PAGE / 2, after: PAGE / 2 };
-    await answered(get("log", parameters, { slot }), (found) => {
+    await answered(asking.ask("log", parameters), (found) => {
       [lines, isFirst, isLast] = [found.lines, found.first, found.last];
       isLoading = false;
       point(true);
@@ -122,15 +120,17 @@ function mount(body, panel) {
     if (!isGone) tally();
   }
 
-  let tallied = "";
+  let tallied = ""; // the filters of the number
+  let isGrown = false; // since then
 
   /** How many lines pass the filters. */
   async function tally() {
     const now = JSON.stringify(filters);
-    if (now === tallied) return;
-    tallied = now;
-    number.textContent = "…";
-    await answered(get("log/count", { ...asked, ...chosen() }, { slot: `${slot} count` }), (found) => {
+    if (now === tallied && !isGrown) return;
+    const ask = now === tallied ? "update" : "ask";
+    [tallied, isGrown] = [now, false];
+    if (ask === "ask") number.textContent = "…";
+    await answered(counting[ask]("log/count", { ...asked, ...chosen() }), (found) => {
       number.textContent = found.count === null ? "" : counted(found.count, "line");
     });
   }
@@ -146,7 +146,7 @@ function mount(body, panel) {
     isLoading = true;
     const parameters = { ...asked, ...chosen(), at: edge.time, seq: edge.seq };
     parameters[isBefore ? "before" : "after"] = PAGE;
-    await answered(get("log", parameters, { slot }), (found) => {
+    await answered(asking.ask("log", parameters), (found) => {
       isLoading = false;
       if (isBefore) {
         lines = [...found.lines, ...lines];
@@ -204,7 +204,8 @@ function mount(body, panel) {
   /** Lines may have come at the end of a recording that goes on. */
   function grown() {
     known = { ...panel.recording.info, start: panel.recording.start };
-    tallied = "";
+    isGrown = true;
+    if (isLoading) return;
     if (!lines.length) load();
     else if (isLast) more(false);
     else tally();
@@ -245,7 +246,7 @@ function mount(body, panel) {
         title: line.text,
         onclick: () => panel.seek(line.time),
       },
-      element("span", { class: "time" }, offset(line.time)),
+      element("span", { class: "time" }, offset(line.time, 9)),
       hasLevels ? element("span", { class: "level" }, line.level ?? "") : null,
       line.name ? element("span", { class: "name" }, line.name) : null,
       element("span", { class: "text" }, line.text + (line.cut ? "…" : "")),
@@ -278,6 +279,8 @@ function mount(body, panel) {
     update,
     destroy() {
       isGone = true;
+      asking.stop();
+      counting.stop();
       clearTimeout(typing);
       watching.disconnect();
     },

@@ -1,6 +1,6 @@
 /** The track of a satellite receiver, or of a robot, on a grid in metres: no tiles, no network. */
 
-import { ApiError, bytes, get } from "../api.js";
+import { ApiError, Question, bytes, get, isAborted } from "../api.js";
 import { element } from "../dom.js";
 import { unpack } from "../spatial/packed.js";
 import { metres, plane } from "../spatial/plane.js";
@@ -64,11 +64,12 @@ function mount(body, panel) {
   let rested = 0; // when the track may be asked for again
   let timer = 0;
   let isGone = false;
+  const [asking, looking] = [new Question(), new Question()];
 
   const drawn = plane(place, { label: `Track of ${panel.topic.topic}`, paint, pick });
   fit.addEventListener("click", drawn.reset);
   const following = follow({
-    load: (at) => get("fix", { ...asked, at }),
+    load: (at, signal) => get("fix", { ...asked, at }, { signal }),
     show(found) {
       fix = found;
       describe();
@@ -86,6 +87,8 @@ function mount(body, panel) {
     update,
     destroy() {
       isGone = true;
+      asking.stop();
+      looking.stop();
       clearTimeout(timer);
       following.destroy();
       drawn.destroy();
@@ -108,7 +111,7 @@ function mount(body, panel) {
     rested = Infinity;
     const begun = performance.now();
     try {
-      const found = unpack(await bytes("track", { ...asked, pixels: PIXELS }));
+      const found = unpack(await asking.ask("track", { ...asked, pixels: PIXELS }, bytes));
       if (isGone) return;
       track = found;
       wanted = "";
@@ -132,8 +135,8 @@ function mount(body, panel) {
     wanted = key;
     try {
       const parameters = { ...asked, begin, end, pixels: PIXELS };
-      const found = unpack(await bytes("track", parameters));
-      if (isGone || key !== wanted) return;
+      const ask = panel.recording.isUpdating ? "update" : "ask";
+      const found = unpack(await looking[ask]("track", parameters, bytes));
       if (!found.is_geographic) detail = found;
       else detail = found.grid ? { ...found, shift: shiftOf(found.grid) } : null;
       drawn.redraw();
@@ -224,8 +227,8 @@ function mount(body, panel) {
   }
 
   function refuse(error) {
+    if (isGone || isAborted(error)) return;
     if (!(error instanceof ApiError)) throw error;
-    if (isGone) return;
     problem.textContent = error.message;
     problem.hidden = false;
     place.hidden = true;

@@ -32,7 +32,7 @@ function mount(body, panel) {
   let top = null;
 
   const following = follow({
-    load: (at) => get("message", { ...asked, at }),
+    load: (at, signal) => get("message", { ...asked, at }, { signal }),
     show,
     fail: (error) => problem(error.message),
     recording: panel.recording,

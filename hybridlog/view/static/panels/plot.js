@@ -1,6 +1,6 @@
 /** Fields over time: each value where there are few, else least and greatest by pixel. */
 
-import { ApiError, get, isAborted } from "../api.js";
+import { ApiError, Question, isAborted } from "../api.js";
 import { element, fill } from "../dom.js";
 import { show } from "../range.js";
 import * as state from "../state.js";
@@ -42,10 +42,8 @@ function fieldsOf({ fields }) {
   return fields.filter((one) => typeof one === "string").slice(0, MOST_FIELDS);
 }
 
-let mounted = 0;
-
 function mount(body, panel) {
-  const slot = `plot ${(mounted += 1)}`;
+  const [asking, naming] = [new Question(), new Question()];
   const asked = { recording: panel.recording.info.id, topic: panel.topic.topic };
   const legend = element("div", { class: "legend" });
   const place = element("div", { class: "chart" });
@@ -70,7 +68,7 @@ function mount(body, panel) {
 
   async function load() {
     try {
-      const found = await get("fields", asked);
+      const found = await naming.ask("fields", asked);
       if (isGone) return;
       known = found.fields;
       if (!fieldsOf(panel.options)) panel.setOptions({ fields: usual(known) });
@@ -109,7 +107,7 @@ function mount(body, panel) {
     if (!names.length) return drawAnswer({ times: [], fields: [], exact: true });
     try {
       const parameters = { ...asked, field: names, begin, end, pixels };
-      const answer = await get("series", parameters, { slot });
+      const answer = await asking[panel.recording.isUpdating ? "update" : "ask"]("series", parameters);
       if (isGone) return;
       problem.hidden = true;
       drawAnswer({ ...answer, times: answer.times.map(state.instant) });
@@ -253,7 +251,9 @@ function mount(body, panel) {
     const place = isHovered ? idx : placeAt(drawn.times, panel.cursor());
     drawn.fields.forEach((one) => {
       const output = legend.querySelector(`output[data-field="${CSS.escape(one.field)}"]`);
-      if (output) output.textContent = place < 0 ? "" : valueText(one, place, typeOf(one.field));
+      if (!output) return;
+      output.textContent = place < 0 ? "" : valueText(one, place, typeOf(one.field));
+      output.title = output.textContent; // if it is cut
     });
   }
 
@@ -261,6 +261,8 @@ function mount(body, panel) {
     update,
     destroy() {
       isGone = true;
+      asking.stop();
+      naming.stop();
       watching.disconnect();
       picker.destroy();
       scheme.removeEventListener("change", redraw);

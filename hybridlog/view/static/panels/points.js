@@ -108,15 +108,15 @@ function mount(body, panel) {
     return typeof panel.options.colour === "string" ? panel.options.colour : null;
   }
 
-  async function load(at) {
+  async function load(at, signal) {
     const parameters = { recording: panel.recording.info.id, topic: panel.topic.topic, at };
     const value = chosen() ?? usual;
     const isAxis = AXES.includes(value) || value === PLAIN;
-    const buffer = await bytes("points", { ...parameters, value: isAxis ? null : value });
+    const buffer = await bytes("points", { ...parameters, value: isAxis ? null : value }, { signal });
     const answer = { ...unpack(buffer), size: buffer.byteLength, value };
     if (answer.names) usual = suggested(answer);
     // The first answer tells which values there are.
-    return (chosen() ?? usual) === value ? answer : load(at);
+    return (chosen() ?? usual) === value ? answer : load(at, signal);
   }
 
   async function show(answer) {

@@ -1,0 +1,174 @@
+"""Questions that a page gives up, and those about recordings that go on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.view import context
+from hybridlog.view.app import make_app
+from hybridlog.view.routes import ask
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.view.conftest import PORT, TOKEN, served
+from tests.view.test_ask import asked_for
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+    from hybridlog.view.asked import Asked
+    from hybridlog.view.question import PageQuestion
+
+S = 10**9
+WHOLE = {"begin": 0, "end": 20 * S, "pixels": 100}
+SCAN = {"recording": "robot", "topic": "/base/scan"}
+NEAR = {**SCAN, "where": "ranges.min < 0.8"}
+QUESTIONS: dict[str, dict[str, Any]] = {
+    "ask": NEAR,
+    "matches": {**NEAR, **WHOLE},
+    "match-list": {**NEAR, "at": 0},
+    "export-command": {**NEAR, "where": "ranges[7] < 0.8"},
+    "series": {**SCAN, **WHOLE, "field": "ranges.min"},
+    "track": {"recording": "robot", "topic": "/odom", "pixels": 100},
+    "log": {"recording": "robot", "topic": "/rosout", "at": 0, "after": 9},
+    "log/count": {"recording": "robot", "topic": "/rosout", "text": "e"},
+    "recordings": {"where": "scan: ranges.min < 0.5"},
+    "timeline": {**WHOLE, **SCAN},
+    "sql": {"text": "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"},
+}
+
+
+@pytest.mark.parametrize("path", QUESTIONS)
+def test_a_question_that_is_given_up_stops(
+    demo_store: hl.Store, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """The client leaves when something is about to be read, and nothing more is."""
+    leaves = threading.Event()
+
+    class Watched(threading.Event):
+        def is_set(self) -> bool:
+            leaves.set()
+            assert self.wait(20)
+            return True
+
+    app = make_app(demo_store, TOKEN, PORT)
+    with monkeypatch.context() as patched:
+        patched.setattr(context, "threading", SimpleNamespace(Event=Watched))
+        said = asked_for(app, path, QUESTIONS[path], leaves_after=leaves)
+    assert b"The query was stopped" in said[1]["body"]
+    said = asked_for(app, "recording", {"recording": "robot"}, leaves_after=20.0)
+    assert said[0]["status"] == 200
+
+
+def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> None:
+    app = make_app(demo_store, TOKEN, PORT)
+    shared: context.Context = app._app.state.context
+    with ExitStack() as held:
+        for _ in range(context.MAX_WORKING):
+            held.enter_context(shared.turns)
+        said = asked_for(app, "ask", NEAR, leaves_after=0.1)
+        assert b"The query was stopped" in said[1]["body"]
+    with shared.matches._asking:
+        said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=0.1)
+        assert b"The query was stopped" in said[1]["body"]
+    said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=20.0)
+    assert said[0]["status"] == 200
+
+
+@pytest.mark.peer("browser")
+def test_an_update_waits_for_the_answer_before(page: Page, demo_url: str) -> None:
+    page.goto(demo_url)
+    said = page.evaluate(
+        """async () => {
+            const { Question } = await import("./api.js");
+            const said = [], answers = [];
+            const by = (path, asked, { signal }) => new Promise((resolve, reject) => {
+                said.push(path);
+                answers.push(() => resolve(path));
+                signal.addEventListener("abort", () => reject(new DOMException("", "AbortError")));
+            });
+            const question = new Question();
+            const hear = (one) =>
+                one.then((text) => said.push(`= ${text}`), ({ name }) => said.push(name));
+            const later = () => new Promise((resolve) => setTimeout(resolve, 10));
+            const run = async (...steps) => {
+                for (const step of steps) { step(); await later(); }
+            };
+            await run(
+                () => hear(question.ask("a", {}, by)),
+                () => hear(question.update("b", {}, by)),
+                () => hear(question.update("c", {}, by)),
+                () => answers[0](),
+                () => answers[1](),
+                () => hear(question.update("d", {}, by)),
+                () => hear(question.update("e", {}, by)),
+                () => hear(question.ask("f", {}, by)),
+                () => question.stop(),
+            );
+            return said;
+        }"""
+    )
+    aborted = "AbortError"
+    assert [one for one in said if len(one) == 1] == ["a", "c", "d", "f"]
+    assert [one for one in said if len(one) > 1] == ["= a", aborted, "= c", *[aborted] * 3]
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[hl.Store]:
+    """A store, as another process has it open, with a recording that goes on and on."""
+    settings = SegmentSettings(segment_size=1)
+    ended = threading.Event()
+    with hl.open(tmp_path / "store", create=True) as writing, ExitStack() as stack:
+        recording = stack.enter_context(
+            writing.start("live", settings=settings, flush_interval_s=0.05)
+        )
+
+        def write() -> None:
+            n = 0
+            while not ended.wait(0.05):
+                recording.write(Channel("/a", "json", None), b'{"n": %d}' % n, log_time=S + n)
+                n += 1
+
+        writer = threading.Thread(target=write)
+        writer.start()
+        stack.callback(writer.join)
+        stack.callback(ended.set)
+        with hl.open(tmp_path / "store") as store:
+            yield store
+
+
+@pytest.mark.peer("browser")
+def test_updates_do_not_starve_a_question(
+    running: hl.Store, page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An answer that takes longer than the time from one update to the next comes, and again."""
+    question_of = ask.question_of
+
+    def slow(context: context.Context, asked: Asked) -> PageQuestion:
+        time.sleep(1.5)
+        return question_of(context, asked)
+
+    monkeypatch.setattr(ask, "question_of", slow)
+    until = time.monotonic() + 30
+    while running.entry("live").messages == 0 if running.summaries() else True:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+        running.refresh()
+    with served(running) as url:
+        page.goto(f"{url}#recording=live&panels=[]")
+        page.get_by_label("Topic of the question").locator("option").wait_for(state="attached")
+        page.get_by_label("Question", exact=True).fill("n >= 0")
+        page.keyboard.press("Enter")
+        told = page.locator(".told")
+        told.filter(has_text="match").wait_for()
+        first = told.inner_text()
+        told.filter(has_not_text=first).filter(has_text="match").wait_for()
+        page.locator(".matches li").nth(1).wait_for()
