@@ -7,13 +7,18 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import hybridlog as hl
+from hybridlog import session
+from hybridlog.maintenance.opening import repair_on_open
 from hybridlog_storage import files
+from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.files import System
 from hybridlog_storage.messages import Channel
+from tests.cli.within import answer
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 
@@ -58,3 +63,22 @@ def test_a_crash_on_a_full_disk_waits_for_room(
         assert store.repairs.disk_full is None
         (entry,) = store.recordings()
         assert (entry.label, entry.status, entry.messages) == ("crash", "recovered", 50)
+
+
+def test_nothing_is_said_to_have_crashed_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("whole") as recording:
+            recording.write(Channel("/a", "json", None, {}), b'{"n": 1}')
+
+    def full(directory: Any, catalog: Any, report: Any) -> Any:
+        if not catalog.is_in_memory:
+            raise DiskFullError("No space left while writing the catalog.")
+        return repair_on_open(directory, catalog, report)
+
+    monkeypatch.setattr(session, "repair_on_open", full)
+    done = answer("fetch", "-t", "/a", "--count", store=tmp_path / "store")
+    assert done.out == "1\n"
+    assert "The disk of the store is full, so nothing in it is repaired or noted." in done.err
+    assert "crash" not in done.err

@@ -86,7 +86,7 @@ def _print_repairs(store: Store) -> None:
         note(f"Recording {recording} cannot be read: {problem}")
     if repairs.disk_full is not None:
         note(
-            "The disk of the store is full, so what a crash has left was not recovered. Remove "
+            "The disk of the store is full, so nothing in it is repaired or noted. Remove "
             f"recordings with `hybridlog rm`, or make room. {repairs.disk_full}"
         )
     elif not store.directory.is_writable:

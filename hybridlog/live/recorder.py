@@ -688,7 +688,7 @@ class Recorder:
         # Messages in memory will be written, and as many new ones before the next check.
         coming = state.filled * options.budget_bytes + grown
         try:
-            check_room(state.free_bytes, options.reserve_bytes + coming)
+            check_room(state.free_bytes, options.reserve_bytes, coming)
         except DiskFullError as error:
             self._refuse(Cause.DISK, str(error))
         failure = self._target.failure
@@ -715,15 +715,16 @@ class Recorder:
             )
 
 
-def check_room(free_bytes: int, reserve_bytes: float) -> None:
-    """Check that a disk has as much free space as the reserve.
+def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> None:
+    """Check that a disk has as much free space as the reserve and what comes next.
 
     Raises:
         DiskFullError: It has less.
     """
-    if free_bytes < reserve_bytes:
+    if free_bytes < reserve_bytes + coming_bytes:
+        lower = ", or lower --reserve" if reserve_bytes else ""
         left = _megabytes(free_bytes)
-        raise DiskFullError(f"The disk has only {left} left: free some, or lower --reserve.")
+        raise DiskFullError(f"The disk has only {left} left: free some{lower}.")
 
 
 def _megabytes(count: float) -> str:

@@ -379,7 +379,8 @@ class TableWriter:
             yield
         except Exception as error:
             self.has_failed = True
-            _log.warning("no tables of %s: %s", self._recording, error or repr(error))
+            reason = getattr(error, "strerror", None) or error or repr(error)
+            _log.warning("Recording %s has no tables yet: %s", self._recording, reason)
             self.discard()
 
     # From chunks to rows in memory.
