@@ -68,7 +68,9 @@ def command(
     with opened_store(store, mongo, quiet=as_json) as opened:
         if what is not None:
             choice = replace(choice, name=(what, *choice.name))
-        chosen = [*recordings_of(opened, choice)]
+        chosen = [
+            recording_summary.with_misfits(opened, entry) for entry in recordings_of(opened, choice)
+        ]
         is_one = choice == Choice.of(what) and opened.is_one(choice.name)
         index = opened.index_place
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}

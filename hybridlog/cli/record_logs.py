@@ -16,6 +16,7 @@ from hybridlog.cli import coverage, output
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
+from hybridlog.cli.recording_summary import with_misfits
 from hybridlog.cli.signals import if_stopped
 from hybridlog.losses import losses_of
 from hybridlog_storage.errors import (
@@ -140,7 +141,9 @@ class LogRecorder:
         for piece in self._pieces(store, log):
             self.results.begin(piece.path)
             try:
-                self.results.add(piece.path, self._record_one(store, piece, progress))
+                report = self._record_one(store, piece, progress)
+                report.entry = with_misfits(store, report.entry)
+                self.results.add(piece.path, report)
             except AlreadyRecordedError as error:
                 self.results.known(piece.path, error)
             except (SourceError, UsageError) as error:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 _STATUS = {
@@ -41,3 +44,20 @@ def as_dict(recording: RecordingSummary) -> dict[str, Any]:
         "source": recording.source,
         "created_ns": recording.created,
     }
+
+
+def with_misfits(store: Store, recording: RecordingEntry) -> RecordingEntry:
+    """The same recording, where `unreadable` counts what does not fit its definition alone.
+
+    The catalog also counts messages with more fields than the index takes; tables have these.
+    """
+    channels = []
+    for channel in recording.channels:
+        unreadable, table = channel.stats.unreadable, None
+        if unreadable:
+            table = store.session.tables.of(recording, channel.topic)
+        if table is not None:
+            unfit = sum(int(rows.is_unreadable().sum()) for rows in table.scan(own={"state"}))
+            unreadable = min(unreadable, unfit)
+        channels.append(replace(channel, stats=replace(channel.stats, unreadable=unreadable)))
+    return replace(recording, channels=channels)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.column import ranges
@@ -94,6 +95,13 @@ class TableRows:
         own = {name: column.slice(begin, end - begin) for name, column in self.own.items()}
         records = self.records.slice(begin, end - begin)
         return TableRows(self.t[begin:end], self.seq[begin:end], own, records)
+
+    def is_unreadable(self) -> NDArray[np.bool_]:
+        """bool[n], True for messages without fields; none if `state` was not read."""
+        state = self.own.get("state")
+        if state is None:
+            return np.zeros(len(self), np.bool_)
+        return np.asarray(pc.equal(state, "unreadable").to_numpy(zero_copy_only=False))
 
     def behind(self, key: _Key) -> int:
         """Index of the first row after a log time and arrival number."""

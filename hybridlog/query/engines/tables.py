@@ -118,7 +118,7 @@ class TablesEngine:
             matched = unreadable = 0
             for rows, holds in self._rows(part):
                 matched += int(holds.sum())
-                unreadable += int(_are_unreadable(rows).sum())
+                unreadable += int(rows.is_unreadable().sum())
             self._counts[part] = _Count(matched, unreadable)
         return self._counts[part].matched
 
@@ -191,7 +191,7 @@ class TablesEngine:
         self._counters.bytes_read += int(table.size(paths, own) * min(part.share * 1.2, 1.0))
         try:
             for rows in table.scan(paths, own=columns, spans=spans):
-                yield rows, self._holds(part, rows) & ~_are_unreadable(rows)
+                yield rows, self._holds(part, rows) & ~rows.is_unreadable()
         except StoreError:
             self._session.reject_table(part.recording, part.topic)
             raise
@@ -211,16 +211,6 @@ class TablesEngine:
         if found is None:
             raise UndecidedError(f"The table of {part.topic} cannot tell.")
         return found
-
-
-def _are_unreadable(rows: TableRows) -> NDArray[np.bool_]:
-    """bool[n], True for messages without fields; none if the column was not read."""
-    import pyarrow.compute as pc
-
-    state = rows.own.get("state")
-    if state is None:
-        return np.zeros(len(rows), np.bool_)
-    return np.asarray(pc.equal(state, "unreadable").to_numpy(zero_copy_only=False))
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:
