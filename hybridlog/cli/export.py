@@ -166,6 +166,7 @@ def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quie
             left_out.append(error)
             continue
         _print_written(path, one, missing, quiet=quiet)
+        query.counters.reduced += one.counters.reduced
     if len(left_out) == len(paths):
         raise left_out[0]
 
@@ -188,8 +189,9 @@ def _print_written(
     """Print a line about a file; --quiet leaves it out, unless messages are missing."""
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
     if missing or not quiet:
+        written = query.counters.messages - query.counters.reduced - missing
         output.note(
-            f"{path}: {output.counted(query.counters.messages, 'message')}{left_out}"
+            f"{path}: {output.counted(written, 'message')}{left_out}"
             f"{latched(query.counters)}{beside}, "
             f"{output.size(path.stat().st_size)}"
         )
