@@ -585,12 +585,13 @@ class Session:
         found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
         if found is None:
             entry = self._current(summary)
-            if entry is None or entry.id != summary.id:
+            while entry is None or entry.id != summary.id:
                 # Another process may have renamed it.
                 now = repair_on_open(self.directory, self.catalog, self.repairs)
-                place = now.by_id.get(summary.id)
-                entry = None if place is None else self._current(now.summaries[place])
-            if entry is None or entry.status in UNFINISHED:
+                if summary.id not in now.by_id:
+                    return None
+                entry = self._current(now.summaries[now.by_id[summary.id]])
+            if entry.status in UNFINISHED:
                 return entry
             found = self._entries.setdefault(summary.id, entry)
         return found

@@ -101,8 +101,10 @@ def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairR
         looks = directory.looks(names)
         report.unreadable.clear()
         found = _find(directory, catalog, looks, known, report)
-        # A recording that was renamed meanwhile must not be missed.
-        if directory.names() == names:
+        # A recording that was renamed meanwhile must not be missed. If it has exchanged its label
+        # with another one, that one may have been seen twice.
+        is_twice = any(len(copies) > 1 for copies in found.values())
+        if directory.names() == names and not (is_twice and directory.looks(names) != looks):
             break
     report.copies.clear()
     for recording, copies in found.items():
