@@ -525,7 +525,7 @@ def test_a_killed_server_is_told_and_leaves_nothing(
                 go_on()
         with pytest.raises(BackendFailedError):
             backend.counts()
-        assert time.monotonic() - began < 15
+        assert time.monotonic() - began < 50, "it waits as long as a driver does by itself"
     assert not working_in(tmp_path)
 
 

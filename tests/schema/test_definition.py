@@ -628,12 +628,12 @@ def test_nesting_and_unfolding_are_bounded():
 def test_the_largest_definitions_are_refused_or_read_in_time(encoding, piece):
     prefix, _, piece = piece.rpartition("|")
     text = prefix + (piece * (MAX_DEFINITION // len(piece)))[: MAX_DEFINITION - len(prefix)]
-    started = time.monotonic()
+    started = time.thread_time()  # the machine may be busy
     try:
         parse(text, encoding)
     except DefinitionError as error:
         assert len(str(error)) < 1000  # noqa: PT017
-    assert time.monotonic() - started < 20
+    assert time.thread_time() - started < 20
 
 
 TOKENS = st.sampled_from(

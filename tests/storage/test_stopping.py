@@ -174,11 +174,11 @@ def test_other_threads_are_not_stopped() -> None:
 
 def test_a_signal_ends_a_pause() -> None:
     timer = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
     started = time.monotonic()
 
     def work() -> None:
         with at_safe_points():
+            timer.start()
             pause(LONG_S)
 
     with pytest.raises(Stop):
