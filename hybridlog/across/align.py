@@ -156,9 +156,9 @@ class Aligned:
         topics = tuple(topic for stream in streams for topic in stream.question.topics)
         asked = replace(streams[0].question, topics=topics)
         found = [*about_names(self._session, asked, names)]
-        of = f"of {self.rows} {'row is' if self.rows == 1 else 'rows are'} empty"
+        rows = counted(self.rows, "row")
         lines = [
-            f"{name}: {number} {of}: {reason}."
+            f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
             for name, reasons in self.empty.items()
             for reason, number in reasons.items()
         ]

@@ -24,7 +24,7 @@ from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import STAMP
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
-from hybridlog_storage.times import END
+from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -156,7 +156,9 @@ class TopicReader:
         if self._clock_column == TIME and self.elsewhere(recording) is None:
             with suppress(TimeError):  # the range does not touch this recording
                 lost = lost_times(self._session, self._beside(recording))
-                spans = sorted((one.begin_ns, one.end_ns, 0) for one in lost)
+                # Those that may be of any time explain no row.
+                known = (one for one in lost if one.begin_ns > BEGIN)
+                spans = sorted((one.begin_ns, one.end_ns, 0) for one in known)
         return joined(np.array(spans, np.int64).reshape(-1, 3))[:, :2]
 
     def _beside(self, recording: str) -> Question:

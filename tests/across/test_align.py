@@ -409,8 +409,8 @@ def test_cells_without_a_value_are_counted_by_column(tmp_path: Path) -> None:
         }
         assert aligned.remarks() == [
             "a.x: 2 of 6 rows are empty: the message has no such value.",
-            "/b: 1 of 6 rows are empty: no message came before.",
-            "b.x: 1 of 6 rows are empty: the message has no such value.",
+            "/b: 1 of 6 rows is empty: no message came before.",
+            "b.x: 1 of 6 rows is empty: the message has no such value.",
         ]
 
 
@@ -478,6 +478,22 @@ def test_lost_messages_explain_empty_cells(tmp_path: Path) -> None:
                 "no message within 200ms before": 1,
             }
         }
+
+
+def test_losses_of_an_unknown_time_explain_no_row(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("now") as recording:
+            for n, topic in enumerate(("/a", "/b")):
+                recording.write(Channel(topic, "json", None, {}), b"{}", log_time=BASE + n)
+    (tmp_path / "store" / "recordings" / "now" / "journal").unlink()
+    with hl.open(tmp_path / "store") as store:
+        aligned = store.align("/a", "/b")
+        aligned.to_arrow()
+        assert store.topic("/b").lost()
+        assert aligned.remarks() == [
+            "/b: 1 of 1 row is empty: no message came before.",
+            "now has lost its journal, so this answer may not be complete.",
+        ]
 
 
 def test_the_command_takes_messages_of_another_recording(logs: Logs) -> None:

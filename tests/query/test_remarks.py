@@ -129,6 +129,9 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
         "2023-11-14T22:13:25Z.",
         "Other recordings span that time: tuesday.",
     ]
+    # A relative time is another one in each recording.
+    relative = store.topic("/n").in_recording("monday").between("+15s", None)
+    assert remarks(relative) == remarks(late)[:1]
     never = store.topic("/n").where("n > 99").windows("1s")
     assert remarks(store.topic("/j").during(never)) == [
         "No time is asked for: there are no events, or no intervals."

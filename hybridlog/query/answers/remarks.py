@@ -18,7 +18,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
 from hybridlog.query.question import field_types
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import format_time
+from hybridlog.query.times import format_time, is_relative
 from hybridlog.query.topics import namesakes
 from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import HybridlogError, TimeError
@@ -235,7 +235,7 @@ def _causes(session: Session, question: Question) -> Iterator[str]:
     if question.bounds is None or not question.is_by_log_time:
         return
     yield from _topics_beside(session, question)
-    if question.recordings is not None:
+    if question.recordings is not None and not any(map(is_relative, question.bounds)):
         yield from _others(session, question)
 
 
