@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 
 from hybridlog.query.answers.next_time import next_time
 from hybridlog.view.context import start_of
-from hybridlog_storage.errors import TopicError
+from hybridlog_storage.errors import TimeError, TopicError
+from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
+    from hybridlog.query.query import Query
     from hybridlog.view.asked import Asked
     from hybridlog.view.context import Context
 
@@ -46,7 +48,9 @@ class Current:
 
 
 def current(context: Context, asked: Asked) -> Current:
-    """The message of the parameters `recording`, `topic` and `at`.
+    """The message of the parameters `recording`, `topic`, `at` and `seq`.
+
+    Of several messages at that time, it is the last one whose arrival number is at most `seq`.
 
     Raises:
         TopicError: No such recording or topic exists.
@@ -55,9 +59,7 @@ def current(context: Context, asked: Asked) -> Current:
     recording, query = context.topic(asked)
     start = start_of(recording)
     moment = asked.moment(start)
-    message = None
-    with suppress(TopicError):  # there is none yet
-        message = query.at(moment)
+    message = _message(query, moment, asked.integer("seq", 0, END, END))
     # Of messages with the same time, the last one is current: the next one is later.
     later = moment if message is None else message.log_time_ns + 1
     until = next_time(context.store.session, recording, query.topics[0], later)
@@ -66,3 +68,16 @@ def current(context: Context, asked: Asked) -> Current:
         None if message is None else str(message.log_time_ns - start),
         None if until is None else str(until - start),
     )
+
+
+def _message(query: Query, moment: int, seq: int) -> Message | None:
+    if seq < END:
+        with suppress(TimeError):
+            beside = query.between(*span_of(moment, moment)).where(f"_meta.seq <= {seq}")
+            found = beside.reverse().first()
+            if found is not None:
+                return found
+        moment -= 1
+    with suppress(TopicError):  # there is none yet
+        return query.at(moment)
+    return None

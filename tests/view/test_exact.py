@@ -55,6 +55,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
                 for n, time in enumerate(TIMES):
                     payload = struct.pack("<Qqddf2Q", *list(row(n).values())[:-1], *row(n)["ids"])
                     recording.write(numbers, payload, log_time=time + (label == "other"))
+        with made.start("twins") as recording:
+            for n in range(12):
+                payload = struct.pack("<Qqddf2Q", *list(row(n).values())[:-1], *row(n)["ids"])
+                recording.write(numbers, payload, log_time=START + n // 3)
         yield made
 
 
@@ -78,6 +82,20 @@ def test_a_match_leads_to_its_message(client: TestClient) -> None:
         after = {**MATCHES, "at": int(at) + 1, "count": 1}
         later = client.get("match-list", params=after).json()["rows"]
         assert [at for at, _ in later] == OFFSETS[n + 1 : n + 2]
+
+
+def test_a_match_leads_to_its_message_among_others_of_its_time(client: TestClient) -> None:
+    asked = {**MATCHES, "recording": "twins"}
+    rows = client.get("match-list", params={**asked, "at": 0}).json()["rows"]
+    assert [at for at, _ in rows] == [str(n // 3) for n in range(12)]
+    for n, (at, seq) in enumerate(rows):
+        found = client.get("message", params={**asked, "at": at, "seq": seq}).json()
+        assert (found["seq"], found["tree"]["items"][0]["text"]) == (seq, str(row(n)["id"]))
+        assert found["until"] == (str(n // 3 + 1) if n < 9 else None)
+    before = {**asked, "at": 1, "seq": rows[2][1]}  # of the time before
+    assert client.get("message", params=before).json()["seq"] == rows[2][1]
+    found = client.get("sql", params={"text": SQL.format("t").replace("jump", "twins")}).json()
+    assert found["at"] == [None] * 12
 
 
 def test_values_of_a_plot_are_exact(client: TestClient) -> None:
@@ -152,13 +170,38 @@ def test_values_of_sql_are_exact(client: TestClient) -> None:
 
 
 def test_a_row_of_sql_leads_into_its_recording(client: TestClient) -> None:
-    text = "select t, recording from num order by t, recording limit 4"
+    where = "where recording <> 'twins'"
+    text = f"select t, recording from num {where} order by t, recording limit 4"
     found = client.get("sql", params={"text": text}).json()
     assert found["recordings"] == ["jump", "other", "jump", "other"]
     assert found["at"] == [str(int(OFFSETS[n // 2]) + n % 2) for n in range(4)]
     boots = client.get("sql", params={"text": "select log_time, recording from boot"}).json()
     assert boots["at"] == ["0", "0"]
     assert sorted(boots["recordings"]) == ["jump", "other"]
+
+
+@pytest.mark.peer("browser")
+def test_the_page_shows_the_match_of_several_at_one_time(page: Page, store: hl.Store) -> None:
+    panels = [{"kind": "message", "topic": "/num", "options": {}}]
+    ask = {"kind": "predicate", "topic": "/num", "text": MATCHES["where"], "within": ""}
+    shown = {"recording": "twins", "panels": json.dumps(panels), "ask": json.dumps(ask)}
+
+    def check(n: int) -> None:
+        page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
+        page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
+        assert page.locator("li[aria-current]").count() == 1
+
+    with served(store) as url:
+        page.goto(f"{url}#{urlencode(shown)}")
+        for n in (4, 5, 3, 0):
+            page.get_by_role("complementary").get_by_role("button", name=f"#{n + 1} ").first.click()
+            check(n)
+        for n in range(1, 9):
+            page.keyboard.press("n")
+            check(n)
+        for n in range(7, 0, -1):
+            page.keyboard.press("p")
+            check(n)
 
 
 @pytest.mark.peer("browser")

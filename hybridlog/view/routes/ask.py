@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -25,12 +26,13 @@ from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
 from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
 from hybridlog.view.question import program, question_of
-from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
     from hybridlog.drawing.matches import Matches
     from hybridlog.sql.topic_view import Remarks
@@ -201,18 +203,32 @@ def _moments(
 def _messages_in(
     context: Context, entry: RecordingEntry, topics: Collection[str], spans: Sequence[range]
 ) -> list[int | None]:
-    """The only log time of messages of some topics in each span, ns; None for none or several."""
+    """The log time of the only message of each of some topics in a span, ns; None for none.
+
+    None also if there are several, of one topic or at several times.
+    """
     ends = [[min(max(time, BEGIN), END) for time in (one[0], one[-1])] for one in spans]
     bounds = np.array([(*span_of(*pair), 0) for pair in ends], np.int64).reshape(-1, 3)
     own = {channel.topic for channel in entry.channels}
     query = context.store.query(sorted(own & {*topics} or own), [entry.id])
     asked = query.during(Intervals.of([(entry.id, bounds)]))
-    known = distinct(
-        np.concatenate([one.log_time for one in asked.match_times()] or [bounds[0:0, 0]])
-    )
+    by_topic: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
+    for found in asked.match_times():
+        by_topic[found.topic].append(found.log_time)
     first, last = np.array(ends, np.int64).reshape(-1, 2).T
-    places = zip(np.searchsorted(known, first), np.searchsorted(known, last, "right"), strict=True)
-    return [int(known[low]) if high - low == 1 else None for low, high in places]
+    least, greatest = np.full(len(spans), END), np.full(len(spans), BEGIN)
+    is_one = np.ones(len(spans), np.bool_)
+    for parts in by_topic.values():
+        known = np.sort(np.concatenate(parts))
+        low, high = np.searchsorted(known, first), np.searchsorted(known, last, "right")
+        is_one &= high - low <= 1
+        there = high > low
+        least[there] = np.minimum(least[there], known[low[there]])
+        greatest[there] = np.maximum(greatest[there], known[low[there]])
+    is_one &= least == greatest
+    return [
+        time if one else None for time, one in zip(least.tolist(), is_one.tolist(), strict=True)
+    ]
 
 
 routes = [

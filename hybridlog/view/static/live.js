@@ -71,9 +71,9 @@ export function followLive(recording) {
     if (!by) return;
     recording.start = start;
     const moved = (time) => (time === null ? null : time + by);
-    const { begin, end, at } = state.get();
+    const { begin, end, at, seq } = state.get();
     recording.info.end += by;
     recording.info.begin += by;
-    state.set({ begin: moved(begin), end: moved(end), at: at + by });
+    state.set({ begin: moved(begin), end: moved(end), at: at + by, seq });
   }
 }

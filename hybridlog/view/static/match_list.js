@@ -36,7 +36,7 @@ export function matchList(recording) {
   let total = 0;
   let shown = { rows: [], before: 0 };
   const [pages, steps] = [new Question(), new Question()];
-  const end = state.on(["at"], mark);
+  const end = state.on(["at", "seq"], mark);
   return { side, show, update, step, destroy };
 
   function destroy() {
@@ -62,7 +62,7 @@ export function matchList(recording) {
     const [first] = shown.rows;
     if (!first) load({ at: recording.info.begin, seq: -1, direction: "later" }, "update");
     else if (shown.rows.length < PAGE)
-      load({ at: first[0], seq: first[1] - 1, direction: "later" }, "update");
+      load({ at: first[0], seq: first[1] - 1n, direction: "later" }, "update");
     else draw();
   }
 
@@ -79,7 +79,7 @@ export function matchList(recording) {
     if (!asked) return null;
     try {
       const found = await question[ask]("match-list", { ...asked, ...place });
-      return { ...found, rows: found.rows.map(([time, seq]) => [state.instant(time), seq]) };
+      return { ...found, rows: found.rows.map((row) => row.map(state.instant)) };
     } catch (error) {
       if (isAborted(error)) return null;
       if (!(error instanceof ApiError)) throw error;
@@ -94,17 +94,19 @@ export function matchList(recording) {
   }
 
   async function step(direction) {
-    const at = state.get("at") + (direction === "later" ? 1n : 0n);
-    const found = await list({ at, seq: -1, direction, count: 1 }, steps, "ask");
+    const { at, seq } = state.get();
+    const isBehind = seq === null && direction === "later"; // all messages of that time
+    const place = { at: isBehind ? at + 1n : at, seq: isBehind ? -1n : (seq ?? -1n) };
+    const found = await list({ ...place, direction, count: 1 }, steps, "ask");
     if (!found) return;
     if (!found.rows.length) {
       notice(direction === "later" ? "No later match." : "No earlier match.");
       return;
     }
-    const [[time, seq]] = found.rows;
-    seek(recording, time);
-    if (!shown.rows.some(([known]) => known === time)) {
-      await load({ at: time, seq: seq - 1, direction: "later" });
+    const [[time, own]] = found.rows;
+    seek(recording, time, own);
+    if (!shown.rows.some(([, known]) => known === own)) {
+      await load({ at: time, seq: own - 1n, direction: "later" });
       mark();
     }
   }
@@ -118,13 +120,13 @@ export function matchList(recording) {
         : "No match";
     fill(
       rows,
-      ...shown.rows.map(([time], number) =>
+      ...shown.rows.map(([time, seq], number) =>
         element(
           "li",
           {},
           element(
             "button",
-            { type: "button", class: "plain", onclick: () => seek(recording, time) },
+            { type: "button", class: "plain", onclick: () => seek(recording, time, seq) },
             element("small", {}, `#${count(shown.before + number + 1)} `),
             offset(time, 9),
           ),
@@ -136,9 +138,10 @@ export function matchList(recording) {
 
   /** Marks the match at the cursor. */
   function mark() {
-    const at = state.get("at");
+    const { at, seq } = state.get();
     [...rows.children].forEach((row, number) => {
-      const isCurrent = shown.rows[number]?.[0] === at;
+      const [time, own] = shown.rows[number] ?? [];
+      const isCurrent = time === at && (seq === null || seq === own);
       row.toggleAttribute("aria-current", isCurrent);
       if (isCurrent) keepVisible(row);
     });

@@ -28,6 +28,8 @@ import points from "./panels/points.js";
  * @property {function(Object)} setOptions changes some of them
  * @property {import("./recording.js").Recording} recording
  * @property {function(): BigInt} cursor ns since the start
+ * @property {function(): ?BigInt} seq the arrival number of the message at the cursor that is
+ *     meant, if it is one of the topic's; null for the last one
  * @property {function(): {begin: BigInt, end: BigInt}} range the visible one
  * @property {function(number|BigInt)} seek moves the cursor
  */
@@ -81,7 +83,7 @@ export function mountPanels(main, recording) {
   draw();
   const ends = [
     state.on(["panels"], draw),
-    state.on(["at", "begin", "end"], update),
+    state.on(["at", "seq", "begin", "end"], update),
     recording.on(draw), // topics may have come
   ];
   return () => {
@@ -159,6 +161,7 @@ export function mountPanels(main, recording) {
         state.set({ panels: panels().map(merged) });
       },
       cursor: () => state.get("at"),
+      seq: () => (state.get("ask")?.topic === panel.topic ? state.get("seq") : null),
       range: () => exactRange(recording),
       seek: (at) => state.set({ at }),
     };

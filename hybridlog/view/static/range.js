@@ -64,10 +64,10 @@ export function lastTime({ info }) {
   return info.end > info.begin ? info.end - 1n : info.begin;
 }
 
-/** Moves the cursor; the range follows when it would be out of sight. */
-export function seek(recording, time) {
+/** Moves the cursor, to a match by its arrival number; the range follows when it is out of sight. */
+export function seek(recording, time, seq = null) {
   const at = clamped(state.instant(time), recording.info.begin, lastTime(recording));
-  state.set({ at });
+  state.set({ at, seq });
   const { begin, end } = exactRange(recording);
   const [now, span] = [Number(at), Number(end - begin)];
   if (at < begin) show(recording, now - span * 0.9, now + span * 0.1);

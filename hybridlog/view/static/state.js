@@ -5,11 +5,13 @@
  * - recording: label or id; "" for the list of recordings
  * - begin, end: the visible range, ns since the start of the recording, as BigInt; null for all
  * - at: the cursor, ns since the start of the recording, as BigInt
+ * - seq: of the messages at the cursor's time, the arrival number of the one that is meant, if it
+ *   is a match; null for the last one
  * - panels: [{kind, topic, options}]
  * - ask: the question {kind, text, …}, or null
  */
 
-const EMPTY = { recording: "", begin: null, end: null, at: 0n, panels: null, ask: null };
+const EMPTY = { recording: "", begin: null, end: null, at: 0n, seq: null, panels: null, ask: null };
 const MOST_PANELS = 24;
 
 let values = { ...EMPTY };
@@ -33,7 +35,8 @@ export function get(key) {
  */
 export function set(given, { isStep = false } = {}) {
   const exact = ([key, value]) => [key, typeof value === "number" ? instant(value) : value];
-  const changes = Object.fromEntries(Object.entries(given).map(exact));
+  const moved = "at" in given ? { seq: null, ...given } : given;
+  const changes = Object.fromEntries(Object.entries(moved).map(exact));
   const changed = Object.keys(changes).filter((key) => !isSame(values[key], changes[key]));
   if (!changed.length) return;
   values = { ...values, ...changes };
@@ -93,7 +96,7 @@ function writeAddress(isStep) {
 function textOf(state) {
   const pairs = new URLSearchParams();
   if (state.recording) pairs.set("recording", state.recording);
-  for (const key of ["begin", "end", "at"]) {
+  for (const key of ["begin", "end", "at", "seq"]) {
     if (state[key] !== EMPTY[key]) pairs.set(key, state[key]);
   }
   for (const key of ["panels", "ask"]) {
@@ -112,6 +115,7 @@ function fromAddress() {
     begin: isRange ? begin : null,
     end: isRange ? end : null,
     at: whole("at") ?? 0n,
+    seq: whole("seq"),
     panels: panelsFrom(parsed(pairs.get("panels"))),
     ask: questionFrom(parsed(pairs.get("ask"))),
   };

@@ -26,9 +26,10 @@ const STILL_PLAYING = 160; // ms between two steps of a cursor that plays
  *     time; its times are texts still
  * @param {function(Answer)} parts.show shows one
  * @param {function(Error)} parts.fail shows why there is none
- * @param {import("../recording.js").Recording} parts.recording
+ * @param {import("../panels.js").Panel} parts.panel
  */
-export function follow({ load, show, fail, recording }) {
+export function follow({ load, show, fail, panel }) {
+  const { recording } = panel;
   let kept = [];
   let { start } = recording; // what the times of these count from
   let shown = null;
@@ -41,7 +42,8 @@ export function follow({ load, show, fail, recording }) {
   const stopped = new AbortController();
   let stopping = 0;
 
-  const covers = ({ time, until }, at) => (time ?? -Infinity) <= at && at < (until ?? Infinity);
+  const covers = ({ time, until, of }, at) =>
+    of === panel.seq() && (time ?? -Infinity) <= at && at < (until ?? Infinity);
 
   function take(answer) {
     if (answer === shown) return;
@@ -80,8 +82,9 @@ export function follow({ load, show, fail, recording }) {
     if (kept.some((answer) => covers(answer, at))) return;
     isRunning = true;
     const begun = performance.now();
+    const of = panel.seq();
     try {
-      const answer = await load(at, stopped.signal);
+      const answer = Object.assign(await load(at, stopped.signal), { of });
       if (isGone) return;
       for (const name of ["time", "until"]) answer[name] &&= instant(answer[name]);
       if (recording.start === start) received(answer, at);

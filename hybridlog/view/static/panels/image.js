@@ -41,12 +41,12 @@ function mount(body, panel) {
     load,
     show,
     fail: (error) => problem(error.message),
-    recording: panel.recording,
+    panel,
   });
 
   /** The picture, decoded already, so that it takes the place of another one at once. */
   async function load(at, signal) {
-    const response = await request("image", { ...asked, at }, { signal });
+    const response = await request("image", { ...asked, at, seq: panel.seq() }, { signal });
     const time = response.headers.get("Hybridlog-Time");
     const until = response.headers.get("Hybridlog-Until");
     const type = response.headers.get("Content-Type");

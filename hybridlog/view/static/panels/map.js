@@ -69,7 +69,7 @@ function mount(body, panel) {
   const drawn = plane(place, { label: `Track of ${panel.topic.topic}`, paint, pick });
   fit.addEventListener("click", drawn.reset);
   const following = follow({
-    load: (at, signal) => get("fix", { ...asked, at }, { signal }),
+    load: (at, signal) => get("fix", { ...asked, at, seq: panel.seq() }, { signal }),
     show(found) {
       fix = found;
       describe();
@@ -80,7 +80,7 @@ function mount(body, panel) {
       facts.textContent = error.message;
       drawn.redraw();
     },
-    recording: panel.recording,
+    panel,
   });
   update();
   return {

@@ -32,10 +32,10 @@ function mount(body, panel) {
   let top = null;
 
   const following = follow({
-    load: (at, signal) => get("message", { ...asked, at }, { signal }),
+    load: (at, signal) => get("message", { ...asked, at, seq: panel.seq() }, { signal }),
     show,
     fail: (error) => problem(error.message),
-    recording: panel.recording,
+    panel,
   });
 
   function show(found) {
@@ -63,6 +63,7 @@ function mount(body, panel) {
       const found = await get("message", {
         ...asked,
         at: of.time,
+        seq: of.seq,
         path: path.join("."),
         begin,
         count: number,

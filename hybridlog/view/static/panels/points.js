@@ -83,7 +83,7 @@ function mount(body, panel) {
     load,
     show: (answer) => show(answer),
     fail: (error) => refuse(error.message),
-    recording: panel.recording,
+    panel,
   });
   following.want(panel.cursor());
   return {
@@ -109,7 +109,7 @@ function mount(body, panel) {
   }
 
   async function load(at, signal) {
-    const parameters = { recording: panel.recording.info.id, topic: panel.topic.topic, at };
+    const parameters = { recording: panel.recording.info.id, topic: panel.topic.topic, at, seq: panel.seq() };
     const value = chosen() ?? usual;
     const isAxis = AXES.includes(value) || value === PLAIN;
     const buffer = await bytes("points", { ...parameters, value: isAxis ? null : value }, { signal });
