@@ -6,7 +6,8 @@ the folder that somebody may find after the power has failed.
 
 The model: writes to a file reach the disk in any order, in pieces of a sector, or not at all,
 until the file is synced. Names reach it in order, until the folder is synced. To sync a file
-keeps its name, too, as journalling file systems do.
+keeps its name, too, as journalling file systems do; others do not, see `keeps_names`. A file
+that is renamed into another folder keeps its old name until that folder has the new one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import errno
 import os
 import random
 import stat
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -55,6 +56,8 @@ class _Folder:
     durable: dict[str, int] = field(default_factory=dict)
     pending: list[tuple[str | None, str | None, int]] = field(default_factory=list)
     """Old name, new name, and what it is; a new file has no old name, a removed one no new."""
+    left: list[tuple[_Folder, str]] = field(default_factory=list)
+    """Other folders, and names in them of files that were moved here since the last sync."""
 
     def apply(self, count: int) -> dict[str, int]:
         """The names when so many changes have reached the disk."""
@@ -73,21 +76,37 @@ class PowerCut(System):
     Args:
         root: The folder that is watched, as it is now.
         calls: How many calls work; None for all.
+        keeps_names: Whether a file that is synced keeps its name.
+        forgets: Tells of a sync whether it is to do nothing.
     """
 
-    def __init__(self, root: Path, calls: int | None = None) -> None:
+    def __init__(
+        self,
+        root: Path,
+        calls: int | None = None,
+        *,
+        keeps_names: bool = True,
+        forgets: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.calls = 0
         self._left = calls
+        self._keeps_names = keeps_names
+        self._forgets = forgets
+        # By a number of ours, as the system uses the number of a removed file again.
         self._files: dict[int, _File] = {}
         self._folders: dict[int, _Folder] = {}
-        self._root = root.stat().st_ino
-        for path in [root, *root.rglob("*")]:
+        self._numbers: dict[int, int] = {}
+        paths = [root, *root.rglob("*")]
+        for path in paths:
+            self._numbers[path.lstat().st_ino] = len(self._numbers)
+        self._made = len(self._numbers)
+        for path in paths:
             about = path.lstat()
             if stat.S_ISDIR(about.st_mode):
-                inside = {p.name: p.lstat().st_ino for p in path.iterdir()}
-                self._folders[about.st_ino] = _Folder(inside)
+                inside = {p.name: self._numbers[p.lstat().st_ino] for p in path.iterdir()}
+                self._folders[self._numbers[about.st_ino]] = _Folder(inside)
             elif stat.S_ISREG(about.st_mode):
-                self._files[about.st_ino] = _File(path.read_bytes())
+                self._files[self._numbers[about.st_ino]] = _File(path.read_bytes())
 
     @property
     def is_off(self) -> bool:
@@ -107,10 +126,10 @@ class PowerCut(System):
         self._step()
         is_new = not _exists(name, folder)
         fd = super().open(name, flags, mode, folder=folder)
-        inode = os.fstat(fd).st_ino
         if is_new and folder is not None:
-            self._files[inode] = _File()
-            self._folder(folder).pending.append((None, name, inode))
+            number = self._new_number(os.fstat(fd))
+            self._files[number] = _File()
+            self._folder(folder).pending.append((None, name, number))
         elif flags & os.O_TRUNC:
             self._file(fd).pending.append((0, None))
         return fd
@@ -131,11 +150,16 @@ class PowerCut(System):
 
     def sync(self, fd: int) -> None:
         self._step()
-        inode = os.fstat(fd).st_ino
-        if inode in self._folders:
-            folder = self._folders[inode]
+        if self._forgets():
+            return
+        number = self._number(os.fstat(fd))
+        if number in self._folders:
+            folder = self._folders[number]
             folder.durable = folder.apply(len(folder.pending))
             folder.pending.clear()
+            for other, name in folder.left:
+                other.pending.append((name, None, 0))
+            folder.left.clear()
             return
         file = self._file(fd)
         content = bytearray(file.durable)
@@ -146,8 +170,8 @@ class PowerCut(System):
                 _put(content, position, data)
         file.durable = bytes(content)
         file.pending.clear()
-        for folder in self._folders.values():
-            places = [n for n, change in enumerate(folder.pending) if change[2] == inode]
+        for folder in self._folders.values() if self._keeps_names else ():
+            places = [n for n, change in enumerate(folder.pending) if change[2] == number]
             if places and folder.pending[places[0]][0] is None:  # it is new
                 count = places[0] + 1
                 folder.durable = folder.apply(count)
@@ -155,9 +179,14 @@ class PowerCut(System):
 
     def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
         self._step()
-        inode = os.stat(old, dir_fd=folder, follow_symlinks=False).st_ino
+        number = self._number(os.stat(old, dir_fd=folder, follow_symlinks=False))
         super().rename(old, new, folder=folder, new_folder=new_folder)
-        self._folder(folder).pending.append((old, new, inode))
+        before, after = self._folder(folder), self._folder(new_folder)
+        if before is after:
+            before.pending.append((old, new, number))
+        else:
+            after.pending.append((None, new, number))
+            after.left.append((before, old))
 
     def unlink(self, name: str, *, folder: int) -> None:
         self._step()
@@ -167,9 +196,9 @@ class PowerCut(System):
     def mkdir(self, name: str, mode: int, *, folder: int) -> None:
         self._step()
         super().mkdir(name, mode, folder=folder)
-        inode = os.stat(name, dir_fd=folder).st_ino
-        self._folders[inode] = _Folder()
-        self._folder(folder).pending.append((None, name, inode))
+        number = self._new_number(os.stat(name, dir_fd=folder))
+        self._folders[number] = _Folder()
+        self._folder(folder).pending.append((None, name, number))
 
     def rmdir(self, name: str, *, folder: int) -> None:
         self._step()
@@ -178,17 +207,17 @@ class PowerCut(System):
 
     def after_cut(self, target: Path, rng: random.Random) -> None:
         """Make the folder that may be found after a cut at this moment."""
-        self._lay(self._root, target, rng)
+        self._lay(0, target, rng)
 
-    def _lay(self, inode: int, target: Path, rng: random.Random) -> None:
-        if inode in self._folders:
+    def _lay(self, number: int, target: Path, rng: random.Random) -> None:
+        if number in self._folders:
             target.mkdir()
-            folder = self._folders[inode]
+            folder = self._folders[number]
             names = folder.apply(rng.randrange(len(folder.pending) + 1))
             for name, inside in names.items():
                 self._lay(inside, target / name, rng)
-        elif inode in self._files:
-            target.write_bytes(self._files[inode].survive(rng))
+        elif number in self._files:
+            target.write_bytes(self._files[number].survive(rng))
 
     def _note(self, fd: int, parts: Sequence[memoryview], position: int, done: int) -> int:
         data = b"".join(parts)[:done]
@@ -196,10 +225,19 @@ class PowerCut(System):
         return done
 
     def _file(self, fd: int) -> _File:
-        return self._files.setdefault(os.fstat(fd).st_ino, _File())
+        return self._files.setdefault(self._number(os.fstat(fd)), _File())
 
     def _folder(self, fd: int) -> _Folder:
-        return self._folders.setdefault(os.fstat(fd).st_ino, _Folder())
+        return self._folders.setdefault(self._number(os.fstat(fd)), _Folder())
+
+    def _number(self, about: os.stat_result) -> int:
+        known = self._numbers.get(about.st_ino)
+        return self._new_number(about) if known is None else known
+
+    def _new_number(self, about: os.stat_result) -> int:
+        self._made += 1
+        self._numbers[about.st_ino] = self._made
+        return self._made
 
 
 def _exists(name: str, folder: int | None) -> bool:

@@ -229,3 +229,19 @@ def test_a_recording_without_its_end_gets_one(store: Path) -> None:
     assert state is not None
     assert state.end is not None  # the last segment says it
     assert status == state.end["status"] == "complete"
+
+
+def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:
+    """The segment comes back from a copy: its number and its arrival numbers are still its own."""
+    last = max((store / "recordings" / "one").glob("*.mcap"))
+    whole = last.read_bytes()
+    last.unlink()
+    with closing(hl.open(store, mongo=NOWHERE)) as opened:
+        opened.mark("one", "+1s", "slip")
+    assert not last.exists()
+    last.write_bytes(whole)
+    with closing(hl.open(store, mongo=NOWHERE)) as opened:
+        entry = opened.entry("one")
+        assert (entry.status, entry.messages, len(entry.marks)) == ("complete", COUNT + 1, 1)
+        seqs = [m.seq for m in opened.all_topics().in_recording("one")]
+        assert len(set(seqs)) == len(seqs) == COUNT + 1

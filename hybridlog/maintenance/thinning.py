@@ -21,7 +21,7 @@ from hybridlog.maintenance.report import CompactedTopic
 from hybridlog.payloads import files as payload_files
 from hybridlog.payloads.contents import MovedContents, open_segment
 from hybridlog.payloads.layout import thinned_name
-from hybridlog_storage import files, journal
+from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.segment_check import SegmentCheck
@@ -156,7 +156,6 @@ def _replace(
     try:
         written = thin(reader, target, movable, about)
         _prove(target, reader, summary, movable)
-        files.sync_folder(path)
         line = {"segment": reader.number, "bytes": written.bytes, "digest": written.digest}
         Journal(path).append(journal.event(journal.COMPACTED, segments=[line]))
         listed = True

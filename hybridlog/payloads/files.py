@@ -36,14 +36,16 @@ def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
     try:
         names = sorted(payload_names(recording, PARTS))
         moved = [name for name in names if name in listed]
-        for name in moved:
-            folder = (final / name).parent
+        folders = {(final / name).parent for name in moved}
+        for folder in folders:
             files.make_folders(folder, depth=IN_PAYLOADS - 1)
-            files.rename(parts / name, final / name, depth=IN_PAYLOADS, new_depth=IN_PAYLOADS)
-            files.sync_folder(folder, depth=IN_PAYLOADS - 1)
-        if moved:
-            files.sync_folder(final, depth=files.IN_RECORDING)
+        if moved:  # folders are on the disk before anything moves into them
             files.sync_folder(recording)
+            files.sync_folder(final, depth=files.IN_RECORDING)
+        for name in moved:
+            files.rename(parts / name, final / name, depth=IN_PAYLOADS, new_depth=IN_PAYLOADS)
+        for folder in folders:
+            files.sync_folder(folder, depth=IN_PAYLOADS - 1)
         files.remove_tree(parts, depth=files.IN_RECORDING)
     except OSError as error:
         raise durability.explain(error, final, "moving payloads to") from error

@@ -5,15 +5,18 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
 import hybridlog as hl
+from hybridlog.payloads import writer
 from hybridlog.query.engines.base import Need
 from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import PayloadError
+from hybridlog_storage.segment_writer import SegmentSettings
 from tests.payloads.logs import BASE, COUNT, SCAN, STEP, scan, write_log
 
 
@@ -221,3 +224,37 @@ def test_sql_reads_arrays_from_columns(
     assert found.num_rows > 10
     assert answers[0].counts.chunks > 0
     assert (answers[1].counts.chunks > 0) == from_chunks
+
+
+@pytest.mark.parametrize("size", ["GROUP_BYTES", "FILE_BYTES"])
+def test_late_messages_in_row_groups_and_files_of_their_own(
+    size: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is in order of time, and each begins before the one in front of it has ended."""
+    order = [n for late in range(3) for n in range(late, 60, 3)]
+    said = [scan(np.full(400, (n * n) % 7, np.float32)) for n in range(60)]
+    rows = [("/scan", SCAN, BASE + n * STEP, said[n]) for n in order]
+    log = write_log(tmp_path / "log.mcap", rows)
+    settings = SegmentSettings(chunk_size=20 * len(said[0]) + len(said[0]) // 2)
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(log, name="log", settings=settings)
+        (entry,) = store.recordings()
+        assert entry.chunks == 3
+        scans = store.topic("/scan")
+
+        def answers() -> list[Any]:
+            return [
+                [(i.begin_ns, i.end_ns) for i in scans.where(f"ranges.max {text}").intervals()]
+                for text in ("> 2.5", "== 2", "< 1", "== 4")
+            ] + [[m.log_time_ns for m in scans.where("ranges.max == 2")]]
+
+        before = answers()
+        assert all(before)
+        monkeypatch.setattr(writer, size, 1)
+        store.compact(topics=["scan"])
+        assert answers() == before
+    with hl.open(tmp_path / "store") as store:
+        scans = store.topic("/scan")
+        assert answers() == before
+        # Columns would be read one after the other.
+        assert store.session.payload_readers(store.recordings()[0], "/scan") is None

@@ -199,6 +199,8 @@ def _set(array: str, row: int, field: str, change: int) -> Callable[[ChunkTable]
         (_set("parts", 2, "channel", 70_000), "not in order"),
         (_set("parts", 0, "first", -1), "times"),
         (_set("parts", 1, "last", 100), "times"),
+        (_set("parts", 0, "last", -1), "times"),
+        (_set("parts", 1, "first", 1), "times"),
         (_set("chunks", 0, "first", 1), "times"),
         (_set("chunks", 2, "last", 1), "times"),
         (_set("parts", 0, "messages", -1), "times"),
