@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import traceback
 from contextlib import suppress
@@ -43,6 +42,8 @@ def serve(handle: int) -> None:
                 if private_bytes() > most - OWN_MEMORY // 2:
                     break  # free memory may stay reserved: a new process has it all
                 threading.Thread(target=_answer, args=(context, asked)).start()
+                if isinstance(context, HybridlogError):
+                    break  # the next process may be able to open it
 
 
 def _opened(path: str, mongo: str | None) -> Context | HybridlogError:
@@ -60,9 +61,9 @@ def _answer(context: Context | HybridlogError, asked: Connection[Any, Any]) -> N
         work, arguments = asked.recv()
         if isinstance(context, HybridlogError):
             asked.send((False, context))
-            os._exit(1)  # the next one may be able to open it
+            return
         try:
-            context.refresh()
+            context.refresh(0.0)
             with until_given_up(_GivenUp(asked)):
                 answer = True, work(context, *arguments)
         except HybridlogError as error:
