@@ -9,7 +9,6 @@ import numpy as np
 
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
-from hybridlog.query.topics import resolve
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
@@ -119,10 +118,10 @@ class Recordings(Sequence["RecordingEntry"]):
         Raises:
             TopicError: There is no recording; or a name matches no topic, or several.
         """
-        known = self.check().topics()
+        self.check()
         if not names:
-            raise TopicError(f"Name a topic. There are: {listed(known)}.")
-        return self._query(resolve(names, known))
+            raise TopicError(f"Name a topic. There are: {listed(self.topics())}.")
+        return self._query(self._session.resolve_in(names, self.ids))
 
     def all_topics(self) -> Query:
         """Make a query about all topics of these recordings.

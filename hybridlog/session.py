@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
     from hybridlog_storage.topic_places import TopicPlaces
 
+_SHOWN = 5  # recordings in a message
 _MAX_OPEN_SEGMENTS = 256
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
 _TRIES = 5  # to connect, while the connection breaks
@@ -804,6 +805,33 @@ class Session:
             there = f"There are: {listed(known)}." if known else "The store is empty."
             raise TopicError(f"Name a topic. {there}")
         return self.having(resolve(names, known))
+
+    def resolve_in(self, names: Sequence[str], recordings: Sequence[str]) -> list[str]:
+        """The topics of some recordings that patterns match.
+
+        Args:
+            names: The patterns.
+            recordings: Ids.
+
+        Raises:
+            TopicError: as for `resolve`; also lists other recordings with such a topic.
+        """
+        snapshot = self.look(recordings)
+        places = [snapshot.by_id[one] for one in recordings if one in snapshot.by_id]
+        known = snapshot.topics_at(np.array(places, np.intp))
+        try:
+            return resolve(names, known)
+        except TopicError as error:
+            found: list[str] = []
+            for name in names:
+                with suppress(TopicError):
+                    found += resolve([name], snapshot.topics)
+            others = snapshot.having({*found}.difference(known)).tolist()
+            if not others:
+                raise
+            labels = listed((snapshot.summaries[place].label for place in others), _SHOWN)
+            have = "has" if len(others) == 1 else "have"
+            raise TopicError(f"{error}; in the store, {labels} {have} such a topic") from error
 
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from hybridlog.choice import Choice
-from hybridlog.wording import listed
-from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
@@ -100,31 +98,7 @@ def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Quer
     chosen = recordings_of(store, choice)
     if not topics:
         return chosen.all_topics()
-    with _name_other_recordings(store, topics, chosen.topics()):
-        return chosen.topic(*topics)
-
-
-@contextmanager
-def _name_other_recordings(
-    store: Store, topics: Sequence[str], known: Collection[str]
-) -> Iterator[None]:
-    """Add the recordings that have a topic to the error that the chosen ones do not."""
-    try:
-        yield
-    except TopicError as error:
-        for topic in topics:
-            having: set[str] = set()
-            with suppress(TopicError):
-                query = store.topic(topic)
-                if set(query.topics).isdisjoint(known):
-                    having = set(query.recordings)
-            labels = [one.label for one in store.summaries() if one.id in having]
-            if labels:
-                have = "has" if len(labels) == 1 else "have"
-                raise TopicError(
-                    f"{error}; in the store, {listed(labels, _SHOWN)} {have} such a topic"
-                ) from error
-        raise
+    return chosen.topic(*topics)
 
 
 def parse_fields(text: str, option: str = "--fields") -> list[str]:

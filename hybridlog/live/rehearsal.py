@@ -24,6 +24,7 @@ from hybridlog.query.predicate.types import check
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT, DurationLike, parse_duration, parse_time
+from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, TimeError, TopicError, WhereError
 
 if TYPE_CHECKING:
@@ -98,6 +99,9 @@ def rehearse(
     remarks: list[str] = []
     able = [topic for topic in topics if _can_fire(session, trigger, topic, remarks)]
     everything = Question(*session.having(session.topics(), recordings))
+    held = {*session.snapshot().topics_at(session.chosen(everything))}
+    if held.isdisjoint(topics):
+        remarks.append(f"No recording that was asked has {listed(topics)}.")
     if since is not None:
         everything = replace(everything, bounds=(_begin(since), TIME_LIMIT - 1))
     parts = []

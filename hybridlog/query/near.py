@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -47,12 +47,12 @@ def question_about(
     Raises:
         TopicError: no such topic exists in the recordings.
     """
-    snapshot = session.look(question.recordings)
-    known: Collection[str] = snapshot.topics
-    if question.recordings is not None:
-        places = session.chosen(question).tolist()
-        known = {t for place in places for t in snapshot.topics_of(snapshot.summaries[place])}
-    found = Question(*session.having(resolve([topic], known), question.recordings))
+    asked = question.recordings
+    if asked is None:
+        topics = resolve([topic], session.look(None).topics)
+    else:
+        topics = session.resolve_in([topic], asked)
+    found = Question(*session.having(topics, asked))
     if question.is_unbounded or not question.is_by_log_time:
         return found
     spans = RangeResolver(session, question).spans()

@@ -10,7 +10,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query.topics import namesakes
-from hybridlog_storage.errors import TimeError
+from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -141,6 +141,19 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
         store.topic("/n").in_recording("monday").between(day, day + 1).count()
     with pytest.raises(TimeError, match=r"Z\.$"):
         store.topic("/n").between(day + SECOND, day + 2 * SECOND).count()
+
+
+def test_a_topic_of_another_recording_is_named_as_one(store: hl.Store) -> None:
+    elsewhere = r"there is no topic '/?j'; there is /n; in the store, monday has such a topic$"
+    with pytest.raises(TopicError, match=elsewhere):
+        store.recordings("tuesday").topic("j")
+    with pytest.raises(TopicError, match=elsewhere):
+        store.topic("/n").in_recording("tuesday").where("/j: n > 1", within="1s")
+    with pytest.raises(TopicError, match=r"there is no topic '/k'; there is /n$"):
+        store.recordings("tuesday").topic("/k")
+    told = store.rehearse("/j: n > 1", recordings=["tuesday"])
+    assert (told.fired, told.remarks) == (0, ("No recording that was asked has /j.",))
+    assert store.rehearse("/j: n > 1").remarks == ()
 
 
 def test_a_short_name_that_several_topics_end_with(store: hl.Store) -> None:
