@@ -103,8 +103,8 @@ def _print_rebuilt(store: Store) -> None:
     if store.catalog.locked is not None:
         path, store.catalog.locked = store.catalog.locked, None
         note(
-            f"Another process keeps the catalog locked, so the files answer, more slowly. End it: "
-            f"`fuser -v {path}` shows which one it is."
+            "Another process keeps the catalog locked, so the files answer, more slowly. If it "
+            f"does not end by itself, end it: `fuser -v {path}` shows which one it is."
         )
     if repairs.tables:
         note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
