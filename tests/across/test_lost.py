@@ -162,14 +162,14 @@ def test_the_commands(damaged: Damaged) -> None:
     states = ("intervals", "-t", "n", "-r", "part", "--where", "v == 1", "--json")
     rows = run(*states, "--state", "not-held", store=damaged.path)
     assert [(r["begin_ns"] - BASE) // SECOND for r in rows.json] == [2, 9]
-    assert "this answer may not be: 3 messages lost in 3 places;" in rows.err
+    assert "this answer may not be: 3 messages lost in 3 places (segment);" in rows.err
 
 
 def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
     store, path = damaged.store, damaged.path
     topic = store.topic("n").in_recording("part")
     lack = "part is not complete, so this answer may not be: {}; `hybridlog info part` says where."
-    whole = [lack.format("3 messages lost in 3 places")]
+    whole = [lack.format("3 messages lost in 3 places (segment)")]
     for remarks, command in (
         (lambda: topic.count() and topic.remarks(), ("fetch", "--count", "-t", "n")),
         (lambda: topic.to_arrow() and topic.remarks(), ("fetch", "-t", "n")),
@@ -187,12 +187,12 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
     # Only what is lost in the range.
     for begin, end, said in (
         ("+0s", "+4s", []),
-        ("+8s", "+9s", [lack.format("1 message lost in 1 place")]),
+        ("+8s", "+9s", [lack.format("1 message lost in 1 place (segment)")]),
     ):
         asked = topic.between(begin, end)
         assert (asked.remarks(is_empty=False), bool(asked.lost())) == (said, bool(said))
     # The message that was lost may have been the current one.
-    assert topic.at_time("+4.5s").remarks() == [lack.format("1 message lost in 1 place")]
+    assert topic.at_time("+4.5s").remarks() == [lack.format("1 message lost in 1 place (segment)")]
     assert topic.at_time("+4.5s").lost()
     assert topic.at_time("+3.5s").remarks() == []
     with pytest.raises(IncompleteError):

@@ -85,6 +85,7 @@ def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_p
     # Chunks of large messages are written first.
     count = run("fetch", "-t", "front/image_raw", "-r", "robot", "--count", store=fresh)
     assert "robot is not complete" in count.err
+    assert "lost in 1 place (cut short by a crash);" in count.err
     assert "all is well" in run("verify", store=fresh).out
 
 

@@ -99,8 +99,9 @@ def _about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str
     others = {JOURNAL_LOST, Cause.THROTTLE, Cause.DEGRADE}
     lost = [row for row in rows if row["cause"] not in others]
     if lost:
+        causes = listed(dict.fromkeys(row["cause"] for row in lost), _SHOWN)
         yield (
-            f"{label} is not complete, so this answer may not be: {in_words(lost)}; "
+            f"{label} is not complete, so this answer may not be: {in_words(lost)} ({causes}); "
             f"`hybridlog info {label}` says where."
         )
 
