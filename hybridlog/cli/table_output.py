@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from hybridlog.cli.progress import Bar
     from hybridlog.export.base import Target
+    from hybridlog.export.jsonl import Line
 
 _FORMATS = ("table", "jsonl", "csv", "parquet", "arrow")
 _SUFFIXES = {
@@ -157,8 +158,7 @@ def _write(
 
         with JsonlWriter(target) as writer:
             for table in tables:
-                for lines in _lines(table):
-                    writer.write_lines(lines)
+                writer.write_lines(_lines(table))
                 rows += table.num_rows
         return rows
     from hybridlog.export import open_table_writer
@@ -170,19 +170,15 @@ def _write(
     return rows
 
 
-def _lines(table: pa.Table) -> Iterator[list[str]]:
+def _lines(table: pa.Table) -> Iterator[Line]:
     """Rows as JSON objects: the log time as `log_time_ns`, as in all JSON lines."""
     import pyarrow as pa
 
-    from hybridlog.export.json_text import json_column
-    from hybridlog.export.jsonl import rows_within
+    from hybridlog.export.jsonl import json_rows
 
     names = ["log_time_ns" if name == "log_time" else name for name in table.column_names]
-    table = table.rename_columns(names)
-    rows = rows_within(table.nbytes, table.num_rows)
-    for batch in table.combine_chunks().to_batches(rows):
-        records = pa.StructArray.from_arrays(batch.columns, names)
-        yield json_column(records).to_pylist()
+    for batch in table.combine_chunks().to_batches():
+        yield from json_rows(pa.StructArray.from_arrays(batch.columns, names))
 
 
 def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:

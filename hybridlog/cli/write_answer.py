@@ -95,13 +95,17 @@ def _write_rows(query: Query, form: str, target: Target, progress: Progress) -> 
     from hybridlog.export import open_table_writer
     from hybridlog.export.jsonl import JsonlWriter
     from hybridlog.frames.answer import json_columns
+    from hybridlog.frames.lines import lines
+    from hybridlog.query.planner import Planner
 
     written = 0
     if form == "jsonl":
         with JsonlWriter(target) as rows:
-            for lines in query.to_json_lines():
-                rows.write_lines(lines)
-                written += len(lines)
+            query.session.renew()
+            query.counters.reset()
+            for some in lines(Planner(query.session, query.question, query.counters)):
+                rows.write_lines(some)
+                written += len(some)
                 progress()
         return written
     schema = query.schema()

@@ -9,10 +9,17 @@ from __future__ import annotations
 
 import base64
 import json
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PIECE_BYTES: Final = 3 << 17
+"""Bytes of values whose text is made at once where it is made in pieces."""
 
 
 def json_column(array: pa.Array) -> pa.Array:
@@ -29,6 +36,44 @@ def json_column(array: pa.Array) -> pa.Array:
     """
     text = _values(array)
     return pc.fill_null(text, "null") if text.null_count else text
+
+
+def json_pieces(array: pa.Array) -> Iterator[str]:
+    """The JSON of an array of one row, in pieces: the text of a long array is never whole."""
+    kind = array.type
+    if array.nbytes <= PIECE_BYTES or array.null_count:
+        yield json_column(array)[0].as_py()
+    elif pa.types.is_struct(kind):
+        for index, field in enumerate(kind):
+            yield f"{', ' if index else '{'}{json.dumps(field.name)}: "
+            yield from json_pieces(array.field(index))
+        yield "}"
+    elif _is_list(kind):
+        elements = array.flatten()
+        rows = max(PIECE_BYTES * len(elements) // max(elements.nbytes, 1), 1)
+        yield "["
+        for begin in range(0, len(elements), rows):
+            part = elements.slice(begin, rows)
+            yield ", " if begin else ""
+            if len(part) == 1:
+                yield from json_pieces(part)
+            else:
+                yield ", ".join(json_column(part).to_pylist())
+        yield "]"
+    elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        text = array[0].as_py()
+        yield '"'
+        for begin in range(0, len(text), PIECE_BYTES):
+            yield json.dumps(text[begin : begin + PIECE_BYTES])[1:-1]
+        yield '"'
+    elif is_binary(kind):
+        data = memoryview(array[0].as_buffer())
+        yield '"'
+        for begin in range(0, len(data), PIECE_BYTES):  # a multiple of three bytes
+            yield base64.b64encode(data[begin : begin + PIECE_BYTES]).decode()
+        yield '"'
+    else:
+        yield json_column(array)[0].as_py()
 
 
 def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
@@ -51,7 +96,7 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         words = array.dictionary_encode()
         quoted = [json.dumps(word) for word in words.dictionary.to_pylist()]
         return pa.array(quoted, pa.string()).take(words.indices)
-    if pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or _is_fixed_binary(kind):
+    if is_binary(kind):
         return pc.binary_join_element_wise('"', base64_column(array), '"', "")
     if pa.types.is_temporal(kind):  # dates, times of day, intervals
         texts = [None if value is None else _temporal(value) for value in array.to_pylist()]
@@ -144,5 +189,7 @@ def _is_list(kind: pa.DataType) -> bool:
     )
 
 
-def _is_fixed_binary(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_fixed_size_binary(kind))
+def is_binary(kind: pa.DataType) -> bool:
+    """True for bytes of any width."""
+    kinds = (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_fixed_size_binary)
+    return any(is_kind(kind) for is_kind in kinds)

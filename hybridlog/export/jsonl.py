@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from datetime import date, timedelta
-from typing import Any
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -21,6 +22,11 @@ from hybridlog.export.base import FileWriter, Sink, Target
 from hybridlog.schema.plain import without_nan
 from hybridlog_storage.errors import UsageError
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Line: TypeAlias = "str | Iterator[str]"
+"""A line, or its pieces."""
 _MAX_DEPTH = 200
 _BLOCK = 1 << 20
 _ROWS = 4096
@@ -71,13 +77,23 @@ class JsonlWriter(FileWriter):
                 block, size = [], 0
         self._sink.write(b"".join(block))
 
-    def write_lines(self, lines: Sequence[str]) -> None:
+    def write_lines(self, lines: Iterable[Line]) -> None:
         """Append lines that are made already, without their ends.
 
         Raises:
             DiskFullError: No space left.
         """
-        self._sink.write("".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace"))
+        block: list[str] = []
+        size = 0
+        for piece in chain.from_iterable(
+            (f"{line}\n",) if isinstance(line, str) else chain(line, "\n") for line in lines
+        ):
+            block.append(piece)
+            size += len(piece)
+            if size >= _BLOCK:
+                self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
+                block, size = [], 0
+        self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
 
     def _finish(self) -> None:
         self._sink.commit()
@@ -92,8 +108,45 @@ def rows_within(size: int, rows: int, *, limit: int = 16 << 20) -> int:
     return int(min(_ROWS, max(1, limit // per_row)))
 
 
-def json_line(row: Mapping[str, object]) -> str:
-    """An object as one line of JSON, without its end.
+def json_rows(records: pa.StructArray) -> Iterator[Line]:
+    """Rows of columns as lines, long ones in pieces."""
+    from hybridlog.export.json_text import PIECE_BYTES, json_column, json_pieces
+
+    rows = rows_within(records.nbytes, len(records))
+    for begin in range(0, len(records), rows):
+        part = records.slice(begin, rows)
+        if part.nbytes > PIECE_BYTES * rows:
+            yield from (json_pieces(part.slice(row, 1)) for row in range(len(part)))
+        else:
+            yield from json_column(part).to_pylist()
+
+
+def object_line(row: Mapping[str, object]) -> Line:
+    """An object as one line of JSON, without its end; in pieces if it has a long list.
+
+    Raises:
+        UsageError: A value that has no JSON form.
+    """
+    if any(isinstance(value, list) and len(value) > _ROWS for value in row.values()):
+        return _pieces(row)
+    return json_line(row)
+
+
+def _pieces(row: Mapping[str, object]) -> Iterator[str]:
+    for number, (name, value) in enumerate(row.items()):
+        yield f"{', ' if number else '{'}{json_line(name)}: "
+        if not isinstance(value, list):
+            yield json_line(value)
+            continue
+        for begin in range(0, max(len(value), 1), _ROWS):
+            yield ", " if begin else "["
+            yield json_line(value[begin : begin + _ROWS])[1:-1]
+        yield "]"
+    yield "}"
+
+
+def json_line(row: object) -> str:
+    """A value as one line of JSON, without its end.
 
     Raises:
         UsageError: A value that has no JSON form.

@@ -8,6 +8,7 @@ null, and a new one is an error, because these formats fix their columns.
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Iterator
 from typing import Protocol
 
@@ -17,7 +18,13 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from hybridlog.export.base import FileWriter, Sink, Target
-from hybridlog.export.json_text import base64_column, json_column
+from hybridlog.export.json_text import (
+    PIECE_BYTES,
+    base64_column,
+    is_binary,
+    json_column,
+    json_pieces,
+)
 from hybridlog.export.jsonl import rows_within
 from hybridlog.schema.arrow_types import common_schema, converted, is_list
 from hybridlog_storage.errors import UsageError
@@ -26,6 +33,7 @@ HELD_BYTES = 32 << 20
 """Default limit of the pieces held back to learn the columns, bytes."""
 GROUP_BYTES = 32 << 20
 GROUP_ROWS = 1 << 17
+_LONG_ROW = 1 << 20
 
 
 class _ArrowFile(Protocol):
@@ -169,9 +177,20 @@ class ParquetWriter(TableFileWriter):
     format_name = "parquet"
 
     def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        exact = [path for field in schema for path in _exact_leaves(field.name, field.type)]
+        leaves = [leaf for field in schema for leaf in _leaves(field.name, field.type)]
+        # Arrow holds the dictionary of a long array, and many copies of a long text.
+        has_long_rows = self._bytes > _LONG_ROW * max(self._rows, 1)
         writer: _ArrowFile = pa.parquet.ParquetWriter(
-            sink, schema, compression="zstd", write_statistics=exact
+            sink,
+            schema,
+            compression="zstd",
+            use_dictionary=[] if has_long_rows else [path for path, _ in leaves],
+            write_statistics=[
+                path
+                for path, kind in leaves
+                if not pa.types.is_floating(kind)
+                and not (has_long_rows and not pa.types.is_primitive(kind))
+            ],
         )
         return writer
 
@@ -183,15 +202,15 @@ class ParquetWriter(TableFileWriter):
         return table
 
 
-def _exact_leaves(path: str, kind: pa.DataType) -> Iterator[str]:
-    """Paths of the leaves of a column that are no floats, as Parquet spells them."""
+def _leaves(path: str, kind: pa.DataType) -> Iterator[tuple[str, pa.DataType]]:
+    """Paths and types of the leaves of a column, as Parquet spells them."""
     if pa.types.is_struct(kind):
         for field in kind:
-            yield from _exact_leaves(f"{path}.{field.name}", field.type)
+            yield from _leaves(f"{path}.{field.name}", field.type)
     elif is_list(kind):
-        yield from _exact_leaves(f"{path}.list.element", kind.value_type)
-    elif not pa.types.is_floating(kind):
-        yield path
+        yield from _leaves(f"{path}.list.element", kind.value_type)
+    else:
+        yield path, kind
 
 
 class ArrowWriter(TableFileWriter):
@@ -223,30 +242,91 @@ class CsvWriter(TableFileWriter):
     format_name = "csv"
 
     def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        if not schema.names:
-            return _Nothing()
-        writer: _ArrowFile = pa.csv.CSVWriter(sink, schema)
-        return writer
+        return _CsvFile(sink, schema) if schema.names else _Nothing()
 
-    def _prepared(self, table: pa.Table) -> pa.Table:
-        for index, field in enumerate(table.schema):
-            kind = field.type
-            if kind == pa.json_():
-                chunks = [chunk.storage for chunk in table.column(index).chunks]
-                column = pa.chunked_array(chunks, pa.string())
-            elif pa.types.is_null(kind) or pa.types.is_dictionary(kind):
-                column = table.column(index).cast(
-                    pa.string() if pa.types.is_null(kind) else kind.value_type
-                )
-            elif _is_binary(kind):
-                chunks = [base64_column(chunk) for chunk in table.column(index).chunks]
-                column = pa.chunked_array(chunks, pa.string())
-            elif pa.types.is_nested(kind):
-                column = _json_chunks(table.select([index]))
-            else:
+
+class _CsvFile:
+    """Rows as text, long ones cell by cell and in pieces.
+
+    Args:
+        sink: The output.
+        schema: The columns.
+    """
+
+    def __init__(self, sink: Sink, schema: pa.Schema) -> None:
+        self._sink = sink
+        nothing = [pa.nulls(0, field.type) for field in schema]
+        empty = _as_text(pa.Table.from_arrays(nothing, schema=schema))
+        self._writer = pa.csv.CSVWriter(sink, empty.schema)
+
+    def write_table(self, table: pa.Table) -> None:
+        """Write rows."""
+        rows = rows_within(table.nbytes, table.num_rows)
+        for begin in range(0, table.num_rows, rows):
+            part = table.slice(begin, rows)
+            if part.nbytes <= PIECE_BYTES * rows:
+                self._writer.write_table(_as_text(part))
                 continue
-            table = table.set_column(index, field.name, column)
-        return table
+            for row in range(part.num_rows):
+                for piece in _row_pieces(part.slice(row, 1)):
+                    self._sink.write(piece)
+
+    def close(self) -> None:
+        """End the file."""
+        self._writer.close()
+
+
+def _row_pieces(row: pa.Table) -> Iterator[bytes]:
+    """The text of one row in pieces."""
+    for index, column in enumerate(row.columns):
+        yield b"," if index else b""
+        array = column.combine_chunks()
+        if pa.types.is_string(column.type) and array.nbytes > PIECE_BYTES and not array.null_count:
+            text = array[0].as_py()
+            yield b'"'
+            for begin in range(0, len(text), PIECE_BYTES):
+                yield text[begin : begin + PIECE_BYTES].replace('"', '""').encode()
+            yield b'"'
+        elif array.null_count or not (pa.types.is_nested(column.type) or is_binary(column.type)):
+            cell = io.BytesIO()
+            pa.csv.write_csv(
+                _as_text(row.select([index])), cell, pa.csv.WriteOptions(include_header=False)
+            )
+            yield cell.getvalue()[:-1]
+        elif pa.types.is_nested(column.type):
+            yield b'"'
+            for piece in json_pieces(array):
+                yield piece.replace('"', '""').encode("utf-8", "backslashreplace")
+            yield b'"'
+        else:
+            yield from (piece.encode() for piece in json_pieces(array))
+    yield b"\n"
+
+
+def _as_text(table: pa.Table) -> pa.Table:
+    """The table with columns that a CSV file can have."""
+    for index, field in enumerate(table.schema):
+        kind = field.type
+        if kind == pa.json_():
+            chunks = [chunk.storage for chunk in table.column(index).chunks]
+            column = pa.chunked_array(chunks, pa.string())
+        elif pa.types.is_null(kind) or pa.types.is_dictionary(kind):
+            column = table.column(index).cast(
+                pa.string() if pa.types.is_null(kind) else kind.value_type
+            )
+        elif is_binary(kind):
+            chunks = [base64_column(chunk) for chunk in table.column(index).chunks]
+            column = pa.chunked_array(chunks, pa.string())
+        elif pa.types.is_nested(kind):
+            chunks = []
+            for array in table.column(index).chunks:
+                text = json_column(array)
+                chunks.append(pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string())))
+            column = pa.chunked_array(chunks, pa.string())
+        else:
+            continue
+        table = table.set_column(index, field.name, column)
+    return table
 
 
 class _Nothing:
@@ -257,24 +337,6 @@ class _Nothing:
 
     def close(self) -> None:
         """Nothing to close."""
-
-
-def _json_chunks(column: pa.Table) -> pa.ChunkedArray:
-    chunks = []
-    rows = rows_within(column.nbytes, column.num_rows)
-    for batch in column.to_batches(max_chunksize=rows):
-        array = batch.column(0)
-        text = json_column(array)
-        chunks.append(pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string())))
-    return pa.chunked_array(chunks, pa.string())
-
-
-def _is_binary(kind: pa.DataType) -> bool:
-    return bool(
-        pa.types.is_binary(kind)
-        or pa.types.is_large_binary(kind)
-        or pa.types.is_fixed_size_binary(kind)
-    )
 
 
 def _check_names(schema: pa.Schema) -> None:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from hybridlog.export.json_text import json_column
-from hybridlog.export.jsonl import json_line, rows_within
+from hybridlog.export.jsonl import Line, json_rows, object_line
 from hybridlog.frames.answer import Decoder
 from hybridlog.frames.builder import Block
 from hybridlog.frames.columns import flat, summary_array, with_summaries
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
 
-def lines(planner: Planner) -> Iterator[list[str]]:
+def lines(planner: Planner) -> Iterator[list[Line]]:
     """The messages of an answer in order, in batches: one JSON object for each message.
 
     It has `log_time_ns`, `topic`, `recording` if there are several, and the fields of the
@@ -45,9 +44,9 @@ def lines(planner: Planner) -> Iterator[list[str]]:
         yield _lines_of(run, decoder, planner)
 
 
-def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[str]:
+def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[Line]:
     """The lines of a run, in its order."""
-    found: list[str | None] = [None] * len(run.batch)
+    found: list[Line | None] = [None] * len(run.batch)
     for number, rows in rows_by_channel(run.batch.channel):
         channel = decoder.channels[number]
         if channel.is_reduced:
@@ -67,7 +66,7 @@ def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[str]:
     return [line for line in found if line is not None]
 
 
-def _of_columns(block: Block, topic: str, fields: Sequence[str] | None) -> Iterator[str]:
+def _of_columns(block: Block, topic: str, fields: Sequence[str] | None) -> Iterator[Line]:
     """Lines of messages that all have every field."""
     times = pa.array(block.log_time)
     columns: dict[str, pa.Array[Any]] = {"log_time_ns": times, "topic": _repeated(topic, times)}
@@ -76,10 +75,7 @@ def _of_columns(block: Block, topic: str, fields: Sequence[str] | None) -> Itera
     leaves = with_summaries(flat(block.records), fields)
     for path in _by_fields(leaves, fields):
         columns[free_name(path, columns)] = leaves[path]
-    records = structs(columns, len(times))
-    rows = rows_within(records.nbytes, len(records))
-    for begin in range(0, len(records), rows):
-        yield from json_column(records.slice(begin, rows)).to_pylist()
+    yield from json_rows(structs(columns, len(times)))
 
 
 def _by_fields(names: Iterable[str], fields: Sequence[str] | None) -> list[str]:
@@ -109,7 +105,7 @@ def _firsts(
 
 def _of_objects(
     firsts: Sequence[Mapping[str, Any]], decoded: DecodedObjects, fields: Sequence[str] | None
-) -> Iterator[str]:
+) -> Iterator[Line]:
     """Lines of messages with different fields."""
     wanted = None
     if fields is not None:
@@ -121,7 +117,7 @@ def _of_objects(
             _summarise(leaves, fields)
         for path in _by_fields(leaves, fields):
             row[free_name(path, row)] = leaves[path]
-        yield json_line(row)
+        yield object_line(row)
 
 
 def _flat(message: Mapping[str, Any]) -> dict[str, Any]:

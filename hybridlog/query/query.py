@@ -851,7 +851,8 @@ class Query:
         """The answer in order as lines of JSON, many at a time."""
         from hybridlog.frames.lines import lines
 
-        return lines(self._planner())
+        for batch in lines(self._planner()):
+            yield [line if isinstance(line, str) else "".join(line) for line in batch]
 
     @of_one_moment
     def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:

@@ -110,6 +110,6 @@ class JsonCodec:
 
 def _parsed(payload: memoryview) -> Plain:
     try:
-        return cast("Plain", json.loads(bytes(payload).decode("utf-8-sig")))
+        return cast("Plain", json.loads(str(payload, "utf-8-sig")))
     except (ValueError, RecursionError) as error:
         raise PayloadError(f"the payload is not JSON: {error}") from error

@@ -6,6 +6,7 @@ import io
 import itertools
 import json
 import math
+import random
 import zipfile
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,8 +20,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridlog.export import json_text, jsonl, tables
 from hybridlog.export.json_text import json_column
-from hybridlog.export.jsonl import JsonlWriter, message_row
+from hybridlog.export.jsonl import (
+    JsonlWriter,
+    json_line,
+    json_rows,
+    message_row,
+    object_line,
+)
 from hybridlog.export.npz import NpzWriter
 from hybridlog.export.tables import ArrowWriter, CsvWriter, ParquetWriter
 from hybridlog_storage.errors import UsageError
@@ -440,3 +448,39 @@ def test_npz_names_stay_in_their_place() -> None:
         entries = archive.namelist()
     assert len(set(entries)) == len(entries) == len(names) + 1
     assert not any("/" in entry or "\\" in entry for entry in entries)
+
+
+def test_long_rows_in_pieces_are_the_same_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = random.Random(0)
+    rows = [
+        {
+            "s": rng.choice(["a", 'b"c', "é,\n", None, "", "x" * 40]),
+            "l": rng.choice([None, [], [rng.random() for _ in range(rng.choice([1, 50]))]]),
+            "n": rng.choice([None, 1, 2]),
+            "b": rng.choice([None, b"xyz" * 5, b"", b"1234"]),
+            "m": [{"x": rng.choice([1.5, math.nan]), "q": ['"', "z"] * rng.choice([0, 3])}]
+            * rng.choice([0, 1, 9]),
+            "d": {"k": rng.choice([None, True]), "t": [1] * 3},
+        }
+        for _ in range(100)
+    ]
+    table = pa.Table.from_pylist(rows)
+    records = table.to_struct_array().combine_chunks()
+
+    def written() -> tuple[bytes, bytes]:
+        csv, lines = io.BytesIO(), io.BytesIO()
+        with CsvWriter(csv) as writer:
+            writer.write(table)
+        with JsonlWriter(lines) as jsonl_writer:
+            jsonl_writer.write_lines(json_rows(records))
+        return csv.getvalue(), lines.getvalue()
+
+    whole = written()
+    for module in (tables, jsonl):
+        monkeypatch.setattr(module, "rows_within", lambda *_: 1)
+    for size in (3, 30, 300):
+        monkeypatch.setattr(json_text, "PIECE_BYTES", size)
+        monkeypatch.setattr(tables, "PIECE_BYTES", size)
+        assert written() == whole
+    long = {"a": [1, math.nan, "é"] * 3000, "b": [], "c": {"d": [None] * 5000}, "e": 2**70}
+    assert "".join(object_line(long)) == json_line(long)
