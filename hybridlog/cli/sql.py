@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 
 import click
@@ -63,9 +62,8 @@ def command(
     if query is None and not is_prompt:
         query = sys.stdin.read()
     opening = opened_store(store, mongo, quiet=quiet, is_lasting=is_prompt)
-    with opening as opened, ExitStack() as stack:
+    with opening as opened:
         connection = opened.sql_engine.connect(most)
-        stack.enter_context(limited_memory(connection.memory))
 
         def check(text: str) -> None:
             known = set(opened.topics())
@@ -78,7 +76,7 @@ def command(
 
             run_prompt(connection, choices, seconds, check)
             return
-        with if_stopped("The query was stopped."):
+        with if_stopped("The query was stopped."), limited_memory(connection.memory):
             check(query or "")
             answer = connection.query(query or "", timeout=seconds)
             write_answer(answer, choices)

@@ -13,6 +13,7 @@ from hybridlog.cli.output import note, say
 from hybridlog.cli.sql_answer import print_remarks, write_answer
 from hybridlog.consent import state_directory
 from hybridlog.sql.completion import DELIMITERS, candidates
+from hybridlog.sql.memory_limit import limited_memory
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import at_safe_points
 
@@ -50,7 +51,7 @@ def run_prompt(
             if not text.strip():
                 continue
             try:
-                with at_safe_points():
+                with at_safe_points(), limited_memory(connection.memory):
                     check(text)
                     answer = connection.query(text, timeout=timeout)
                     write_answer(answer, choices)

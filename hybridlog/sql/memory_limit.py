@@ -13,8 +13,8 @@ OWN_MEMORY: Final = 512 << 20
 """Bytes that hybridlog may take beside DuckDB, on top of what the process has at the start."""
 
 
-# What Arrow reserves by default would count as taken; it reads this when it is loaded.
-os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+# What Arrow reserves would count as taken; it reads this when it is loaded.
+os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
 
 
 def private_bytes() -> int:
