@@ -32,12 +32,11 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher
 
-    settings = segment_settings(choices)
-    if choices.split_size is not None:
-        least = _MIN_SEGMENT
-        settings = replace(settings, segment_size=_size("--split-size", choices.split_size, least))
-    if choices.split_duration is not None:
-        settings = replace(settings, segment_span_s=_seconds(choices.split_duration))
+    settings = replace(
+        segment_settings(choices),
+        segment_size=_size("--split-size", choices.split_size, _MIN_SEGMENT),
+        segment_span_s=_seconds(choices.split_duration),
+    )
     flush_interval_s = _seconds(choices.flush_interval)
     if not 0 < flush_interval_s <= _MAX_FLUSH_S:
         raise UsageError("--flush-interval must be longer than 0, and at most an hour.")

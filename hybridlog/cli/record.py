@@ -160,12 +160,14 @@ def _is_file(word: str) -> bool:
 @click.option(
     "--split-size",
     cls=_LiveOption,
+    default="1GiB",
     metavar="SIZE",
     help="Start a new segment file after this size.",
 )
 @click.option(
     "--split-duration",
     cls=_LiveOption,
+    default="10m",
     metavar="TIME",
     help="Start a new segment file after this time.",
 )

@@ -53,8 +53,8 @@ class RecordChoices:
     duration: str | None
     max_messages: int | None
     max_size: str | None
-    split_size: str | None
-    split_duration: str | None
+    split_size: str
+    split_duration: str
     use_sim_time: bool
     throttle: tuple[str, ...]
     priority: tuple[str, ...]

@@ -27,7 +27,12 @@ from hybridlog.live.policy import (
     first_fit,
     retention,
 )
-from hybridlog.live.recording import LiveOptions, LiveRecording, indexed_within_s
+from hybridlog.live.recording import (
+    LIVE_SETTINGS,
+    LiveOptions,
+    LiveRecording,
+    indexed_within_s,
+)
 from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
@@ -38,13 +43,13 @@ from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.recorder import RecordReport
     from hybridlog.store import Store
+    from hybridlog_storage.segment_writer import SegmentSettings
 
 _LOOK_S = 1.0
 _JUMP_S = 0.5
@@ -89,7 +94,7 @@ class RecorderOptions:
     reserve_bytes: int = 1 << 30
     budget_bytes: int = field(default_factory=default_budget)
     flush_interval_s: float = 1.0
-    settings: SegmentSettings = field(default_factory=SegmentSettings)
+    settings: SegmentSettings = LIVE_SETTINGS
     snapshots: SnapshotOptions | None = None
     no_index: TopicMatcher | None = None
     use_sim_time: bool = False

@@ -64,6 +64,8 @@ _LATE_S = 0.01  # a large message that waits longer for its copy starts both mea
 _LATE_TIMES = 20  # for this multiple of its waiting time
 _RATE_S = 0.25  # interval at which the incoming rate is measured
 _MAX_NS = 1 << 63
+LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
+"""Live segments are short, since what is not sealed is read anew by each command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ class LiveOptions:
         budget_bytes: Payload bytes that may be in memory, not written yet.
         flush_interval_s: Seconds after which a message is in the segment at the latest. A
             `kill -9` can cost the messages of this time.
-        settings: Settings of segments and chunks.
+        settings: Settings of segments and chunks; segments of 1 GiB or ten minutes.
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
     """
 
@@ -84,7 +86,7 @@ class LiveOptions:
     source: Mapping[str, Any] = field(default_factory=dict)
     budget_bytes: int = field(default_factory=default_budget)
     flush_interval_s: float = 1.0
-    settings: SegmentSettings = field(default_factory=SegmentSettings)
+    settings: SegmentSettings = LIVE_SETTINGS
     no_index: TopicMatcher | None = None
 
     def __post_init__(self) -> None:
