@@ -442,6 +442,11 @@ class Session:
                     moment, self._pinned.moment = self._pinned.moment, before
                 yield step
 
+    @property
+    def is_at_one_moment(self) -> bool:
+        """True within `at_one_moment`, in this thread."""
+        return getattr(self._pinned, "moment", None) is not None
+
     def renew(self) -> _Moment:
         """Begin a new moment, unless this thread asks about an earlier one."""
         pinned: _Moment | None = getattr(self._pinned, "moment", None)

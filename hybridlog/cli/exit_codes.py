@@ -20,7 +20,7 @@ EXIT_CODES: Final = {
     8: "this content is in the store already",
     9: "an optional package is missing",
     10: "no fields: the message definition does not give them",
-    11: "--strict: messages of the asked range are lost",
+    11: "--strict: messages of the asked range are lost, or not written yet",
     INTERNAL: "an error in hybridlog itself",
     130: "interrupted (Ctrl-C): undone, or finished by a later command",
     143: "ended (SIGTERM): undone, or finished by a later command",

@@ -16,11 +16,12 @@ from hybridlog.cli.answer_notes import print_cost, print_lost, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
-from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.write_answer import write_answer
+from hybridlog.cli.signals import Stopped, if_stopped
+from hybridlog.cli.write_answer import write_answer, write_following
 from hybridlog.export import PICTURES
 from hybridlog.export.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     from hybridlog.choice import Choice
@@ -60,6 +61,7 @@ class _Choices:
     limit: int | None
     every: int
     reverse: bool
+    follow: bool
     fields: str | None
     tags: str | None
     within: str | None
@@ -100,6 +102,12 @@ class _Choices:
     "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Only every n-th message."
 )
 @click.option("--reverse", is_flag=True, help="Latest first.")
+@click.option(
+    "--follow",
+    is_flag=True,
+    help="Of running recordings: print messages as they come, from now on or from the beginning "
+    "of --between, until the recordings end or Ctrl-C.",
+)
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
 @options.tag_columns
 @click.option(
@@ -144,8 +152,13 @@ def command(**parameters: Any) -> None:
     form = _form(choices)
     path = _path(choices, form)
     started = time.monotonic()
-    with opened_store(choices.store, choices.mongo, quiet=choices.quiet) as store:
+    with opened_store(
+        choices.store, choices.mongo, quiet=choices.quiet, is_lasting=choices.follow
+    ) as store:
         query = _query(store, choices)
+        if choices.follow:
+            _follow(query, choices, form)
+            return
         if choices.at is not None:
             try:
                 query = query.at_time(choices.at)
@@ -169,6 +182,31 @@ def command(**parameters: Any) -> None:
             print_remarks(query, choices.topic)
             if count is not None:
                 print_lost(query, count)
+
+
+def _follow(query: Query, choices: _Choices, form: str) -> None:
+    """Print messages as they come, then what they may lack."""
+    started = time.monotonic()
+    following = query.follow(*choices.topic)
+    stopped: Stopped | None = None
+    try:
+        with at_safe_points():
+            write_following(following, form, sys.stdout.buffer)
+    except Stopped as error:
+        stopped = error
+    if not choices.quiet:
+        print_cost(query.counters, time.monotonic() - started, count=False)
+        from hybridlog.cli.recording_summary import status
+        from hybridlog.query.query import Query
+
+        asked = Query(query.session, following.question)
+        asked.counters = query.counters
+        print_remarks(asked, choices.topic)
+        for one in asked.summaries():
+            if one.status != "open":
+                output.note(f"{one.label} has ended: {status(one)}.")
+    if stopped is not None:
+        raise stopped
 
 
 def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Query:
@@ -216,19 +254,9 @@ def _query(store: Store, choices: _Choices) -> Query:
 
 def _form(choices: _Choices) -> str:
     _check_near(choices)
-    if choices.at is not None:
-        for given, option in (
-            (choices.between is not None, "--between"),
-            (choices.limit is not None, "--limit"),
-            (choices.every > 1, "--every"),
-            (choices.reverse, "--reverse"),
-            (choices.clock != "log", "--clock"),
-            (any(map(_names_topics, choices.where)), "--where with other topics"),
-        ):
-            if given:
-                raise UsageError(f"--at gives one message, by log time: leave out {option}.")
-    if choices.form is not None:
-        form = choices.form
+    _check_together(choices)
+    if choices.form is not None or choices.follow:
+        form = choices.form or "jsonl"
     elif choices.output is None or str(choices.output) == "-":
         form = "table" if sys.stdout.isatty() else "jsonl"
     else:
@@ -241,6 +269,35 @@ def _form(choices: _Choices) -> str:
     if form == "table" and choices.output is not None:
         raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
     return form
+
+
+def _check_together(choices: _Choices) -> None:
+    """Refuse options that --at or --follow make no sense with."""
+    with_others = any(map(_names_topics, choices.where)), "--where with other topics"
+    alone: dict[str, list[tuple[bool, str]]] = {}
+    if choices.at is not None:
+        alone["--at gives one message, by log time"] = [
+            (choices.between is not None, "--between"),
+            (choices.limit is not None, "--limit"),
+            (choices.every > 1, "--every"),
+            (choices.reverse, "--reverse"),
+            (choices.clock != "log", "--clock"),
+            with_others,
+        ]
+    if choices.follow:
+        alone["--follow prints messages as they come, in lines (jsonl, csv)"] = [
+            (choices.form not in {None, *_TEXT}, f"--format {choices.form}"),
+            (choices.output is not None, "--output"),
+            (choices.reverse, "--reverse"),
+            (choices.count, "--count"),
+            (choices.at is not None, "--at"),
+            (choices.strict, "--strict"),
+            with_others,
+        ]
+    for reason, others in alone.items():
+        for given, option in others:
+            if given:
+                raise UsageError(f"{reason}: leave out {option}.")
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from itertools import chain
+from typing import TYPE_CHECKING, BinaryIO
 
 from hybridlog.cli import output
 from hybridlog.cli.progress import progress_bar
@@ -14,10 +15,12 @@ from hybridlog_storage.errors import (
     PayloadError,
     UsageError,
 )
+from hybridlog_storage.stopping import anywhere
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
     from hybridlog.export.base import Target
+    from hybridlog.query.answers.follow import Following
     from hybridlog.query.query import Query
 
 Progress = Callable[[], None]
@@ -62,6 +65,29 @@ def write_answer(
             return 0
         written = _write_rows(query, form, target, progress)
         return counters.messages - counters.reduced - written
+
+
+def write_following(following: Following, form: str, stream: BinaryIO) -> None:
+    """Write messages as they come as `jsonl` or `csv`, and flush those that come together."""
+    from hybridlog.export.jsonl import JsonlWriter
+    from hybridlog.export.tables import CsvWriter
+    from hybridlog.frames.answer import stream as tables_of
+    from hybridlog.frames.lines import lines
+
+    if form == "jsonl":
+        with JsonlWriter(stream) as rows:
+            for some in lines(following):
+                with anywhere():
+                    rows.write_lines(some)
+                    stream.flush()
+        return
+    tables = tables_of(following, at_once=True)
+    first = next(tables)
+    with CsvWriter(stream, schema=first.schema) as writer:
+        for table in chain([first], tables):
+            writer.write(table)
+            with anywhere():
+                writer.flush()
 
 
 def _write_exact(

@@ -87,6 +87,12 @@ class TableFileWriter(FileWriter):
             elif self._bytes >= GROUP_BYTES or self._rows >= GROUP_ROWS:
                 self._write_group()
 
+    def flush(self) -> None:
+        """Write the rows so far."""
+        with self._failures():
+            self._write_group()
+        self._sink.flush()
+
     def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
         raise NotImplementedError
 

@@ -72,10 +72,14 @@ def _collected(planner: Planner) -> TableBuilder:
     return builder
 
 
-def stream(planner: Planner) -> Iterator[pa.Table]:
+def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     """The answer in order, in tables of bounded size; at least one, possibly empty.
 
     The type of a column may differ between tables if no definition fixes it.
+
+    Args:
+        planner: Planner of the question.
+        at_once: True for a table of the columns, and one of what is read at a time.
     """
     question = planner.question
     groups: Iterator[Iterable[Block]]
@@ -89,14 +93,14 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
     builder, size = _builder(question), 0
     given = False
     for group in groups:
-        # Blocks of one group overlap in time, so no table ends between them.
-        if len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
-            yield _finished(builder, question)
-            given = True
-            builder, size = _builder(question), 0
         for block in group:
             builder.append(block)
             size += block.size
+        # Blocks of one group overlap in time, so no table ends between them.
+        if at_once or len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
+            yield _finished(builder, question)
+            given = True
+            builder, size = _builder(question), 0
     if len(builder) or not given:
         yield _finished(builder, question)
 

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.budget import default_budget
@@ -127,6 +127,7 @@ class RecorderState:
         free_bytes: Free space of the disk.
         stored_bytes: Payload bytes stored so far.
         snapshots: Snapshots so far; None when everything is stored.
+        taken: Messages that are stored or will be, by topic, when the state is requested.
     """
 
     name: str
@@ -142,6 +143,7 @@ class RecorderState:
     free_bytes: int
     stored_bytes: int
     snapshots: int | None = None
+    taken: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -517,7 +519,9 @@ class Recorder:
 
     def _ask_state(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         state = self._state
-        return {} if state is None else summary_of(state)
+        if state is None or isinstance(self._target, Snapshots):
+            return {} if state is None else summary_of(state)
+        return summary_of(replace(state, taken=self._target.taken))
 
     def _ask_mark(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         text, tags = request.get("text"), request.get("tags")
@@ -741,6 +745,7 @@ def summary_of(state: RecorderState) -> dict[str, Any]:
     return {
         **{k: v for k, v in asdict(state).items() if k != "topics"},
         "lost": dict(state.lost),
+        "taken": dict(state.taken),
         "topics": [asdict(topic) for topic in state.topics],
     }
 

@@ -64,6 +64,7 @@ _LATE_S = 0.01  # a large message that waits longer for its copy starts both mea
 _LATE_TIMES = 20  # for this multiple of its waiting time
 _RATE_S = 0.25  # interval at which the incoming rate is measured
 _MAX_NS = 1 << 63
+_SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
 """Live segments are short, since what is not sealed is read anew by each command."""
 
@@ -190,7 +191,7 @@ class LiveRecording:
                 database,
                 name=name,
                 tags=options.tags,
-                source={"path": "", "kind": "live", "profile": "", "bytes": 0, **options.source},
+                source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
                 settings=options.settings,
                 no_index=options.no_index,
                 pressure=Backpressure(
@@ -335,6 +336,15 @@ class LiveRecording:
     def is_empty(self) -> bool:
         """True if it has taken no message."""
         return not any(self._taken)
+
+    @property
+    def taken(self) -> Counter[str]:
+        """Messages taken so far, by topic."""
+        found: Counter[str] = Counter()
+        with self._lock:
+            for channel, messages in zip(self._channels, self._taken, strict=True):
+                found[channel.topic] += messages
+        return found
 
     @property
     def lag(self) -> int:

@@ -25,6 +25,7 @@ class Counters:
         documents_read: Index documents received from MongoDB.
         reduced: Messages left out because only their fields were recorded.
         unreadable: Messages of the predicate's topics that do not fit their definition.
+        unindexed: Messages of running recordings that the index lacks, if it has answered.
         elapsed_s: Wall time, seconds.
     """
 
@@ -36,6 +37,7 @@ class Counters:
     documents_read: int = 0
     reduced: int = 0
     unreadable: int = 0
+    unindexed: int = 0
     elapsed_s: float = 0.0
 
     def reset(self) -> None:

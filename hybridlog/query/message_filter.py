@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.query.predicate.tree import And, Opaque, Predicate, is_meta, nodes
+from hybridlog.query.predicate.tree import And, Opaque, Predicate, nodes
 from hybridlog_storage.errors import DefinitionError, PayloadError, WhereError
 
 if TYPE_CHECKING:
@@ -17,18 +17,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch
-
-
-_ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
-"""Fields of index documents that messages do not have."""
-
-
-def can_decide(predicate: Predicate) -> bool:
-    """True if the messages alone decide a predicate, without MongoDB."""
-    names = [path.split(".") for path in predicate.fields() if is_meta(path)]
-    if any(len(name) < 2 or name[1] in _ONLY_INDEXED for name in names):
-        return False
-    return not predicate.is_opaque
 
 
 def residual(predicate: Predicate) -> Predicate | None:

@@ -400,12 +400,31 @@ class Planner:
             self._told.add(part)
             if part.blind:
                 unseen = replace(part, channels=part.blind, blind=(), predicate=None)
-                by_times = self._catalog[1]
-                is_known = by_times.cost(unseen, Need.COUNT) is not None
-                engine = by_times if is_known else self._scan
-                self.counters.unreadable += engine.count([unseen])
+                self.counters.unreadable += self._count_stored(unseen)
+            if part.needs_index and self._mongo.reaches(part):
+                self.counters.unindexed += self.count_unindexed([part])
             if part.predicate.is_opaque and self._mongo.reaches(part):
                 self.counters.unreadable += self._mongo.count_unasked(part)
+
+    def _count_stored(self, part: Part) -> int:
+        """Number of messages of a part without a predicate."""
+        by_times = self._catalog[1]
+        engine = self._scan if by_times.cost(part, Need.COUNT) is None else by_times
+        return engine.count([part])
+
+    def count_unindexed(self, parts: Iterable[Part]) -> int:
+        """Number of messages of running recordings, in the range, that the index lacks.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+            IndexChangedError: another process changes the index.
+        """
+        total = 0
+        for part in (part for part in parts if part.recording.status == "open"):
+            channels = (*part.channels, *part.blind)
+            whole = replace(part, channels=channels, blind=(), predicate=None)
+            total += max(self._count_stored(whole) - self._mongo.count([whole]), 0)
+        return total
 
     def _undecided(self, part: Part) -> Predicate | None:
         """The share of a part's predicate that is left when MongoDB has answered."""
@@ -597,14 +616,15 @@ def _after(item: _Rows, key: _Key) -> _Rows | None:
 
 def _thinned(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
-    number = {topic: n for n, topic in enumerate(question.topics)}
-    seen = np.zeros(len(number), np.int64)
+    number: dict[str, int] = {}
+    seen: dict[int, int] = defaultdict(int)
     given = 0
     for run in runs:
         keep = np.ones(len(run.batch), np.bool_)
         if question.every > 1:
-            of = np.array([number[c.channel.topic] for c in run.channels], np.intp)
-            topics = of[run.batch.channel]
+            names = (channel.channel.topic for channel in run.channels)
+            of = [number.setdefault(name, len(number)) for name in names]
+            topics = np.array(of, np.intp)[run.batch.channel]
             for topic in np.unique(topics).tolist():
                 rows = np.flatnonzero(topics == topic)
                 keep[rows] = (seen[topic] + np.arange(len(rows))) % question.every == 0

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from hybridlog.choice import During, Tags, Texts
     from hybridlog.message import Message
     from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.answers.follow import Following
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.answers.lost import Lost
     from hybridlog.query.answers.match_times import MatchTimes
@@ -461,6 +462,24 @@ class Query:
         for run in self._planner().runs():
             yield from messages_in(run)
 
+    def follow(self, *names: str) -> Following:
+        """The messages that running recordings flush from now on, until all of them have ended.
+
+        With `between`, also those that are flushed already. Each comes once; those that are
+        flushed together are in order of log time. MongoDB is not needed.
+
+        Args:
+            names: The topics as they were written: globs take topics that appear later.
+
+        Raises:
+            UsageError: No recording of the question is running, or it has `reverse`, `during`
+                or a filter that MongoDB answers.
+        """
+        from hybridlog.query.answers.follow import Following
+
+        self.counters.reset()
+        return Following(self.session, self.question, self.counters, names)
+
     def first(self) -> Message | None:
         """The first message; None if the answer is empty."""
         return next(iter(self.limit(1)), None)
@@ -759,6 +778,7 @@ class Query:
         """
         from hybridlog.query.answers.index_documents import index_documents
 
+        self.session.renew()
         self.counters.reset()
         return index_documents(self.session, self.question, self.counters)
 
@@ -921,16 +941,16 @@ class Query:
         Raises:
             TimeError: the range is empty, or outside all recordings.
         """
-        from hybridlog.query.answers.lost import Lost, lost_in
+        from hybridlog.query.answers.lost import lost_in
 
         found = lost_in(self.session, self.question)
         if any(lost_in(self.session, one.question) for one in self.conditions):
-            found = Lost(found.messages, False, found.reduced, found.rows)
+            found = replace(found, is_exact=False)
         return found
 
     @of_one_moment
     def check_complete(self, *, payloads: bool = False) -> None:
-        """Check that no message of the asked range is lost.
+        """Check that no message of the asked range is lost, or not written yet.
 
         Args:
             payloads: True to check that no payload is missing, too.
@@ -939,12 +959,21 @@ class Query:
             IncompleteError: some are.
             TimeError: the range is empty, or outside all recordings.
         """
+        from hybridlog.query.answers.lost import unindexed, unwritten
+
         found = self.lost()
         if found:
             raise IncompleteError(
                 f"{found.told} in this range; `hybridlog losses` says where. Without --strict the "
                 "rest is given."
             )
+        for question in (self.question, *(one.question for one in self.conditions)):
+            late = [told for _, told in unwritten(self.session, question)]
+            if question.predicate is not None and question.predicate.needs_index:
+                planner = Planner(self.session, question, Counters())
+                late += map(unindexed, filter(None, [planner.count_unindexed(planner.parts())]))
+            if late:
+                raise IncompleteError(" ".join(late))
         if payloads and found.reduced:
             raise IncompleteError(
                 f"Of {found.reduced} messages in this range only the fields are stored. Without "

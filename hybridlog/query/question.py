@@ -165,6 +165,11 @@ class Part:
         """True if all of its messages have documents in MongoDB."""
         return all(c.channel.is_indexed for c in self.channels if c.stats.messages)
 
+    @property
+    def needs_index(self) -> bool:
+        """True if only MongoDB can answer the predicate."""
+        return self.predicate is not None and self.predicate.needs_index
+
     @lazy
     def field_types(self) -> Mapping[str, str] | None:
         """Types of the fields by path; None where a definition does not fix them."""

@@ -131,7 +131,7 @@ class RangeResolver:
     def _bounds_of(self, places: NDArray[np.intp]) -> tuple[list[Span], NDArray[np.intp]]:
         """A range that is relative to each recording, and the recordings that it overlaps."""
         summaries = self._session.snapshot().summaries
-        found = [(place, self._bounds_in(summaries[place])) for place in places.tolist()]
+        found = [(place, self.bounds_in(summaries[place])) for place in places.tolist()]
         inside = [(p, span) for p, span in found if not self._is_outside(span, summaries[p])]
         return [span for _, span in inside], np.array([p for p, _ in inside], np.intp)
 
@@ -184,7 +184,7 @@ class RangeResolver:
                 yield recording, begin
             seen.add(recording.id)
 
-    def _bounds_in(self, recording: RecordingSummary) -> Span:
+    def bounds_in(self, recording: RecordingSummary) -> Span:
         """The range in one recording, ns.
 
         It may be empty: for example `2025-01-01` to `end`, in a recording of 2024.
@@ -244,7 +244,7 @@ class RangeResolver:
         spans: list[str] = []
         for place in places.tolist():
             start, end = self._clock_span(summaries[place])
-            low, high = self._bounds_in(summaries[place])
+            low, high = self.bounds_in(summaries[place])
             # `2025-01-01` to `end` is no mistake: the recording simply ends before.
             if low < high or low == start or high == end:
                 label = summaries[place].label

@@ -115,6 +115,12 @@ def matcher(include: Sequence[str] = (), exclude: Sequence[str] = ()) -> TopicMa
     return TopicMatcher(include, exclude)
 
 
+def later(patterns: Sequence[str]) -> Callable[[str], bool]:
+    """A test for topics that appear later: globs and `re:` take them, names do not."""
+    open_ones = [pattern for pattern in patterns if not _is_plain(pattern)]
+    return TopicMatcher(open_ones) if open_ones else lambda _: False
+
+
 def _resolve_one(pattern: str, known: list[str]) -> list[str]:
     if pattern in known:
         return [pattern]

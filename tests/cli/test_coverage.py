@@ -125,7 +125,7 @@ def test_info_shows_notes_and_marks(damaged: Path) -> None:
     ]
 
 
-def test_messages_that_are_not_indexed_yet_are_counted(tmp_path: Path) -> None:
+def test_messages_that_are_not_written_yet_are_counted(tmp_path: Path) -> None:
     def is_known() -> bool:
         store.refresh()
         return "/kept" in store.topics()
@@ -138,10 +138,10 @@ def test_messages_that_are_not_indexed_yet_are_counted(tmp_path: Path) -> None:
         for second in range(3):
             recording.write(KEPT, PAYLOAD, log_time=BEGIN_NS + second * SECOND_NS)
         wait_for(is_known)
-        recorder = ControlServer(tmp_path / "store", "now", {"state": lambda _: {"lag": 12}})
+        state = {"taken": {"/kept": 15, "/other": 100}}
+        recorder = ControlServer(tmp_path / "store", "now", {"state": lambda _: state})
         try:
             done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
         finally:
             recorder.close()
-    assert "now is still being recorded" in done.err
-    assert "now: 12 recorded messages are not indexed yet." in done.err
+    assert "now is being recorded: 12 messages not written yet" in done.err

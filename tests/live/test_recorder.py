@@ -21,11 +21,14 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
+from hybridlog.cli.live_options import recorder_options
+from hybridlog.cli.record import command as record_command
+from hybridlog.cli.record_choices import RecordChoices
 from hybridlog.live import recorder as recorder_module
 from hybridlog.live.control_server import choose, request, running
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.recording import LiveRecording
+from hybridlog.live.recording import LiveOptions, LiveRecording
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.losses import Cause
 from hybridlog.marks import MARKS
@@ -653,3 +656,16 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     channels = {c.topic: c for c in store.entry(robot.recorder.name).channels}
     assert channels["/chatter"].metadata[SUPPLIED] == "noetic, fits the messages"
     assert "no definition in the source" in str(channels["/odd"].reason)
+
+
+def test_live_segments_are_short_by_default() -> None:
+    context = record_command.make_context("record", ["--ros1"])
+    chosen = recorder_options(RecordChoices(**context.params, live_options=()))
+    for settings in (LiveOptions().settings, FREE.settings, chosen.settings):
+        assert (settings.segment_size, settings.segment_span_s) == (1 << 30, 600)
+    other = ["--ros1", "--split-size", "2MiB", "--split-duration", "5s"]
+    context = record_command.make_context("record", other)
+    chosen = recorder_options(RecordChoices(**context.params, live_options=()))
+    assert (chosen.settings.segment_size, chosen.settings.segment_span_s) == (2 << 20, 5)
+    # Those of logs are not.
+    assert (SegmentSettings().segment_size, SegmentSettings().segment_span_s) == (4 << 30, None)

@@ -70,6 +70,7 @@ def _matching(
     mongo = Mongo(session, counters, lambda: parts)
     if not all(mongo.reaches(part) for part in parts[:1]):
         session.database_for("Reading index documents")
+    counters.unindexed = planner.count_unindexed(parts)
     by_topic: dict[str, list[Part]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)

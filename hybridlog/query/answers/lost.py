@@ -1,8 +1,9 @@
-"""Lost messages of the range of a question, as the loss ledger knows them."""
+"""Messages that are missing from the range of a question: lost, or not written yet."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ import numpy as np
 from hybridlog.losses import CRASH, Cause, losses_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.wording import counted
+from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
@@ -19,9 +22,11 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 JOURNAL_LOST = "journal lost"
 """Cause of a row for what may have been lost with a journal."""
+_INTERVAL_S = 1.0  # flush interval of recorders that do not say it
 _EVERYTHING = np.array([[BEGIN, END]], np.int64)
 
 
@@ -35,12 +40,15 @@ class Lost:
         is_exact: False if an unknown number is lost besides.
         reduced: Messages of which only the fields are stored.
         rows: Rows of the loss ledger, with the label of their `recording`.
+        unwritten: Messages that a running recorder has taken and not written yet, which are not
+            lost; None for an unknown number.
     """
 
     messages: int
     is_exact: bool
     reduced: int
     rows: tuple[Mapping[str, Any], ...]
+    unwritten: int | None = 0
 
     def __bool__(self) -> bool:
         """True if any message is lost."""
@@ -96,7 +104,10 @@ def lost_in(session: Session, question: Question) -> Lost:
         is_exact = is_exact and count is not None
         messages += count or 0
         found.append({"recording": entry.label, **row})
-    return Lost(messages, is_exact, reduced, tuple(found))
+    late = [count for count, _ in unwritten(session, question)]
+    known = [count for count in late if count is not None]
+    missing = sum(known) if len(known) == len(late) else None
+    return Lost(messages, is_exact, reduced, tuple(found), missing)
 
 
 def lost_times(session: Session, question: Question) -> Intervals:
@@ -156,3 +167,49 @@ def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
     if row.get("from") is None or row.get("to") is None:
         return None
     return int(row["from"]), int(row["to"])
+
+
+def unwritten(session: Session, question: Question) -> list[tuple[int | None, str]]:
+    """What running recordings have not written, if a question reaches past the last flush.
+
+    Returns:
+        For each, the number of messages, None if its recorder does not answer, and a sentence.
+    """
+    places = session.chosen(question)
+    snapshot = session.snapshot()
+    found: list[tuple[int | None, str]] = []
+    for place in places[snapshot.is_open[places]].tolist():
+        one = snapshot.summaries[place]
+        if one.status != "open" or not _reaches_past(session, question, one):
+            continue
+        from hybridlog.live.control_server import request
+
+        messages: int | None = None
+        with suppress(HybridlogError, KeyError):  # no socket, or it has just begun or ended
+            taken = request(session.directory.path, one.label, "state")["taken"]
+            written = session.entry_of(one).messages_by_topic()
+            messages = sum(max(taken.get(t, 0) - written[t], 0) for t in question.topics)
+        said = one.source.get("flush_interval_s")
+        what = f"up to {said if isinstance(said, int | float) else _INTERVAL_S:g} s"
+        what = what if messages is None else counted(messages, "message")
+        if messages != 0:
+            told = f"{one.label} is being recorded: {what} not written yet, nor in this answer."
+            found.append((messages, told))
+    return found
+
+
+def _reaches_past(session: Session, question: Question, one: RecordingSummary) -> bool:
+    """True if a question is about times after the last flush of a recording."""
+    begin, end = BEGIN, END
+    if question.bounds is not None and question.clock == "log":
+        begin, end = RangeResolver(session, question).bounds_in(one)
+    if question.during is not None:
+        windows = question.during.of_recording(one.id)
+        end = min(end, int(windows[-1, 1])) if len(windows) else begin
+    return end > (begin if one.span is None else max(begin, one.span[1]))
+
+
+def unindexed(messages: int) -> str:
+    """What an answer of MongoDB lacks, in words."""
+    are = "is" if messages == 1 else "are"
+    return f"{counted(messages, 'message')} {are} not indexed yet, nor in this answer of MongoDB."

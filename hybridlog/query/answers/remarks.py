@@ -12,7 +12,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.losses import Cause, in_words, line_of
-from hybridlog.query.answers.lost import JOURNAL_LOST, losses_in
+from hybridlog.query.answers.lost import JOURNAL_LOST, losses_in, unindexed, unwritten
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
@@ -21,12 +21,11 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time, is_relative
 from hybridlog.query.topics import namesakes
 from hybridlog.wording import counted, listed, unfit
-from hybridlog_storage.errors import HybridlogError, TimeError
+from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
 
 _MOST = 100  # recordings looked at
 _SHOWN = 5  # names in a remark
@@ -58,6 +57,8 @@ def remarks(
             f"{counted(counters.reduced, 'message')} {has} no payload, which was dropped under "
             "pressure: not in this answer; --where and --fields find the fields."
         )
+    if counters.unindexed:
+        yield unindexed(counters.unindexed)
     yield from about_names(session, question, names)
     if question.clock == "header" and question.bounds is not None:
         yield from _about_stamps(session, question)
@@ -69,25 +70,10 @@ def remarks(
 
 def completeness(session: Session, question: Question) -> Iterator[str]:
     """Sentences about what the recordings of a question may lack in its range."""
-    for entry in session.doubtful(question):
-        if entry.status == "open":
-            yield from _about_running(session, entry)
+    yield from (told for _, told in unwritten(session, question))
     with suppress(TimeError):  # nothing is in the range
         for entry, rows in groupby(losses_in(session, question), itemgetter(0)):
             yield from _about_losses(entry.label, [row for _, row in rows])
-
-
-def _about_running(session: Session, entry: RecordingEntry) -> Iterator[str]:
-    from hybridlog.live.control_server import request
-
-    yield f"{entry.label} is still being recorded; later messages are not in this answer."
-    try:
-        messages = request(session.directory.path, entry.label, "state").get("lag")
-    except HybridlogError:  # it has just ended, or belongs to another user
-        return
-    if isinstance(messages, int) and messages:
-        are = "is" if messages == 1 else "are"
-        yield f"{entry.label}: {counted(messages, 'recorded message')} {are} not indexed yet."
 
 
 def _about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -78,14 +78,15 @@ class Mongo:
         """
         # Documents do not tell the channels of a topic apart, so none may be blind.
         is_answered = part.is_indexed and not part.blind and not _is_older(part)
-        if part.recording.status in UNFINISHED:
-            is_answered &= part.predicate is not None and part.predicate.is_opaque
+        is_open = part.recording.status in UNFINISHED
+        if is_open:
+            is_answered &= part.needs_index
         if need is Need.VALUES or self._is_away or not is_answered:
             return None
         if not self.reaches(part):
             return None
         try:
-            is_listed = self._place(part).is_listed
+            is_listed = is_open or self._place(part).is_listed  # without documents yet
             if not is_listed or (need is not Need.SELECTION and self.undecided(part)):
                 return None
         except IndexChangedError:

@@ -21,7 +21,6 @@ from hybridlog.query.engines.base import (
     offsets_by_chunk,
     places_of,
 )
-from hybridlog.query.message_filter import can_decide
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog_storage.times import inside, touches
 
@@ -212,9 +211,7 @@ def _are_known(part: Part, fields: Collection[str] | None) -> bool:
     if types is None:
         return False
     predicate = part.predicate
-    if predicate is not None and (
-        not can_decide(predicate) or any(map(is_meta, predicate.fields()))
-    ):
+    if predicate is not None and (predicate.needs_index or any(map(is_meta, predicate.fields()))):
         return False
     return all(
         any(name == path or name.startswith((f"{path}.", f"{path}[")) for name in types)

@@ -39,11 +39,8 @@ class PayloadScan:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By chunks, bytes and messages; None if only MongoDB understands the predicate."""
-        if part.predicate is not None:
-            from hybridlog.query.message_filter import can_decide
-
-            if not can_decide(part.predicate):
-                return None
+        if part.needs_index:
+            return None
         size = sum(stats.payload_bytes for stats in part.stats)
         encodings = {channel.channel.message_encoding for channel in part.channels}
         message_s = _ROW_S if encodings <= _BY_COLUMNS else _OBJECT_S

@@ -19,7 +19,7 @@ from hybridlog.query.engines.base import (
     offsets_by_chunk,
     places_of,
 )
-from hybridlog.query.message_filter import can_decide, meta_array
+from hybridlog.query.message_filter import meta_array
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog_storage.errors import StoreError
 
@@ -85,7 +85,7 @@ class TablesEngine:
         is_known = part.predicate is None and need not in {Need.OUTCOMES, Need.VALUES}
         if is_known or not part.is_by_log_time:
             return None  # known from the catalog and the chunk index
-        if part.predicate is not None and not can_decide(part.predicate):
+        if part.needs_index:
             return None
         asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
         if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:

@@ -232,6 +232,17 @@ class Predicate:
         """True if only MongoDB can answer a part of it."""
         return any(isinstance(node, Opaque) for node in nodes(self.root))
 
+    @property
+    def needs_index(self) -> bool:
+        """True if messages alone cannot decide it, without MongoDB."""
+        names = [path.split(".") for path in self.fields() if is_meta(path)]
+        only_there = any(len(name) < 2 or name[1] in _ONLY_INDEXED for name in names)
+        return only_there or self.is_opaque
+
+
+_ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
+"""Fields of index documents that messages do not have."""
+
 
 def is_meta(path: str) -> bool:
     """True if a path leads into `_meta`, which hybridlog adds to a message."""

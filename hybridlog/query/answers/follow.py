@@ -1,0 +1,169 @@
+"""Messages of running recordings, as they are flushed.
+
+The chunks of a recording only grow in number, whether its segments are sealed meanwhile or not,
+and each is read once. So each message comes once, also one with an earlier log time than others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from hybridlog.message import messages_in
+from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
+from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.topics import later
+from hybridlog_storage.catalog import chunk_entries
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.stopping import pause, safe_point
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from hybridlog.message import Message
+    from hybridlog.query.chunk_scan import MessageRun, ScanPlan
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.engines.base import Engine
+    from hybridlog.query.question import Part, Question, Span
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+
+_EVERY_S: Final = 0.25
+
+
+class Following(Planner, Iterator["Message"]):
+    """The messages of running recordings as they come; waits for the next one.
+
+    Args:
+        session: The open store.
+        question: The question; without a time range, about what is flushed from now on.
+        counters: Count what is read.
+        names: The topics as they were written; globs take topics that appear later.
+
+    Attributes:
+        question: The recordings that are followed, and the topics so far.
+
+    Raises:
+        UsageError: No recording of the question is running, or it asks for what is not known
+            before the end.
+    """
+
+    def __init__(
+        self, session: Session, question: Question, counters: Counters, names: Sequence[str]
+    ) -> None:
+        question, wanted = _checked(question), question.recordings
+        with session.at_one_moment():
+            running = [
+                session.entry_of(one)
+                for one in session.look(wanted).summaries
+                if one.status == "open" and (wanted is None or one.id in wanted)
+            ]
+            if not running:
+                raise UsageError("Only a running recording can be followed, and none is running.")
+            ids = tuple(entry.id for entry in running)
+            named = question.names_recording or len(running) > 1
+            question = replace(question, recordings=ids, names_recording=named)
+            super().__init__(session, question, counters)
+            self._ranges = RangeResolver(session, replace(question, bounds=None))
+            self._scan = self._arrived = _Arrived(session, counters)
+            self._takes = later(names)
+            self._bounds: dict[str, Span] = {}
+            self._read = dict.fromkeys(ids, (0, 0))  # the last segment, and how many of its chunks
+            for entry in running if question.bounds is None else ():
+                self._read[entry.id] = max([0, *map(int, entry.digests), *entry.flushed]), 0
+                _ = [*self._arrivals(entry, None)]
+            _ = self.examples, self.ranks  # of this moment
+        self._messages = (message for run in self.runs() for message in messages_in(run))
+
+    def __next__(self) -> Message:
+        """The next message; ends with the recordings."""
+        return next(self._messages)
+
+    def _runs(self) -> Iterator[MessageRun]:
+        goes_on = True
+        while goes_on:
+            started = time.monotonic()
+            if self.session.is_at_one_moment:
+                raise UsageError("Within at_one_moment, nothing new is seen: follow outside of it.")
+            with self.session.at_one_moment():
+                plan, goes_on = self._look()
+            for run in ChunkScan(plan, self.session.segment).runs():
+                yield run
+                safe_point()
+            if goes_on:
+                pause(max(_EVERY_S - (time.monotonic() - started), 0))
+
+    def _look(self) -> tuple[ScanPlan, bool]:
+        """The plan for what has come since the last look, and whether more will."""
+        places = self.session.chosen(self.question)
+        snapshot = self.session.snapshot()
+        new = [t for t in snapshot.topics_at(places) if t not in self.question.topics]
+        topics = (*self.question.topics, *filter(self._takes, new))
+        self.question = replace(self.question, topics=topics)
+        summaries = [snapshot.summaries[place] for place in places.tolist()]
+        parts: list[Part] = []
+        for one in summaries:
+            entry = self.session.entry_of(one)
+            if self.question.bounds and one.span is not None and one.id not in self._bounds:
+                # The beginning that a time may be relative to is known now.
+                self._bounds[one.id] = RangeResolver(self.session, self.question).bounds_in(one)
+            bounds = self._bounds.get(one.id)
+            self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
+            parts += self.parts_in(one, bounds, None) if chunks else ()
+        return self.plan(parts), any(one.status == "open" for one in summaries)
+
+    def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[ChunkEntry]:
+        """The chunks that have come since the last call, and may have messages in bounds."""
+        clock = self.question.clock
+        last, read = self._read[entry.id]
+        for segment in sorted({*map(int, entry.digests), *entry.flushed} - {*range(last)}):
+            flushed = entry.flushed.get(segment)
+            table = flushed.table if flushed else self.session.chunk_table(entry, segment)
+            start = min(read if segment == last else 0, len(table.chunks))
+            parts = table.parts[int(table.part_bounds()[start]) :]
+            new = replace(table, chunks=table.chunks[start:], parts=parts)
+            for chunk in chunk_entries(entry, segment, new, None, bounds=bounds, clock=clock):
+                yield replace(chunk, number=chunk.number + start)
+            self._read[entry.id] = segment, len(table.chunks)
+
+    def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
+        """False: tables have whole topics."""
+        return False
+
+    def _selecting(self, part: Part) -> Engine:
+        return self._scan
+
+    def _tell_unasked(self, parts: Sequence[Part]) -> None:
+        for part in (part for part in parts if part.blind):
+            unseen = replace(part, channels=part.blind, blind=(), predicate=None)
+            self.counters.unreadable += self._scan.count([unseen])
+
+
+class _Arrived(PayloadScan):
+    """Reads only the chunks that have just come, in `chunks` by recording."""
+
+    def __init__(self, session: Session, counters: Counters) -> None:
+        super().__init__(session, counters)
+        self.chunks: dict[str, list[ChunkEntry]] = {}
+
+    def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
+        return RecordingScan(part.recording, indexes, part.bounds, self.chunks[part.recording.id])
+
+
+def _checked(question: Question) -> Question:
+    """The question without an end; refuses what is only known when a recording has ended."""
+    begin, stop = question.bounds or (None, None)
+    word = str(stop).strip().lower()
+    for is_asked, problem in (
+        (question.reverse, "has no last message to begin with"),
+        (question.during is not None, "cannot be asked for intervals, which are of one moment"),
+        (question.predicate and question.predicate.needs_index, "is not in MongoDB yet"),
+        (word.startswith("-"), f"has no end to count {stop} from"),
+    ):
+        if is_asked:
+            raise UsageError(f"What is still recorded {problem}.")
+    return replace(question, bounds=(begin, None)) if word == "end" else question

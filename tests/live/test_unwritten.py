@@ -1,0 +1,146 @@
+"""What a running recording has and an answer has not: a number, or the flush interval."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog_storage.errors import IncompleteError
+from tests.cli.running import run
+from tests.live.robot import robot
+from tests.live.speaker import text, text_channel
+from tests.live.test_follow import NOWHERE, wait_until_flushed
+
+SECOND = 1_000_000_000
+CHANNEL = text_channel("/a")
+
+
+@contextmanager
+def half_written(path: Path) -> Iterator[hl.Store]:
+    """A store with a recording: of /a two messages are flushed and three are not, of /b one."""
+    with robot(path, flush_s=0.2) as first:
+        first.say("/a", "1", time=1 * SECOND)
+        first.say("/a", "2", time=2 * SECOND)
+        first.say("/quiet", "0", time=1 * SECOND)
+        with hl.open(path) as store:
+            wait_until_flushed(store, 3)
+            first.hold()
+            first.say("/a", "3", "4", "5", time=3 * SECOND)
+            first.say("/b", "6", time=3 * SECOND)
+            yield store
+
+
+def test_the_number_is_that_of_the_topics_asked(tmp_path: Path) -> None:
+    with half_written(tmp_path / "store") as store:
+        query = store.topic("/a")
+        assert query.count() == 2
+        expected = "live is being recorded: 3 messages not written yet, nor in this answer."
+        assert query.remarks() == [expected]
+        assert query.lost().unwritten == 3
+        assert not query.lost()
+        with pytest.raises(IncompleteError, match="3 messages not written yet"):
+            query.check_complete()
+        quiet = store.topic("/quiet")
+        assert quiet.remarks() == []
+        assert quiet.lost().unwritten == 0
+        quiet.check_complete()
+
+
+def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with half_written(path) as store:
+        query = store.topic("/a")
+        whole = store.topic("/a").windows(after="1s")
+        for part, unwritten in (
+            (query.between("start", "end"), 3),
+            (query.between(None, 2 * SECOND + 1), 3),
+            (query.between("+1s", None), 3),
+            (query.between(None, 2 * SECOND), 0),
+            (query.between("start", "-1s"), 0),
+            (query.during(whole), 3),
+            (query.during(whole).between(None, 2 * SECOND), 0),
+            (query.between(None, 2 * SECOND).clock("header"), 3),
+        ):
+            assert part.lost().unwritten == unwritten, part
+            assert len(part.remarks(is_empty=False)) == (unwritten > 0)
+        options = ["fetch", "-t", "/a", "--count", "--strict", "--between", "start"]
+        done = run(*options, "2000000000ns", store=path)
+        assert (done.out, "not written" in done.err) == ("1\n", False)
+        assert "3 messages not written yet" in run(*options, "end", store=path, code=11).err
+
+
+@pytest.mark.parametrize("mongo", [(), ("--mongo", NOWHERE)])
+def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
+    path = tmp_path / "store"
+    with half_written(path):
+        told = "live is being recorded: 3 messages not written yet"
+        for words in (
+            ["fetch", "-t", "/a", "--count"],
+            ["fetch", "-t", "/a", "--where", "data == '1'"],
+            ["rate", "-t", "/a"],
+            ["gaps", "-t", "/a"],
+            ["intervals", "-t", "/a", "--where", "data == '1'"],
+            ["changes", "-t", "/a", "--fields", "data"],
+            ["export", tmp_path / "a.mcap", "-t", "/a", "--force"],
+            ["sql", "select count(*) from a"],
+        ):
+            done = run(*words, *mongo, store=path)
+            assert told in done.err, (words, done.err)
+            assert "lost" not in done.err
+        ended = run("fetch", "-t", "/a", "--count", "--between", "start", "-1s", store=path)
+        assert "being recorded" not in ended.err
+
+
+def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with hl.open(path, create=True, require_database=True) as store:
+        recording = store.start("own", flush_interval_s=0.5)
+        for number in (1, 2):
+            recording.write(CHANNEL, text("x"), log_time=number * SECOND)
+        wait_until_flushed(store, 2)
+        query = store.topic("/a")
+        assert query.remarks(is_empty=False) == [
+            "own is being recorded: up to 0.5 s not written yet, nor in this answer."
+        ]
+        assert query.lost().unwritten is None
+        assert not query.lost()
+        with pytest.raises(IncompleteError, match=r"up to 0\.5 s not written yet"):
+            query.check_complete()
+        query.between(None, 2 * SECOND).check_complete()
+        assert "up to 0.5 s not written yet" in run("fetch", "-t", "/a", "--count", store=path).err
+        recording.close()
+        assert query.remarks(is_empty=False) == []
+        assert query.lost().unwritten == 0
+        query.check_complete()
+
+
+def test_what_the_index_lacks_is_told_where_mongodb_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hybridlog.live.recording._index_delay", lambda _: 3600.0)
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        recording = store.start("own", flush_interval_s=0.1)
+        for number in range(5):
+            recording.write(CHANNEL, text("x"), log_time=(1 + number) * SECOND)
+        wait_until_flushed(store, 5)
+        query = store.topic("/a")
+        documents = list(query.documents())
+        assert query.counters.unindexed == 5 - len(documents) > 0
+        late = f"{5 - len(documents)} messages are not indexed yet"
+        assert any(late in line for line in query.remarks(is_empty=False))
+        raw = query.where({"$expr": {"$eq": ["$data", "x"]}})
+        assert raw.count() == len(documents)
+        assert any(late in line for line in raw.remarks(is_empty=False))
+        with pytest.raises(IncompleteError, match=late):
+            raw.between(None, 5 * SECOND + 1).check_complete()
+        # What others answer is whole.
+        same = query.where("data == 'x'")
+        assert same.count() == len(list(same)) == 5
+        assert same.counters.unindexed == 0
+        recording.close()
+        assert len(list(query.documents())) == raw.count() == 5
+        assert query.counters.unindexed == raw.counters.unindexed == 0
