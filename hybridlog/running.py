@@ -82,6 +82,10 @@ class RunningRecording:
         self.topics = set() if self.entry is None else topic_types(self.entry)
         return True
 
+    def is_cut(self) -> bool:
+        """True if chunks that were read have been taken back, on a full disk."""
+        return any(segment.is_cut() for segment in self._segments.values())
+
     def reader(self, number: int) -> SegmentReader | None:
         """The reader of a segment that is not sealed; None for others."""
         segment = self._segments.get(number)
@@ -165,7 +169,7 @@ def _losses(
     yield from joined([*rows, *(row for one in segments.values() for row in one.losses)])
     yield from (row for row in before if row["cause"] == Cause.SEGMENT)
     for number, segment in segments.items():
-        for damage in segment.damaged:
+        for damage in filter(None, (*segment.damaged, segment.stopped)):
             yield _damaged(number, damage.reason, damage.offset, damage.length)
     for number, reason in unreadable.items():
         yield _damaged(number, reason)

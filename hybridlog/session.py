@@ -466,6 +466,9 @@ class Session:
         """True if files of recordings that were read look different by now."""
         if self.directory.changed() != self._changed:
             return True
+        running = [one for key, one in [*self._running.items()] if key in self._moment.running]
+        if any(one.is_cut() for one in running):
+            return True
         read = self._entries.keys() | self._moment.running.keys()
         summaries = [one for one in self.snapshot().summaries if one.id in read]
         looks = self.directory.looks([one.label for one in summaries])

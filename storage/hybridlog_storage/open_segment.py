@@ -7,6 +7,8 @@ left out. The chunks become rows of a `ChunkTable`, as those of a sealed segment
 
 from __future__ import annotations
 
+import struct
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +25,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable, parts_of
 from hybridlog_storage.compression import FilePart
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, read_record
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, Record, read_record
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segment_format import (
@@ -34,6 +36,7 @@ from hybridlog_storage.segment_format import (
     OUR_NAMES,
     PADDING_OPCODE,
     channel_of,
+    compression_of,
     index_order,
     json_of,
     split_trailer,
@@ -43,9 +46,17 @@ from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader, loss_row
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog_storage.messages import Buffer
+
 _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
+_MAX_TORN: Final = 1 << 20  # bytes looked at of a record that is not whole
+_WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
+_CHUNK_HEAD_SIZE: Final = CHUNK_HEAD.size + 16  # with the longest name of a compression
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
+_TORN: Final = frozenset(
+    {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT}
+)
 _PASSED: Final = frozenset({Opcode.HEADER, Opcode.METADATA_INDEX, PADDING_OPCODE})
 
 
@@ -91,6 +102,7 @@ class OpenSegment:
         channels: Channels by id, as far as they are defined.
         losses: Rows of the loss ledger written so far.
         damaged: Chunks and other records that cannot be read.
+        stopped: What is in place of the next record, if no writer leaves that; else None.
         end: Bytes that are read.
 
     Raises:
@@ -111,10 +123,12 @@ class OpenSegment:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self.damaged: list[Damage] = []
+        self.stopped: Damage | None = None
         self.end = len(MAGIC)
         self._schemas: dict[int, SchemaRecord] = {}
         self._chunk: tuple[int, int] | None = None  # offset and length of the last chunk record
         self._chunks: list[tuple[int, ...]] = []
+        self._head = self._last = b""  # heads of the last chunk record and of the last of them
         self._parts: list[NDArray[np.void]] = []
         self._others: list[tuple[int, int, int]] = []
         self._flushed: Flushed | None = None
@@ -139,10 +153,28 @@ class OpenSegment:
         Raises:
             SegmentError: The file cannot be read.
         """
-        self.reader.grow()
-        size, before = self.reader.size, self.end
-        if size < before:  # the writer took its last chunks back, on a full disk
+        is_cut = self.is_cut()
+        if is_cut:
             self._begin()
+        before = self.end, self.stopped
+        self._read_on()
+        if self.stopped is not None:
+            time.sleep(_WRITING_S)  # perhaps the writer is in the middle of this record
+            self._read_on()
+        return is_cut or (self.end, self.stopped) != before
+
+    def is_cut(self) -> bool:
+        """True if the writer took chunks back that were read, on a full disk."""
+        self.reader.grow()
+        if self.reader.size < self.end or not self._chunks:
+            return self.reader.size < self.end
+        return bytes(self.reader.read(self._chunks[-1][0], CHUNK_HEAD.size)) != self._last
+
+    def _read_on(self) -> None:
+        """Read the records behind those that are read."""
+        self.reader.grow()
+        self.stopped = None
+        size = self.reader.size
         window, start = memoryview(b""), 0
         at = self.end if self._chunk is None else self._chunk[0] + self._chunk[1]
         while at + RECORD_HEAD.size <= size:
@@ -157,21 +189,67 @@ class OpenSegment:
                     continue
             opcode, length = RECORD_HEAD.unpack_from(window, at - start)
             behind = at + RECORD_HEAD.size + length
-            if behind > size:
-                break
             try:
-                if not self._take(opcode, at, behind - at):
+                if behind > size or not self._take(opcode, at, behind - at):
+                    if not self._is_end(opcode, behind - at, at):
+                        self.stopped = Damage(at, size - at, "there is no whole record")
                     break
             except SegmentError as error:
                 self.damaged.append(Damage(at, behind - at, str(error)))
             at = behind
             if self._chunk is None:
                 self.end = at
-        return self.end != before
+
+    def _is_end(self, opcode: int, length: int, at: int) -> bool:
+        """True if what is written ends so: with a part of a record, or room behind it.
+
+        Args:
+            opcode: Opcode of the next record.
+            length: Its bytes.
+            at: Byte of the file where it starts.
+        """
+        there = self.reader.size - at
+        head = self.reader.read(at, min(there, _MAX_TORN))
+        if opcode == 0:
+            return not any(head)  # room behind the last block
+        if length <= there:
+            return opcode == Opcode.DATA_END  # the segment is being sealed
+        if opcode == Opcode.CHUNK or there < _CHUNK_HEAD_SIZE:
+            return there < _CHUNK_HEAD_SIZE or length == _chunk_length(head)
+        if opcode == ARRIVAL_OPCODE and self._chunk is not None:
+            return self._may_be_arrivals(at, length)
+        try:
+            is_whole = read_record(opcode, head[RECORD_HEAD.size :])[1] > 0
+        except SegmentError:
+            is_whole = False
+        is_possible = length <= _MAX_TORN or opcode == Opcode.ATTACHMENT
+        return opcode in _TORN and is_possible and not is_whole
+
+    def _may_be_arrivals(self, at: int, length: int) -> bool:
+        """True if a record of arrival numbers is not longer than message indexes allow."""
+        assert self._chunk is not None
+        return length < 96 + (at - sum(self._chunk)) // 2  # they take half for each message
+
+    def _check(self, opcode: int, at: int, length: int) -> None:
+        """Check that a record fits what comes before it, and its own fields.
+
+        Raises:
+            SegmentError: It does not.
+        """
+        if self._chunk is not None and opcode not in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
+            self.damaged.append(Damage(*self._chunk, "its arrival numbers are missing"))
+            self._chunk, self.end = None, at
+        elif opcode == ARRIVAL_OPCODE and self._chunk and not self._may_be_arrivals(at, length):
+            raise SegmentError("the arrival numbers are too long")
+        if opcode == Opcode.CHUNK and length > _CHUNK_HEAD_SIZE:
+            self._head = bytes(self.reader.read(at, _CHUNK_HEAD_SIZE))
+            if _chunk_length(self._head) != length:
+                raise SegmentError("the lengths of a chunk contradict each other")
 
     def _take(self, opcode: int, at: int, length: int) -> bool:
         """Take a whole record; False for one that no open segment has."""
-        if opcode == Opcode.CHUNK and length > CHUNK_HEAD.size:
+        self._check(opcode, at, length)
+        if opcode == Opcode.CHUNK and length > _CHUNK_HEAD_SIZE:
             self._chunk = at, length
         elif opcode == Opcode.MESSAGE_INDEX and self._chunk is not None:
             pass  # read with the arrival numbers
@@ -183,7 +261,7 @@ class OpenSegment:
         elif length > _MAX_RECORD:
             raise SegmentError("the record is too large")
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            record, _ = read_record(opcode, self._content(at, length))
+            record = self._record(opcode, at, length)
             if isinstance(record, SchemaRecord):
                 self._schemas[record.id] = record
             elif isinstance(record, ChannelRecord):
@@ -194,6 +272,12 @@ class OpenSegment:
             return opcode in _PASSED
         return True
 
+    def _record(self, opcode: int, at: int, length: int) -> Record | None:
+        record, size = read_record(opcode, self._content(at, length))
+        if size != length - RECORD_HEAD.size:
+            raise SegmentError("the record is longer than its fields")
+        return record
+
     def _content(self, at: int, length: int) -> memoryview:
         return self.reader.read(at + RECORD_HEAD.size, length - RECORD_HEAD.size)
 
@@ -201,8 +285,10 @@ class OpenSegment:
         """Add a chunk, by its message indexes; if they are damaged, by its messages."""
         if trailer > _MAX_RECORD:
             raise SegmentError("the message indexes are too large")
-        head = CHUNK_HEAD.unpack(self.reader.read(offset, CHUNK_HEAD.size))
+        head = CHUNK_HEAD.unpack_from(self._head)
         behind = self.reader.read(offset + length, trailer)
+        if not any(behind[-4:]):  # the checksum of the arrival numbers
+            raise SegmentError("the arrival numbers are too long")
         first, last, size = int(head[2]), int(head[3]), int(head[4])
         parts = _parts_by_index(behind, (first, last), size)
         if parts is None:
@@ -222,13 +308,18 @@ class OpenSegment:
             except SegmentError as error:
                 self.damaged.append(Damage(offset, length, str(error)))
                 parts, first, last = np.empty(0, PART), 0, 0
+        is_known = np.isin(parts["channel"], list(self.channels))
+        if not is_known.all():
+            parts = parts[is_known]
+            self.damaged.append(Damage(offset, length, "a channel is not defined"))
         row = (offset, length, trailer, 0, crc32(behind), first, last, len(parts))
         self._chunks.append(row)
         self._parts.append(parts)
+        self._last = self._head[: CHUNK_HEAD.size]
         self._flushed = None
 
     def _add_metadata(self, at: int, length: int) -> None:
-        record, _ = read_record(Opcode.METADATA, self._content(at, length))
+        record = self._record(Opcode.METADATA, at, length)
         assert isinstance(record, Metadata)
         if record.name == LOSSES_METADATA:
             self.losses += loss_rows(json_of(record))
@@ -273,7 +364,7 @@ def _parts_by_index(
     counts = np.array([len(rows) for _, rows in indexes])
     order = np.argsort(starts, kind="stable")
     sizes = np.empty(len(starts), np.int64)
-    sizes[order] = np.diff(starts[order], append=size) - MESSAGE_HEAD.itemsize
+    sizes[order] = np.diff(starts[order], append=min(size, 1 << 62)) - MESSAGE_HEAD.itemsize
     channels = [channel for channel, _ in indexes]
     is_whole = starts[order[0]] == 0 and (sizes >= 0).all() and channels == sorted(set(channels))
     if not is_whole or not all((t[1:] >= t[:-1]).all() for t in times):
@@ -286,3 +377,12 @@ def _parts_by_index(
     if (int(parts["first"].min()), int(parts["last"].max())) != span:
         return None
     return parts
+
+
+def _chunk_length(head: Buffer) -> int:
+    """Bytes of a chunk record, by the length of its content; -1 if the head is damaged."""
+    try:
+        name, packed = compression_of(head)
+    except struct.error:
+        return -1
+    return CHUNK_HEAD.size + 12 + len(name) + packed
