@@ -84,7 +84,7 @@ def check_all(store: hl.Store, running: Running) -> None:
 def test_one_moment_while_segments_are_sealed(running: Running) -> None:
     """The block sees one state of the recording, whatever is sealed meanwhile."""
     segments = running.before.entry(LABEL).segments
-    with running.writing(30, 0.01) as writing, hl.open(running.path, mongo=NO_MONGODB) as store:
+    with running.writing(60, 0.01) as writing, hl.open(running.path, mongo=NO_MONGODB) as store:
         while writing.is_alive():
             check_all(store, running)
     running.flushed()
