@@ -76,7 +76,7 @@ def test_one_image(drive: Drive, tmp_path: Path) -> None:
     fetch(drive, *rear, tmp_path / "y.jpg")
     assert (tmp_path / "y.jpg").read_bytes() == FILES[0]
     refused = fetch(drive, *rear, tmp_path / "y.png", code=2)
-    assert refused == Answer("", "")
+    assert refused == Answer("", "", 2)
     assert not (tmp_path / "y.png").exists()
     fetch(drive, "-t", "front", "-o", tmp_path / "z.png", code=2)
     fetch(drive, "-t", "front", "--limit", 0, "-o", tmp_path / "z.png", code=2)

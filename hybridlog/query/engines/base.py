@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -63,16 +63,8 @@ class Values(NamedTuple):
     records: pa.StructArray
 
 
-class Objects(NamedTuple):
-    """Matching messages as plain objects, in order of log time and arrival.
-
-    Attributes:
-        log_time: int64[n], ns.
-        objects: n messages, as `Codec.objects` makes them.
-    """
-
-    log_time: NDArray[np.int64]
-    objects: Sequence[Mapping[str, object]]
+Objects: TypeAlias = "tuple[NDArray[np.int64], Sequence[Mapping[str, object]]]"
+"""Log times, ns, of messages in order, and the messages as `Codec.objects` makes them."""
 
 
 class Engine(Protocol):

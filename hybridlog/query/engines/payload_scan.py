@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
-from hybridlog.query.engines.base import Need, Objects, Outcomes, Values
+from hybridlog.query.engines.base import Need, Outcomes, Values
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, MessageRun
     from hybridlog.query.counters import Counters
+    from hybridlog.query.engines.base import Objects
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.session import Session
@@ -92,7 +93,7 @@ class PayloadScan:
             if found is None:
                 found = objects_of(channel.codec.plain, payloads_of(*where))
             self._counters.unreadable += len(run.batch) - len(found.rows)
-            yield Objects(run.batch.log_time[found.rows], found.objects)
+            yield run.batch.log_time[found.rows], found.objects
 
     def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
         """The whole messages of a plan in order, those of one channel at a time."""
