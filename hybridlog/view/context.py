@@ -99,11 +99,7 @@ class Context:
             TopicError: There is none.
             UsageError: The parameter is missing.
         """
-        name = asked.text("recording")
-        with suppress(TopicError):
-            return self.store.entry(name)
-        self.refresh(0.0)  # it may be new
-        return self.store.entry(name)
+        return self.store.entry(asked.text("recording"))
 
     def query(self, recording: RecordingEntry, *topics: str) -> Query:
         """A query about topics, by their full names, of one recording.

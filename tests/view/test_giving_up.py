@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,12 +14,14 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import hybridlog as hl
+from hybridlog.demo.write import write_bag
+from hybridlog.query import chunk_scan
 from hybridlog.view import context
 from hybridlog.view.app import make_app
 from hybridlog.view.routes import ask
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
-from tests.view.conftest import PORT, TOKEN, served
+from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
 
 if TYPE_CHECKING:
@@ -51,21 +54,50 @@ def test_a_question_that_is_given_up_stops(
     demo_store: hl.Store, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
     """The client leaves when something is about to be read, and nothing more is."""
+    assert_stops(demo_store, monkeypatch, path, QUESTIONS[path])
+
+
+def assert_stops(
+    store: hl.Store,
+    monkeypatch: pytest.MonkeyPatch,
+    path: str,
+    asked: dict[str, Any],
+    module: str = "",
+) -> None:
+    """The client leaves when a module, or any, is about to read."""
     leaves = threading.Event()
 
     class Watched(threading.Event):
         def is_set(self) -> bool:
+            if module not in sys._getframe(2).f_code.co_filename:
+                return super().is_set()
             leaves.set()
             assert self.wait(20)
             return True
 
-    app = make_app(demo_store, TOKEN, PORT)
+    app = make_app(store, TOKEN, PORT)
     with monkeypatch.context() as patched:
         patched.setattr(context, "threading", SimpleNamespace(Event=Watched))
-        said = asked_for(app, path, QUESTIONS[path], leaves_after=leaves)
+        said = asked_for(app, path, asked, leaves_after=leaves)
     assert b"The query was stopped" in said[1]["body"]
-    said = asked_for(app, "recording", {"recording": "robot"}, leaves_after=20.0)
+    said = asked_for(app, "recordings", {}, leaves_after=20.0)
     assert said[0]["status"] == 200
+
+
+@pytest.mark.parametrize("is_compact", [False, True])
+def test_reading_payloads_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_compact: bool
+) -> None:
+    """By threads that read ahead, and from columns of payloads."""
+    monkeypatch.setattr(chunk_scan, "_MIN_THREADED_BYTES", 0)
+    write_bag(tmp_path / "robot.bag", duration_s=5, config=ROBOT)
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(tmp_path / "robot.bag", name="robot")
+        if is_compact:
+            assert store.compact()
+        asked = {**SCAN, "where": "ranges[7] < 3 or ranges[7] > 3.1"}
+        module = "payloads/reader" if is_compact else "query/chunk_scan"
+        assert_stops(store, monkeypatch, "ask", asked, module)
 
 
 def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> None:
