@@ -345,7 +345,7 @@ def test_a_running_recording(odd: hl.Store, asking: Callable[[hl.Store], TestCli
         assert (answer["count"], answer["lost"]) == (90, None)
         answer = client.get("sql", params={**asked, "text": text}).json()
         assert answer["rows"] == [["50"]]
-        assert all(remark.startswith("runs is still being") for remark in answer["remarks"])
+        assert all(remark.startswith("runs is being recorded") for remark in answer["remarks"])
         times = {**asked, "begin": 0, "end": 100 * S, "pixels": 100}
         assert sum(client.get("matches", params=times).json()["counts"]) == 90
     assert client.get("ask", params=asked).json()["count"] == 90
