@@ -132,7 +132,7 @@ MUTANTS = [
         ),
         (
             "the-longest-gap-overflows",
-            "np.minimum(begin, _LAST - self._max_gap) + self._max_gap",
+            "np.minimum(begin, END - self._max_gap) + self._max_gap",
             "begin + self._max_gap",
             f"{INTERVALS}::test_a_state_may_be_believed_for_ever",
         ),
@@ -344,8 +344,8 @@ FORMAT_2 = [
         ),
         (
             "a-lost-journal-stays-lost",
-            "        report.journals.append(label)\n",
-            "        pass\n",
+            "        report.journals.append(label)\n        inventory = take",
+            "        inventory = take",
             REPAIR,
         ),
     ),
@@ -404,8 +404,8 @@ FORMAT_2 = [
         ),
         (
             "a-renamed-recording-is-gone",
-            "entry = None if place is None else self._current(now.summaries[place])",
-            "entry = None",
+            "                entry = self._current(now.summaries[now.by_id[summary.id]])\n",
+            "                return None\n",
             "tests/faults/test_meanwhile.py::test_a_recording_that_is_renamed_is_not_missed",
         ),
     ),
@@ -443,8 +443,8 @@ FORMAT_2 = [
         ),
         (
             "an-import-begins-anew",
-            "        if not _is_there(path / name, digest, size):\n            _copy",
-            "        if True:\n            _copy",
+            "    if is_whole():\n        return 0\n",
+            "",
             f"{IDENTITY}::test_an_import_goes_on_where_it_was_stopped",
         ),
         (
@@ -469,12 +469,6 @@ FORMAT_2 = [
             "what-was-exchanged-stays",
             "                files.rename(path / misfit.file, path / moving_name(misfit.file, misfit.belongs))\n",
             "                pass\n",
-            REPAIR,
-        ),
-        (
-            "a-journal-that-lacked-a-segment-proves",
-            "            journal.event(journal.REBUILT, reason=reason),\n            *[",
-            "            *[",
             REPAIR,
         ),
     ),
@@ -576,8 +570,8 @@ FORMAT_2 = [
         ),
         (
             "a-chunk-that-touches-a-range-is-left-out",
-            "not (first < bounds[1] and last >= bounds[0])",
-            "not (first < bounds[1] and last > bounds[0])",
+            "not (min(first, END - 1) < bounds[1] and last >= bounds[0])",
+            "not (min(first, END - 1) < bounds[1] and last > bounds[0])",
             f"{CATALOG}::test_chunks_by_channel_time_and_clock",
         ),
     ),
@@ -601,3 +595,161 @@ FORMAT_2 = [
     ),
 ]
 MUTANTS += FORMAT_2
+
+DROPPED = "tests/payloads/test_drop.py"
+IMPORT = "tests/payloads/test_import.py"
+LATE = "tests/payloads/test_answers.py::test_late_messages_in_row_groups_and_files_of_their_own"
+LOST_LINES = f"{DROPPED}::test_a_journal_that_lacks_its_last_lines_loses_no_message"
+ODD = "tests/storage/test_journal.py"
+POWER = "tests/payloads/test_power_cut.py::test_some_power_cuts"
+MARKED = "tests/test_repair.py::test_a_mark_beside_a_lost_segment_takes_nothing_of_it"
+
+MAINTENANCE = [
+    *_of(
+        "hybridlog/payloads/writer.py",
+        (
+            "late-row-groups-are-in-order",
+            "file.last < first and bool(is_next.all())",
+            "bool(is_next.all())",
+            LATE,
+        ),
+        ("columns-are-not-synced", "        durability.sync_file(fd)\n", "", POWER),
+    ),
+    *_of(
+        "hybridlog/payloads/reader.py",
+        ("files-that-overlap-are-in-order", "if any(end >= start for", "if any(False for", LATE),
+    ),
+    *_of(
+        "hybridlog/payloads/files.py",
+        (
+            "columns-move-into-folders-that-are-not-synced",
+            "            files.sync_folder(recording)\n            files.sync_folder(final, depth=files.IN_RECORDING)\n",
+            "            pass\n",
+            POWER,
+        ),
+        (
+            "names-of-columns-are-not-synced",
+            "            files.sync_folder(folder, depth=IN_PAYLOADS - 1)\n",
+            "            pass\n",
+            POWER,
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/edit.py",
+        (
+            "a-mark-takes-the-number-of-a-lost-segment",
+            "        numbers.update(inventory.state.sealed if inventory.state is not None else ())\n",
+            "",
+            MARKED,
+        ),
+        (
+            "a-mark-takes-the-arrival-number-of-a-lost-message",
+            "return following + sum(sealed.messages for sealed in inventory.lost)",
+            "return following",
+            MARKED,
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/imports.py",
+        (
+            "copied-columns-are-not-checked",
+            "        PayloadReader(folder, file).check()\n",
+            "        PayloadReader(folder, file)\n",
+            IMPORT,
+        ),
+        (
+            "more-than-the-listed-bytes-is-copied",
+            "os.read(fd, min(size, _PIECE))",
+            "os.read(fd, _PIECE)",
+            f"{IMPORT}::test_only_what_is_listed_is_copied",
+        ),
+        (
+            "what-an-earlier-import-left-stays",
+            "                if number not in inventory.summaries:\n                    files.unlink(path / name)\n",
+            "                pass\n",
+            f"{IMPORT}::test_what_an_earlier_import_left_is_checked",
+        ),
+    ),
+    *_of(
+        "hybridlog/entries.py",
+        (
+            "a-journal-that-lacked-a-segment-proves",
+            "return [journal.event(journal.REBUILT, reason=reason), *new,",
+            "return [*new,",
+            REPAIR,
+        ),
+        (
+            "a-stripped-segment-needs-its-line",
+            "if whole != summary.digest and (sealed is None or sealed.digest == whole):",
+            "if state is not None and state.thinned.get(number) and whole != summary.digest:",
+            LOST_LINES,
+        ),
+        (
+            "a-stripped-segment-is-listed-like-the-whole-one",
+            "return number in state.sealed and is_thinned and",
+            "return number in state.sealed and",
+            f"{DROPPED}::test_an_older_journal_in_a_store_that_cannot_be_written",
+        ),
+        (
+            "an-exchanged-stripped-segment-belongs-nowhere",
+            "belongs = numbers.get(_whole_digest(summary))",
+            "belongs = numbers.get(summary.digest)",
+            f"{DROPPED}::test_exchanged_segments_that_the_journal_lists_as_whole_ones",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/opening.py",
+        (
+            "lost-lines-about-columns-stay-lost",
+            "if inventory.stored and (missing := unlisted_lines(inventory)):",
+            "if False and (missing := unlisted_lines(inventory)):",
+            LOST_LINES,
+        ),
+    ),
+    *_of(
+        "hybridlog/tables/reader.py",
+        (
+            "the-last-row-of-a-group-begins-no-range",
+            "span[0] < high and span[1] > low",
+            "span[0] < high - 1 and span[1] > low",
+            "tests/tables/test_reader.py::test_row_groups_out_of_range_are_not_read",
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/chunk_table.py",
+        (
+            "a-part-may-end-before-it-begins",
+            ' or (parts["first"] > parts["last"]).any()',
+            "",
+            "tests/storage/test_chunk_table.py",
+        ),
+    ),
+    *_of(
+        "storage/hybridlog_storage/journal.py",
+        (
+            "booleans-are-numbers",
+            "if type(value) is not int or",
+            "if not isinstance(value, int) or",
+            ODD,
+        ),
+        (
+            "labels-lead-elsewhere",
+            "(_label(labels[0]), _label(labels[1]))",
+            "(_text(labels[0]), _text(labels[1]))",
+            ODD,
+        ),
+        (
+            "half-of-a-surrogate-pair-is-text",
+            "    value.encode()  # fails for half of a surrogate pair\n",
+            "",
+            ODD,
+        ),
+        (
+            "the-end-is-taken-as-it-is",
+            'self.end = end_of(line["end"])',
+            'self.end = dict(line["end"])',
+            ODD,
+        ),
+    ),
+]
+MUTANTS += MAINTENANCE

@@ -92,21 +92,19 @@ class PowerCut(System):
         self._left = calls
         self._keeps_names = keeps_names
         self._forgets = forgets
-        # By a number of ours, as the system uses the number of a removed file again.
         self._files: dict[int, _File] = {}
         self._folders: dict[int, _Folder] = {}
         self._numbers: dict[int, int] = {}
-        paths = [root, *root.rglob("*")]
-        for path in paths:
-            self._numbers[path.lstat().st_ino] = len(self._numbers)
-        self._made = len(self._numbers)
-        for path in paths:
+        """By inode: the same, or another number where it was that of a removed file before."""
+        self._root = self._new_number(root.stat())
+        for path in [root, *root.rglob("*")]:
             about = path.lstat()
+            number = self._number(about)
             if stat.S_ISDIR(about.st_mode):
-                inside = {p.name: self._numbers[p.lstat().st_ino] for p in path.iterdir()}
-                self._folders[self._numbers[about.st_ino]] = _Folder(inside)
+                inside = {p.name: self._number(p.lstat()) for p in path.iterdir()}
+                self._folders[number] = _Folder(inside)
             elif stat.S_ISREG(about.st_mode):
-                self._files[self._numbers[about.st_ino]] = _File(path.read_bytes())
+                self._files[number] = _File(path.read_bytes())
 
     @property
     def is_off(self) -> bool:
@@ -207,7 +205,7 @@ class PowerCut(System):
 
     def after_cut(self, target: Path, rng: random.Random) -> None:
         """Make the folder that may be found after a cut at this moment."""
-        self._lay(0, target, rng)
+        self._lay(self._root, target, rng)
 
     def _lay(self, number: int, target: Path, rng: random.Random) -> None:
         if number in self._folders:
@@ -235,9 +233,11 @@ class PowerCut(System):
         return self._new_number(about) if known is None else known
 
     def _new_number(self, about: os.stat_result) -> int:
-        self._made += 1
-        self._numbers[about.st_ino] = self._made
-        return self._made
+        number = about.st_ino
+        while number in self._files or number in self._folders:
+            number += 1 << 64
+        self._numbers[about.st_ino] = number
+        return number
 
 
 def _exists(name: str, folder: int | None) -> bool:

@@ -289,7 +289,7 @@ def incomplete() -> Iterator[tuple[str, dict[str, Any]]]:
         line = complete[kind]
         for name in names:
             yield f"{kind} without {name}", {k: v for k, v in line.items() if k != name}
-            for wrong in (None, 5.5, [[]], {"a": 5}):
+            for wrong in (None, 5.5, [[]], {"a": 5}, True):
                 if (name, wrong) == ("end", {"a": 5}):
                     continue
                 yield f"{kind} {name} {wrong}", {**line, name: wrong}
@@ -305,6 +305,8 @@ def incomplete() -> Iterator[tuple[str, dict[str, Any]]]:
     yield "only to", event(RENAMED, name="other", to="b")
     yield "only from", event(RENAMED, name="other", **{"from": "a"})
     yield "from", event(RENAMED, name="other", **{"from": 5, "to": "b"})
+    for wrong in ("../b", "a/b", "", ".", ".removed-b", "a\0b"):
+        yield f"to {wrong}", event(RENAMED, name="other", **{"from": "a", "to": wrong})
 
 
 INCOMPLETE = dict(incomplete())
