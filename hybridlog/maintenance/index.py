@@ -211,12 +211,12 @@ def ids_present(directory: StoreDirectory) -> set[str] | None:
     If one is renamed meanwhile, all are listed again, so that none is missed.
     """
     for _ in range(_TRIES):
-        labels = directory.labels()
+        looks = directory.looks(directory.labels())
         try:
-            found = {directory.id_of(label)[:16] for label in labels}
+            found = {directory.id_of(label)[:16] for label in looks}
         except StoreError:
             return None
-        if directory.labels() == labels:
+        if directory.looks(directory.labels()) == looks:
             return found
     return None
 

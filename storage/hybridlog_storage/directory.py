@@ -441,10 +441,10 @@ class StoreDirectory:
         """Labels of a recording, by its id; several are copies of one."""
         found: list[str] = []
         for _ in range(_TRIES):
-            labels = self.labels()
-            found = [label for label in labels if self.has_label(label, recording)]
+            looks = self.looks(self.labels())
+            found = [label for label in looks if self.has_label(label, recording)]
             # One that is renamed meanwhile must not be missed.
-            if found or self.labels() == labels:
+            if found or self.looks(self.labels()) == looks:
                 break
         return found
 

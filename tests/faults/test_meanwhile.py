@@ -65,6 +65,24 @@ def test_a_recording_that_is_renamed_stays_in_the_index(
     assert ids_present(directory) == before
 
 
+def test_labels_that_are_exchanged_hide_no_recording(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory, path = StoreDirectory(case.path), case.path / "recordings"
+    before = ids_present(directory)
+    recording = directory.id_of("a")
+
+    def exchange() -> None:
+        for old, new in (("a", ".x"), ("b", "a"), (".x", "b")):
+            (path / old).rename(path / new)
+
+    once(exchange, monkeypatch, "id_of")
+    assert ids_present(directory) == before
+    monkeypatch.undo()
+    once(exchange, monkeypatch, "id_of")
+    assert directory.labels_of(recording) == ["a"]
+
+
 def test_a_recording_that_is_removed_is_no_unreadable_one(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
