@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 _SHOWN = 5  # recordings in a message
 _MAX_OPEN_SEGMENTS = 256
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
-_TRIES = 5  # to connect, while the connection breaks
+_TRIES = 5  # to connect, while the connection breaks; to find a recording, while it is renamed
 _PAUSE_S = 0.1  # before the second try; doubles each time
 _LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
 _LOOK_SHARE = 0.1  # but for this share of it,
@@ -594,12 +594,16 @@ class Session:
         found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
         if found is None:
             entry = self._current(summary)
-            while entry is None or entry.id != summary.id:
+            for _ in range(_TRIES):
+                if entry is not None and entry.id == summary.id:
+                    break
                 # Another process may have renamed it.
                 now = repair_on_open(self.directory, self.catalog, self.repairs)
                 if summary.id not in now.by_id:
                     return None
                 entry = self._current(now.summaries[now.by_id[summary.id]])
+            if entry is None or entry.id != summary.id:
+                return None
             if entry.status in UNFINISHED:
                 return entry
             found = self._entries.setdefault(summary.id, entry)

@@ -5,8 +5,12 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -16,11 +20,12 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.maintenance import imports
+from hybridlog.maintenance import compact, edit, imports
 from hybridlog.maintenance.imports import ImportReport
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog.session import Session
+from hybridlog_storage import directory as directory_module
 from hybridlog_storage import files, journal
 from hybridlog_storage.database import Database
 from hybridlog_storage.directory import StoreDirectory
@@ -552,6 +557,51 @@ def test_a_command_finds_a_recording_whose_label_goes_around(
             assert content_of(place, one) != before, (step, again)
             if max(exchange.steps) >= 0:
                 break
+
+
+def test_twenty_commands_at_once_wait_for_each_other(
+    two: tuple[Path, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base, one, _ = two
+    path = tmp_path / "store"
+    shutil.copytree(base, path)
+    commands: list[Callable[[hl.Store], object]] = [
+        *(partial(hl.Store.tag, recording=one, **{f"key{n}": str(n)}) for n in range(8)),
+        *(partial(hl.Store.note, recording=one, note=f"note {n}") for n in range(4)),
+        *(partial(hl.Store.mark, recording=one, moment="+1s", note=f"mark {n}") for n in range(4)),
+        *(partial(hl.Store.rename, recording=one, name=f"name {n}") for n in range(3)),
+        partial(hl.Store.compact, recordings=[one], topics=["/scan"]),
+    ]
+    waiting: set[int] = set()
+
+    def pause(seconds: float) -> None:
+        waiting.add(threading.get_ident())
+        time.sleep(seconds)
+
+    monkeypatch.setattr(directory_module, "pause", pause)
+    for module in (edit, compact):
+        monkeypatch.setattr(module, "LOCK_WAIT_S", 250)  # however slow the machine is
+
+    def run(command: Callable[[hl.Store], object]) -> None:
+        with hl.open(path, mongo=NOWHERE) as store:
+            command(store)
+
+    with hl.open(path, mongo=NOWHERE) as store, ThreadPoolExecutor(len(commands)) as pool:
+        with store.directory.writing("a", one):
+            begun = [pool.submit(run, command) for command in commands]
+            while len(waiting) < len(commands):
+                time.sleep(0.01)
+        for future in begun:
+            future.result(250)
+        store.refresh()
+        entry = store.entry(one)
+        assert entry.tags == {"a": "1"} | {f"key{n}": str(n) for n in range(8)}
+        assert sorted(note["text"] for note in entry.notes) == [f"note {n}" for n in range(4)]
+        assert sorted(mark["text"] for mark in entry.marks) == [f"mark {n}" for n in range(4)]
+        assert entry.name in {f"name {n}" for n in range(3)}
+        assert entry.label == entry.name.replace(" ", "-")
+        assert entry.payloads
+        assert not store.verify().findings
 
 
 @pytest.mark.parametrize("change", [swap, replace, remove])

@@ -531,10 +531,13 @@ class StoreDirectory:
 
     def _is_lock_of(self, fd: int, label: str, recording: str) -> bool:
         """True if an open lock is that of a label, and the label that of a recording."""
+        path = self.recording(label) / LOCK
         try:
-            there = files.status(self.recording(label) / LOCK)
-        except OSError:
+            there = files.status(path)
+        except FileNotFoundError:
             return False
+        except OSError as error:
+            raise durability.explain(error, path, "locking") from error
         return os.path.samestat(os.fstat(fd), there) and self.has_label(label, recording)
 
     def holder(self, label: str) -> Holder | None:

@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from tests.imports import ROOT
 from tests.independent import read_bag
 from tests.other_user import User, needs_root, open_place
 
-from .running import recordings, run, wait_for
+from .running import recordings, run
 
 
 def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
@@ -50,48 +49,6 @@ def test_verify_lists_what_is_off(fresh: Path) -> None:
     found = run("verify", "--json", store=fresh, code=1).json["findings"]
     assert len(found) == len(findings)
     assert run("verify", "--quiet", store=fresh, code=1).lines == findings
-
-
-def test_twenty_commands_at_once_wait_for_each_other(fresh: Path) -> None:
-    with hl.open(fresh) as store:
-        recording = store.entry("small").id
-    commands = [
-        *(("tag", recording, f"key{n}={n}") for n in range(8)),
-        *(("note", recording, f"note {n}") for n in range(4)),
-        *(("mark", "-r", recording, "--at", f"+{n}s", f"mark {n}") for n in range(4)),
-        *(("rename", recording, f"small {n}") for n in range(3)),
-        ("reindex", "-r", recording, "-q"),
-    ]
-    with hl.open(fresh) as store, store.directory.writing("small"):
-        begun = [
-            subprocess.Popen(
-                [sys.executable, "-m", "hybridlog", *command, "--store", fresh],
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-            for command in commands
-        ]
-        wait_for(lambda: locks(fresh / "recordings/small/writer.lock", begun) >= 2)
-    for command, process in zip(commands, begun, strict=True):
-        _, told = process.communicate(timeout=200)
-        assert (process.returncode, told) == (0, told), command
-    with hl.open(fresh) as store:
-        entry = store.entry(recording)
-        assert entry.tags == {f"key{n}": str(n) for n in range(8)}
-        assert sorted(note["text"] for note in entry.notes) == [f"note {n}" for n in range(4)]
-        assert sorted(mark["text"] for mark in entry.marks) == [f"mark {n}" for n in range(4)]
-        assert entry.name in {f"small {n}" for n in range(3)}
-        assert not store.verify().findings
-
-
-def locks(lock: Path, processes: list[subprocess.Popen[str]]) -> int:
-    """How many processes have a lock open."""
-    found = 0
-    for process in processes:
-        with suppress(OSError):
-            opened = Path(f"/proc/{process.pid}/fd").iterdir()
-            found += any(fd.samefile(lock) for fd in opened)
-    return found
 
 
 def test_rm(logs: Path, fresh: Path) -> None:
