@@ -45,6 +45,7 @@ from hybridlog_storage.errors import (
     DiskFullError,
     HybridlogError,
     IndexChangedError,
+    SegmentError,
     StoreError,
     TopicError,
 )
@@ -954,10 +955,22 @@ class Session:
             reader = self._segments.get(key)
             if reader is None:
                 _make_room(self._segments)
-                path = self.directory.recording(self.entry(recording).label)
-                reader = open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path))
+                label = self.entry(recording).label
+                try:
+                    reader = self._open_segment(label, number)
+                except SegmentError:
+                    # Another process may have renamed the recording.
+                    known = repair_on_open(self.directory, self.catalog, self.repairs)
+                    place = known.by_id.get(recording)
+                    if place is None or known.summaries[place].label == label:
+                        raise
+                    reader = self._open_segment(known.summaries[place].label, number)
                 self._segments[key] = reader
             return reader
+
+    def _open_segment(self, label: str, number: int) -> SegmentReader:
+        path = self.directory.recording(label)
+        return open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path))
 
     def payload_readers(self, recording: RecordingEntry, topic: str) -> list[PayloadReader] | None:
         """Files of columns of a topic in order of time; None if they cannot be used."""

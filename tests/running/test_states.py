@@ -1,0 +1,197 @@
+"""Copies of a recording that goes on, dead recorders, and other processes that change it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog_storage.directory import StoreDirectory
+from tests.imports import ROOT
+from tests.running.methods import LABEL, METHODS, rows, same, sent
+from tests.running.running import NO_MONGODB, Running, begun
+from tests.running.sequence import SAID, Known, messages
+from tests.running.stores import copy_of
+from tests.scale.cost import cost_of
+
+ABOUT_LOSSES = {"lost", "check_complete", "remarks"}
+"""What a crash has cost is lost, too."""
+
+
+@pytest.fixture(scope="module", params=["one", "many"])
+def running(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Running]:
+    with begun(tmp_path_factory.mktemp("running") / "store", request.param, 130) as found:
+        yield found
+
+
+def check(store: hl.Store, known: Known) -> None:
+    for name, rule in METHODS.items():
+        if name not in ABOUT_LOSSES:
+            found, wanted = rule.ask(store), rule.right(known)
+            assert same(found, wanted), (name, found, wanted)
+
+
+def test_a_copy_that_cannot_be_written(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = running.flushed()
+    copied = copy_of(running, tmp_path / "copy")
+    monkeypatch.setattr(StoreDirectory, "is_writable", False)
+    with hl.open(copied, mongo=NO_MONGODB) as store:
+        assert store.entry(LABEL).status == "unfinished"
+        check(store, known)
+        lost = store.topic("arm").lost()
+        assert (bool(lost), lost.is_exact) == (True, False)
+        assert list(copied.glob("recordings/live/*.open"))
+
+
+def test_a_copy_is_recovered(running: Running, tmp_path: Path) -> None:
+    known = running.flushed()
+    copied = copy_of(running, tmp_path / "copy")
+    with hl.open(copied, mongo=NO_MONGODB) as store:
+        assert store.entry(LABEL).status == "recovered"
+        check(store, known)
+    assert running.before.entry(LABEL).status == "open"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["one", "many"])
+def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "store"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.running.recorder", str(path), kind],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    everything = messages(0, 10_000, 0)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        with hl.open(path, mongo=NO_MONGODB) as before:
+            until = time.monotonic() + 60
+            while before.entry(LABEL).messages < 300:
+                assert time.monotonic() < until
+                time.sleep(0.01)
+            least = before.entry(LABEL).messages_by_topic()
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            with monkeypatch.context() as patch:
+                patch.setattr(StoreDirectory, "is_writable", False)
+                with hl.open(path, mongo=NO_MONGODB) as store, store.at_one_moment():
+                    entry = store.entry(LABEL)
+                    assert entry.status == "unfinished"
+                    counts = dict(entry.messages_by_topic())
+                    assert all(counts[topic] >= count for topic, count in least.items())
+                    check(store, Known(everything, counts))
+            with hl.open(path, mongo=NO_MONGODB) as store:
+                entry = store.entry(LABEL)
+                assert entry.status == "recovered"
+                assert dict(entry.messages_by_topic()) == counts
+                check(store, Known(everything, counts))
+            before.refresh()
+            check(before, Known(everything, counts))
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_documents_are_a_beginning(running: Running) -> None:
+    """MongoDB has what is indexed, which may be less than what is flushed."""
+    known = running.flushed()
+    with hl.open(running.path) as store:
+        found = [one["n"] for one in store.topic("said").documents()]
+    wanted = [m.fields["n"] for m in known.of("/said") if m.fields is not None]
+    assert found == wanted
+
+
+@pytest.fixture
+def ended(tmp_path: Path) -> Iterator[tuple[hl.Store, Known]]:
+    """A handle that has asked about a recording, and which has been closed since."""
+    with begun(tmp_path / "store", "many", 130) as found:
+        with hl.open(found.path, mongo=NO_MONGODB) as store:
+            known = found.flushed()
+            assert rows(store.topic("arm")) == sent(known.of("/arm"))
+            found.recording.close()
+            yield store, known
+
+
+def test_sealed_between_a_look_and_reading(tmp_path: Path) -> None:
+    with begun(tmp_path / "store", "many", 130) as found:
+        known = found.flushed()
+        with hl.open(found.path, mongo=NO_MONGODB) as store, store.at_one_moment():
+            assert store.entry(LABEL).flushed
+            found.write(60)
+            found.recording.close()
+            check(store, known)
+            steps = iter(store.all_topics())
+        assert len([*steps]) == len(found.sent)
+
+
+def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
+    store, known = ended
+    steps = iter(store.all_topics())
+    first = next(steps)
+    with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
+        other.rename(LABEL, "other")
+    assert rows([first, *steps]) == sent(known.of())
+    assert store.topic("arm").in_recording("other").count() == len(known.of("/arm"))
+    assert [r.label for r in store.summaries()] == ["other"]
+
+
+def test_compacted_meanwhile(ended: tuple[hl.Store, Known]) -> None:
+    store, known = ended
+    steps = iter(store.topic("arm", "cam"))
+    first = next(steps)
+    with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
+        assert other.compact([LABEL], ["arm", "cam"], drop_mcap=True)
+    assert rows([first, *steps]) == sent(known.of("/arm", "/cam"))
+    check(store, known)
+
+
+def test_removed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
+    store, known = ended
+    with store.at_one_moment():
+        assert store.topic("arm").count() == len(known.of("/arm"))
+        with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
+            other.remove(LABEL)
+    assert store.topics() == []
+    assert store.summaries() == []
+
+
+def test_what_questions_read(tmp_path: Path) -> None:
+    """Ended recordings are asked without the running one; that is read once."""
+    path = tmp_path / "store"
+    with hl.open(path, create=True) as store, store.start("ended") as recording:
+        for one in messages(0, 50, 0):
+            if one.topic == "/said":
+                recording.write(SAID, one.raw, log_time=one.log_time)
+    with begun(path, "one", 130) as found, hl.open(path, mongo=NO_MONGODB) as store:
+        about_ended = store.topic("said").in_recording("ended")
+        assert about_ended.count() == 50
+        cost = cost_of(store, lambda: (rows(about_ended), about_ended.where("n > 3").count()))
+        assert not [name for name in cost.opened if name.endswith(".open")]
+        with hl.open(path, mongo=NO_MONGODB) as other:
+            cost = cost_of(other, lambda: other.query(["/said"], ["ended"]).count())
+            assert not [name for name in cost.opened if name.endswith(".open")]
+        running = store.query(["/said"], [LABEL])
+        found.flushed()
+        assert running.count() == found.step
+        again = cost_of(store, running.count)
+        assert not [name for name in again.opened if name.endswith(".open")]
+        assert again.bytes_read <= 2 * 4096  # the room behind the last block
+        grown = next(path.glob("recordings/*/*.open")).stat().st_size
+        found.write(20)
+        found.flushed()
+        grown = next(path.glob("recordings/*/*.open")).stat().st_size - grown
+        more = cost_of(store, running.count)
+        assert running.count() == found.step
+        assert more.bytes_read < grown + 3 * 4096
