@@ -13,7 +13,6 @@ from hybridlog.query.times import (
     parse_range,
     parse_time,
 )
-from hybridlog.schema.stamps import stamps_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END, span_of
@@ -219,6 +218,8 @@ class RangeResolver:
         for chunk in self._session.chunks(recording, [number], None, "log"):
             known = _known_ends(chunk.stats[number], is_publish=is_publish)
             if not known:
+                from hybridlog.schema.stamps import stamps_of
+
                 reader = self._session.segment(recording.id, chunk.segment)
                 batch = reader.read_chunk(chunk.place).batch
                 batch = batch.take(np.flatnonzero(batch.channel == number))

@@ -109,6 +109,8 @@ def with_nested(schema: Schema) -> Schema:
         _, supplied = parse_for_release(schema, "")
     except DefinitionError:
         return schema
+    if not supplied:
+        return schema
     return replace(schema, data=schema.data + _sections(_DEFAULTS[schema.encoding], supplied))
 
 

@@ -53,8 +53,8 @@ def test_help_imports_little() -> None:
 
 
 def test_looking_imports_no_table_libraries(store: Path) -> None:
-    for command in ("ls", "info"):
-        assert not packages_of(command, "--store", store) & {"pandas", "pyarrow", "rosbags"}
+    for command in (("ls",), ("info", "robot")):
+        assert not packages_of(*command, "--store", store) & {"pandas", "pyarrow", "rosbags"}
 
 
 def test_help_names_commands_and_exit_codes() -> None:
