@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -135,13 +137,26 @@ def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
 
 
 def _snapshot(directory: StoreDirectory) -> Snapshot:
-    """The recordings in the catalog; nothing is repaired for it."""
+    """The recordings in the catalog, with what is flushed; nothing is repaired for it."""
     from contextlib import closing
 
+    from hybridlog.entries import summary_of
     from hybridlog.maintenance.opening import open_catalog, snapshot_of
+    from hybridlog.running import RunningRecording
+    from hybridlog.snapshot import UNFINISHED
 
     with closing(open_catalog(directory)) as catalog:
-        return snapshot_of(catalog, catalog.summaries())
+        found = snapshot_of(catalog, catalog.summaries())
+        for summary in found.summaries:
+            known = catalog.recording(summary.id) if summary.status in UNFINISHED else None
+            if known is None:
+                continue
+            running = RunningRecording(directory, summary.label, partial(itemgetter(1), known))
+            running.follow()
+            if running.entry is not None:
+                now = summary_of(running.entry, summary.look)
+                found = found.with_summary(now, running.topics)
+        return found
 
 
 def _short_names(topics: set[str]) -> Iterator[str]:
