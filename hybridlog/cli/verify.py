@@ -13,6 +13,7 @@ from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.query_options import recordings_of
+from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError
 
 if TYPE_CHECKING:
@@ -51,6 +52,9 @@ def command(
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
         _print(result, elapsed, quiet=quiet)
+        running = [one.label for one in chosen.summaries if one.status == "open"]
+        if running and not quiet:
+            output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
     if not result.index and (result.findings or why is None):
         output.note(f"The index was not compared: {why}")
     if result.findings:
