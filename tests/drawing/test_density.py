@@ -361,3 +361,51 @@ def test_a_segment_that_was_written_again_is_counted_again(
         chunks = RecordedChunks(store.session, flushed("one", few + 1))
         chunks.load((BASE, BASE + 10_000))
         assert not chunks.follow(flushed("other", few + 2))
+
+
+def test_parts_of_chunks_are_known_as_they_come(store: hl.Store) -> None:
+    entry = store.entry("a")
+    topics = sorted(TIMES)
+    span = BASE - MS, BASE + 2 * LENGTH
+    (segment, first, last) = entry.spans[0]
+    whole = store.session.chunk_table(entry, segment)
+    assert (whole.chunks["parts"] > 1).any()
+
+    def flushed(count: int) -> RecordingEntry:
+        parts = whole.parts[: int(whole.chunks["parts"][:count].sum())]
+        now = replace(whole, chunks=whole.chunks[:count], parts=parts, is_flushed=True)
+        content = {segment: Flushed(now, (), ())}
+        spans = [(segment, first, last)]
+        return replace(entry, status="open", digests={}, flushed=content, spans=spans)
+
+    step = RecordedChunks(store.session, flushed(1))
+    for known in range(1, len(whole.chunks) + 1):
+        assert step.follow(flushed(known))
+        found = step.parts(span, topics)
+        wanted = RecordedChunks(store.session, flushed(known)).parts(span, topics)
+        for name, column in found._asdict().items():
+            assert column.tolist() == getattr(wanted, name).tolist(), (known, name)
+    # A chunk of the same size and times, but of other messages.
+    chunks = whole.chunks.copy()
+    chunks["trailer_crc"][-1] ^= 1
+    other = flushed(len(chunks))
+    other.flushed[segment] = Flushed(replace(whole, chunks=chunks, is_flushed=True), (), ())
+    assert not RecordedChunks(store.session, other).parts(span, []).segment.size
+    assert not step.follow(other)
+    assert not step.follow(flushed(len(chunks)))
+    assert step.follow(replace(entry, status="open"))
+    assert step.parts(span, topics).messages.sum() == sum(map(len, TIMES.values()))
+    digests = {number: f"{digest}?" for number, digest in entry.digests.items()}
+    assert not step.follow(replace(entry, status="open", digests=digests))
+
+
+def test_the_last_time_of_a_segment_is_in_it(store: hl.Store) -> None:
+    entry = store.entry("a")
+    for segment, first, last in entry.spans:
+        for time_ns in (first, last):
+            chunks = RecordedChunks(store.session, entry)
+            found = chunks.parts((time_ns, time_ns + 1), sorted(TIMES))
+            assert segment in found.segment
+        for time_ns in (first - 1, last + 1):
+            found = chunks.parts((time_ns, time_ns + 1), sorted(TIMES))
+            assert segment not in found.segment

@@ -55,6 +55,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Pa
     with half_written(path) as store:
         query = store.topic("/a")
         whole = store.topic("/a").windows(after="1s")
+        early = query.between(None, 2 * SECOND).windows(after="500ms")
         for part, unwritten in (
             (query.between("start", "end"), 3),
             (query.between(None, 2 * SECOND + 1), 3),
@@ -63,6 +64,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Pa
             (query.between("start", "-1s"), 0),
             (query.during(whole), 3),
             (query.during(whole).between(None, 2 * SECOND), 0),
+            (query.during(early), 0),
             (query.between(None, 2 * SECOND).clock("header"), 3),
         ):
             assert part.lost().unwritten == unwritten, part

@@ -17,12 +17,7 @@ from tests.running.sequence import Known
 
 SPECIAL = {"__iter__", "__getitem__", "__eq__", "__hash__", "__repr__"}
 PRIVATE = {"_repr_html_", "_ipython_key_completions_"}
-READERS = (
-    pytest.param("writer", marks=pytest.mark.slow),
-    "before",
-    "without mongodb",
-    pytest.param("later", marks=pytest.mark.slow),
-)
+READERS = ("writer", "before", "without mongodb", "later")
 
 
 @pytest.fixture(scope="module", params=["one", "many"])

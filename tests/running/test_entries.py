@@ -1,0 +1,131 @@
+"""The entry of a recording that goes on: what is sealed, and what is flushed besides."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.losses import Cause
+from hybridlog.running import RunningRecording
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_writer import SegmentSettings
+from tests.running.running import NO_MONGODB
+
+CHANNELS = [Channel("/a", "json", None), Channel("/b", "json", None)]
+SETTINGS = SegmentSettings(chunk_size=2048, segment_size=10_000, compression="none", sync="never")
+COUNT = 300
+
+
+def time_of(n: int) -> int:
+    """Each seventh message is late."""
+    return 10**18 + 1000 * n - (5500 if n % 7 == 0 else 0)
+
+
+@dataclass
+class Running:
+    """A recording that goes on.
+
+    Attributes:
+        path: A copy of its store as of one moment, without locks.
+        sealed: Its entry with the sealed segments alone.
+        entry: Its entry with everything.
+    """
+
+    path: Path
+    sealed: RecordingEntry
+    entry: RecordingEntry
+
+    def follow(self, directory: StoreDirectory) -> RecordingEntry:
+        running = RunningRecording(directory, "live", lambda: self.sealed)
+        running.follow()
+        assert running.entry is not None
+        return running.entry
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    base = tmp_path_factory.mktemp("entries")
+    with (
+        hl.open(base / "store", create=True) as store,
+        store.start("live", settings=SETTINGS, flush_interval_s=0.05) as recording,
+        hl.open(base / "store", mongo=NO_MONGODB) as reader,
+    ):
+        for n in range(COUNT):
+            payload = b'{"pad": "%b"}' % (b"." * (n % 90))
+            recording.write(CHANNELS[n % 2], payload, log_time=time_of(n))
+        until = time.monotonic() + 60
+        while (entry := reader.entry("live")).messages < COUNT or not entry.flushed:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        (summary,) = reader.session.snapshot().summaries
+        sealed = reader.session._read_entry(summary)
+        assert sealed is not None
+        assert 0 < sealed.messages < COUNT
+        shutil.copytree(base / "store", base / "copy", ignore=shutil.ignore_patterns("mongod*"))
+        yield Running(base / "copy", sealed, entry)
+
+
+def check(found: RecordingEntry) -> None:
+    assert found.messages == COUNT
+    assert found.messages_by_topic() == {"/a": COUNT // 2, "/b": COUNT // 2}
+    times = [time_of(n) for n in range(COUNT)]
+    assert found.span == (min(times), max(times))
+    numbers = [number for number, _, _ in found.spans]
+    assert numbers == sorted({*map(int, found.digests), *found.flushed})
+    assert not found.end.get("losses")
+
+
+def test_it_has_each_message_once(running: Running) -> None:
+    """However often it is looked at: what is sealed stays as it was read."""
+    before = replace(running.sealed, spans=list(running.sealed.spans))
+    for _ in range(3):
+        check(running.follow(StoreDirectory(running.path)))
+    assert running.sealed.spans == before.spans
+    assert running.sealed.messages < COUNT
+
+
+def test_what_is_sealed_while_it_is_listed_counts_once(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A segment may be listed as open, and be sealed when the catalog is read."""
+    directory = StoreDirectory(running.path)
+    listing = directory.listing("live")
+    late = replace(listing, open={**listing.sealed, **listing.open})
+    monkeypatch.setattr(directory, "listing", lambda _: late)
+    check(running.follow(directory))
+
+
+def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:
+    found = running.follow(StoreDirectory(running.path))
+    for number, first, last in found.spans:
+        if number in found.flushed:
+            parts = found.flushed[number].table.parts
+            assert (first, last) == (int(parts["first"].min()), int(parts["last"].max()))
+
+
+@pytest.mark.parametrize("is_file", [True, False])
+def test_what_cannot_be_read_is_a_loss(running: Running, tmp_path: Path, *, is_file: bool) -> None:
+    shutil.copytree(running.path, tmp_path / "store")
+    (path,) = (tmp_path / "store").glob("recordings/live/*.mcap.open")
+    place = running.entry.flushed[int(path.name[:6])].table.chunks[0]
+    data = bytearray(path.read_bytes())
+    data[int(place["offset"]) + 60] ^= 1
+    data[int(place["offset"]) + int(place["length"]) + 20] ^= 1
+    path.unlink()
+    if is_file:
+        path.write_bytes(data)
+    else:
+        path.mkdir()
+    found = running.follow(StoreDirectory(tmp_path / "store"))
+    (loss,) = found.end["losses"]
+    assert (loss["cause"], loss["file"], loss["count"]) == (Cause.SEGMENT, path.name, None)
+    assert loss["offset"] == (int(place["offset"]) if is_file else None)
+    assert running.sealed.messages <= found.messages < COUNT

@@ -1,0 +1,193 @@
+"""A segment that is being written, read again and again: what its summary will say of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.records import Metadata
+
+from hybridlog_storage.attachments import Attachment
+from hybridlog_storage.compression import FilePart
+from hybridlog_storage.open_segment import OpenSegment
+from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
+from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
+from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from tests.storage.test_segments import CHANNELS, LOSS, RECORDING, Row, batch_of
+
+PLACE = ("offset", "length", "trailer", "trailer_crc", "first", "last", "parts")
+PART = ("channel", "messages", "payload_bytes", "first", "last")
+
+
+class Written:
+    """A segment with six chunks, and records of all kinds between them.
+
+    Attributes:
+        data: Its bytes.
+        summary: Its summary.
+        ends: Where each chunk ends, with what is behind it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        settings = SegmentSettings(chunk_size=1 << 20, compression="none", sync="never")
+        writer = RecordingWriter(folder, RECORDING, lambda *_: None, settings)
+        for chunk in range(6):
+            rows: list[Row] = [
+                (n % 2 + chunk // 4, b"%d" % n * (n % 7), 1000 * chunk + 90 - 10 * n, n, n)
+                for n in range(9)
+            ]
+            writer.append(batch_of(rows), CHANNELS)
+            writer.flush()
+            if chunk == 1:
+                writer.add_extra(Metadata(name="calibration", metadata={"a": "b"}))
+                writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
+            if chunk == 2:
+                content = b"content" * 100
+                writer.add_extra(
+                    Attachment(1, 2, "a.txt", "text/plain", FilePart(BytesIO(content), 0, 700))
+                )
+        (path,) = writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+        self.data = path.read_bytes()
+        with SegmentReader(path, 0) as reader:
+            self.summary: SegmentSummary = reader.summary()
+        self.ends = [one.offset + one.length + one.trailer for one in self.summary.chunks]
+        assert len(self.ends) == 6
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
+    return Written(tmp_path_factory.mktemp("open") / "r")
+
+
+def check(segment: OpenSegment, written: Written, size: int) -> None:
+    """Compare what was read of the first bytes with what the summary says of them."""
+    summary = written.summary
+    table, attachments, metadata = segment.flushed
+    count = sum(end <= size for end in written.ends)
+    assert len(table.chunks) == count
+    assert table.is_flushed
+    for name in PLACE:
+        assert (table.chunks[name] == summary.table.chunks[name][:count]).all(), name
+    parts = int(table.chunks["parts"].sum())
+    assert len(table.parts) == parts
+    for name in PART:
+        assert (table.parts[name] == summary.table.parts[name][:parts]).all(), name
+    for found, wanted in ((attachments, summary.attachments), (metadata, summary.metadata)):
+        there = [one for one in wanted if one.offset + one.length <= size]
+        assert [(one.offset, one.length, one.name) for one in found] == [
+            (one.offset, one.length, one.name) for one in there
+        ]
+        for one in found:
+            place = table.stretch(one.offset, one.length)
+            assert place is not None
+            assert place[2] == segment.reader.checksum(place[0], place[1])
+    if count == len(written.ends):
+        assert segment.losses == list(summary.losses)
+        assert {n: asdict(channel) for n, channel in segment.channels.items()} == {
+            n: asdict(channel) for n, channel in summary.channels.items()
+        }
+
+
+@pytest.mark.parametrize("step", [17, 400, 1500])
+def test_it_is_followed_while_it_grows(written: Written, tmp_path: Path, step: int) -> None:
+    path = tmp_path / "000000.mcap.open"
+    path.write_bytes(written.data[:8])
+    segment = OpenSegment(tmp_path, 0)
+    before = 0
+    for size in [*range(8, len(written.data), step), len(written.data)]:
+        with path.open("ab") as file:
+            file.write(written.data[file.tell() : size])
+        is_new = segment.follow()
+        count = len(segment.flushed.table.chunks)
+        assert is_new or count == before
+        assert not segment.follow()
+        assert not segment.damaged
+        check(segment, written, size)
+        before = count
+    assert len(segment.flushed.metadata) == len(segment.flushed.attachments) == 1
+    assert len(segment.losses) == 1
+
+
+def test_a_segment_that_was_taken_back_is_read_anew(written: Written, tmp_path: Path) -> None:
+    path = tmp_path / "000000.mcap.open"
+    path.write_bytes(written.data[: written.ends[4]])
+    segment = OpenSegment(tmp_path, 0)
+    segment.follow()
+    for size in (written.ends[2] + 5, written.ends[0], len(written.data)):
+        path.write_bytes(written.data[:size])
+        assert segment.follow()
+        check(segment, written, size)
+
+
+def test_another_chunk_in_the_place_of_the_last_is_read(written: Written, tmp_path: Path) -> None:
+    """The writer took the last one back, and went on."""
+    path = tmp_path / "000000.mcap.open"
+    last = written.summary.chunks[4]
+    other = bytearray(written.data[: written.ends[4]])
+    other[last.offset + 9] ^= 1  # its first time
+    path.write_bytes(other)
+    segment = OpenSegment(tmp_path, 0)
+    segment.follow()
+    path.write_bytes(written.data)
+    assert segment.follow()
+    check(segment, written, len(written.data))
+
+
+def test_any_byte_behind_a_chunk_may_be_wrong(written: Written, tmp_path: Path) -> None:
+    """Its messages tell then, or the chunk is told to be damaged."""
+    place, table = written.summary.chunks[3], written.summary.table
+    path = tmp_path / "000000.mcap.open"
+    start = place.offset + place.length
+    whole = 0
+    for at in range(start, start + place.trailer):
+        data = bytearray(written.data[: written.ends[-1]])
+        data[at] ^= 0xFF
+        path.write_bytes(data)
+        segment = OpenSegment(tmp_path, 0)
+        segment.follow()
+        found = segment.flushed.table
+        is_told = bool(segment.damaged) or segment.stopped is not None
+        assert is_told or len(found.chunks) == 6, at
+        there = np.repeat(found.chunks["offset"], found.chunks["parts"])
+        wanted = np.repeat(table.chunks["offset"], table.chunks["parts"])
+        if is_told:
+            there, wanted = (rows[rows < place.offset] for rows in (there, wanted))
+        else:
+            whole += 1
+        assert there.tolist() == wanted.tolist(), at
+        for name in PART:
+            rows = found.parts[name][: len(there)] == table.parts[name][: len(there)]
+            assert rows.all(), (at, name)
+    assert whole > place.trailer // 5
+
+
+def test_what_cannot_be_read_is_told_and_the_rest_is_there(
+    written: Written, tmp_path: Path
+) -> None:
+    place = written.summary.chunks[3]
+    path = tmp_path / "000000.mcap.open"
+    data = bytearray(written.data[: written.ends[-1]])
+    data[place.offset + 100] ^= 0xFF
+    trailer = place.offset + place.length
+    data[trailer + 20] ^= 0xFF  # a time in the message index: only messages could tell
+    path.write_bytes(data)
+    segment = OpenSegment(tmp_path, 0)
+    segment.follow()
+    assert [(one.offset, one.length) for one in segment.damaged] == [(place.offset, place.length)]
+    table = segment.flushed.table
+    assert table.chunks["parts"].tolist()[3] == 0
+    rest = np.delete(np.arange(6), 3)
+    assert (table.chunks["parts"][rest] == written.summary.table.chunks["parts"][rest]).all()
+    # A record of metadata whose content does not add up.
+    (index,) = written.summary.metadata
+    data = bytearray(written.data[: written.ends[-1]])
+    data[index.offset + 9 : index.offset + 13] = b"\xff\xff\xff\x7f"
+    path.write_bytes(data)
+    segment = OpenSegment(tmp_path, 0)
+    segment.follow()
+    assert [(one.offset, one.length) for one in segment.damaged] == [(index.offset, index.length)]
+    assert len(segment.flushed.table.chunks) == 6
