@@ -38,7 +38,9 @@ def test_every_command_has_a_rule() -> None:
     assert all(one.words[0] == name for name, rules in COMMANDS.items() for one in rules)
 
 
-@pytest.mark.parametrize("mongo", ["", NO_MONGODB], ids=["mongodb", "without"])
+@pytest.mark.parametrize(
+    "mongo", ["", pytest.param(NO_MONGODB, marks=pytest.mark.slow)], ids=["mongodb", "without"]
+)
 @pytest.mark.parametrize("one", EVERY, ids=_id)
 def test_at_rest(
     running: Running, one: Asked, mongo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

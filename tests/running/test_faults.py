@@ -110,9 +110,9 @@ def without(data: bytes, chunk: int) -> bytes:
 
 
 def test_flipped_bits_are_no_silence(running: Running, copied: Path) -> None:
-    found = check_flips(running, copied, 40, 1)
-    assert found["error"] > 5
-    assert found["told"] > 5
+    found = check_flips(running, copied, 20, 1)
+    assert found["error"] > 2
+    assert found["told"] > 2
 
 
 @pytest.mark.exhaustive
@@ -128,8 +128,8 @@ def test_a_torn_end_is_no_damage(running: Running, copied: Path) -> None:
     data = path.read_bytes()
     starts = record_starts(data)
     rng = random.Random(3)
-    cuts = {rng.randrange(len(MAGIC), len(data)) for _ in range(30)}
-    cuts |= {start + n for start in rng.sample(starts, 15) for n in (0, 1, 9, 12, 40, 60)}
+    cuts = {rng.randrange(len(MAGIC), len(data)) for _ in range(15)}
+    cuts |= {start + n for start in rng.sample(starts, 6) for n in (0, 1, 9, 12, 40, 60)}
     before = 0
     for cut in sorted(cut for cut in cuts if cut <= len(data)):
         for room in (0, 4096):

@@ -17,7 +17,12 @@ from tests.running.sequence import Known
 
 SPECIAL = {"__iter__", "__getitem__", "__eq__", "__hash__", "__repr__"}
 PRIVATE = {"_repr_html_", "_ipython_key_completions_"}
-READERS = ("writer", "before", "without mongodb", "later")
+READERS = (
+    pytest.param("writer", marks=pytest.mark.slow),
+    "before",
+    "without mongodb",
+    pytest.param("later", marks=pytest.mark.slow),
+)
 
 
 @pytest.fixture(scope="module", params=["one", "many"])

@@ -10,13 +10,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.records import Metadata
 
 import hybridlog as hl
+from hybridlog_storage.attachments import Attachment
+from hybridlog_storage.compression import FilePart
 from hybridlog_storage.directory import StoreDirectory
+from tests.cli.running import complete, wait_for
+from tests.cli.within import answer
 from tests.imports import ROOT
 from tests.running.methods import LABEL, METHODS, rows, same, sent
 from tests.running.running import NO_MONGODB, Running, begun
-from tests.running.sequence import SAID, Known, messages
+from tests.running.sequence import SAID, START, Known, messages
 from tests.running.stores import copy_of
 from tests.scale.cost import cost_of
 
@@ -111,6 +116,34 @@ def test_documents_are_a_beginning(running: Running) -> None:
         found = [one["n"] for one in store.topic("said").documents()]
     wanted = [m.fields["n"] for m in known.of("/said") if m.fields is not None]
     assert found == wanted
+
+
+def test_extras_and_what_is_shown(tmp_path: Path) -> None:
+    """Attachments and metadata of a log that is being recorded; completion; notebooks."""
+    with begun(tmp_path / "store", "one", 130) as found:
+        record = tmp_path / "calibration.yaml"
+        record.write_bytes(b"fx: 500")
+        with record.open("rb") as file:
+            part = FilePart(file, 0, 7)
+            writer = found.recording._capture.writer
+            writer.add_extra(Attachment(START, START, record.name, "text/yaml", part))
+            writer.add_extra(Metadata(name="robot", metadata={"name": "seven"}))
+            wait_for(lambda: found.before.metadata(LABEL))
+        for store in (found.store, found.before):
+            wait_for(lambda store=store: store.metadata(LABEL))
+            (attachment,) = store.attachments(LABEL)
+            assert (attachment.name, b"".join(attachment.pieces())) == (record.name, b"fx: 500")
+            assert [one.values for one in store.metadata(LABEL)] == [{"name": "seven"}]
+            extras = store.topic("arm").extras()
+            assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
+        done = answer("attachments", LABEL, "--json", store=found.path)
+        assert [one["name"] for one in done.json] == [record.name]
+        image = found.before.topic("cam").first()
+        assert image is not None
+        assert "<img" in image._repr_html_()
+        assert LABEL in found.before.recordings()._repr_html_()
+        assert complete(f"fetch --store {found.path} -t sa") == ["said"]
+        assert complete(f"info --store {found.path} l") == [LABEL]
 
 
 @pytest.fixture
