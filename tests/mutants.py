@@ -753,3 +753,432 @@ MAINTENANCE = [
     ),
 ]
 MUTANTS += MAINTENANCE
+
+OPEN = "tests/storage/test_open_segment.py"
+CHANGES = "tests/query/test_changes.py"
+COMPACT = "tests/payloads/test_compact.py"
+DROP = "tests/payloads/test_drop.py"
+FOLLOW = "tests/live/test_follow.py"
+UNWRITTEN = "tests/live/test_unwritten.py"
+LOST = "tests/across/test_lost.py"
+DENSITY = "tests/drawing/test_density.py"
+SQL_RUNNING = "tests/sql/test_running.py"
+NEAR = "tests/across/test_near.py"
+RUNNING_ENTRIES = "tests/running/test_entries.py"
+CHANGED = f"{SNAPSHOT}::test_a_recording_that_has_changed_is_as_if_it_had_been_so"
+CHOSEN = f"{IDENTITY}::test_a_command_changes_the_recording_that_was_chosen"
+COVERED = f"{INTERVALS}::test_intervals_cover_what_sets_of_times_do"
+HELD = f"{INTERVALS}::test_a_state_holds_until_the_next_message"
+STEPS_NEAR = f"{INTERVALS}::test_steps_that_are_near_are_one_change"
+
+SILENT = [
+    *_of(
+        "storage/hybridlog_storage/open_segment.py",
+        (
+            "a-segment-that-was-taken-back-is-not-read-anew",
+            "        is_cut = self.is_cut()\n",
+            "        is_cut = False\n",
+            OPEN,
+        ),
+        (
+            "a-record-that-is-being-written-counts",
+            "if behind > size or not self._take(",
+            "if not self._take(",
+            OPEN,
+        ),
+        (
+            "indexes-that-contradict-their-chunk-are-believed",
+            '    if (int(parts["first"].min()), int(parts["last"].max())) != span:\n        return None\n',
+            "",
+            OPEN,
+        ),
+        (
+            "unreadable-flushed-chunks-are-no-damage",
+            "                self.damaged.append(Damage(offset, length, str(error)))\n",
+            "",
+            OPEN,
+        ),
+        (
+            "unreadable-flushed-records-are-no-damage",
+            "                self.damaged.append(Damage(at, behind - at, str(error)))\n",
+            "                pass\n",
+            OPEN,
+        ),
+        (
+            "flushed-losses-are-dropped",
+            "            self.losses += loss_rows(json_of(record))\n",
+            "            pass\n",
+            OPEN,
+        ),
+        (
+            "our-flushed-metadata-is-that-of-the-source",
+            "        elif not record.name.startswith(OUR_NAMES):\n",
+            "        else:\n",
+            OPEN,
+        ),
+        (
+            "flushed-attachments-are-dropped",
+            "        self._attachments.append(found.index(at, length))\n",
+            "",
+            OPEN,
+        ),
+        (
+            "heads-of-flushed-messages-are-payload",
+            " - MESSAGE_HEAD.itemsize",
+            "",
+            OPEN,
+        ),
+        (
+            "a-table-that-was-asked-for-never-grows",
+            "        self._last = self._head[: CHUNK_HEAD.size]\n        self._flushed = None\n",
+            "        self._last = self._head[: CHUNK_HEAD.size]\n",
+            OPEN,
+        ),
+        (
+            "a-record-that-was-flushed-later-is-not-seen",
+            "self.reader.checksum(at, length)))\n        self._flushed = None\n",
+            "self.reader.checksum(at, length)))\n",
+            OPEN,
+        ),
+        (
+            "the-last-time-of-an-index-is-its-first",
+            "[t[0] for t in times], [t[-1] for t in times]",
+            "[t[0] for t in times], [t[0] for t in times]",
+            OPEN,
+        ),
+        (
+            "order-of-flushed-messages-is-taken-for-granted",
+            "    sizes[order] = np.diff(starts[order], ",
+            "    sizes[:] = np.diff(starts, ",
+            OPEN,
+        ),
+    ),
+    *_of(
+        "hybridlog/snapshot.py",
+        (
+            "a-recording-that-has-begun-keeps-its-place",
+            "        if now != sorted(now, key=_order) or",
+            "        if",
+            CHANGED,
+        ),
+        (
+            "a-recording-that-was-renamed-keeps-its-label",
+            " or self.summaries[place].label != summary.label:",
+            ":",
+            CHANGED,
+        ),
+        (
+            "a-recording-that-goes-on-keeps-its-end",
+            "        found.begin[place], found.end[place] = summary.extent\n",
+            "        found.begin[place] = summary.extent[0]\n",
+            CHANGED,
+        ),
+        (
+            "a-recording-that-has-ended-is-open",
+            "        found.is_open[place] = summary.status in UNFINISHED\n",
+            "",
+            CHANGED,
+        ),
+        (
+            "a-moment-before-is-changed-too",
+            "        found.begin, found.end = self.begin.copy(), self.end.copy()\n",
+            "",
+            CHANGED,
+        ),
+        (
+            "new-tags-are-not-found",
+            "        if summary.tags != self.summaries[place].tags:\n",
+            "        if False:\n",
+            CHANGED,
+        ),
+        (
+            "a-new-topic-has-no-recordings",
+            "_set=sets, _having={})",
+            "_set=sets)",
+            CHANGED,
+        ),
+        (
+            "a-new-topic-is-not-listed",
+            'for name in ("topics", "schemas"):',
+            'for name in ("schemas",):',
+            CHANGED,
+        ),
+        (
+            "a-new-topic-is-that-of-another-recording",
+            "            sets[place] = list(known).index(summary.topics)\n",
+            "",
+            CHANGED,
+        ),
+    ),
+    *_of(
+        "hybridlog/query/intervals.py",
+        (
+            "intervals-that-touch-stay-apart",
+            "rows[1:, 0] > reach[:-1]]",
+            "rows[1:, 0] >= reach[:-1]]",
+            COVERED,
+        ),
+        (
+            "an-interval-ends-with-the-last-inside-it",
+            "    reach = np.maximum.accumulate(rows[:, 1])\n",
+            "    reach = rows[:, 1]\n",
+            COVERED,
+        ),
+        (
+            "what-is-behind-the-last-taken-is-dropped",
+            "            end = np.concatenate([taken[:, 0], [END]])\n            rows =",
+            "            end = np.concatenate([taken[:, 0], taken[-1:, 1]])\n            begin = begin[: len(end)]\n            rows =",
+            f"{NEAR}::test_union_and_difference",
+        ),
+        (
+            "a-change-ends-with-its-pause",
+            "(rows[:-1, 1] - 1) > self._pause",
+            "(rows[:-1, 1] - 1) >= self._pause",
+            STEPS_NEAR,
+        ),
+        (
+            "an-open-change-is-a-nanosecond-longer",
+            "        apart = rows[1:, 0] - (rows[:-1, 1] - 1) > self._pause\n",
+            "        apart = rows[1:, 0] - rows[:-1, 1] > self._pause\n",
+            STEPS_NEAR,
+        ),
+        (
+            "the-first-of-messages-at-a-time-counts",
+            "axis=1)[holds[last]]",
+            "axis=1)[holds[first]]",
+            HELD,
+        ),
+        (
+            "a-block-ends-with-its-last-time",
+            "whole = int(np.searchsorted(time, time[-1])) if len(time) else 0",
+            'whole = int(np.searchsorted(time, time[-1], "right")) if len(time) else 0',
+            HELD,
+        ),
+        (
+            "messages-that-end-a-state-count",
+            "            count[len(self._count) :] = holds[len(self._count) :]\n",
+            "            count[len(self._count) :] = 1\n",
+            HELD,
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/edit.py",
+        (
+            "the-recording-that-has-the-label-is-marked",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        inventory",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        inventory",
+            f"{CHOSEN}[mark]",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/removal.py",
+        (
+            "the-recording-that-has-the-label-is-removed",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n",
+            f"{CHOSEN}[rm]",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/compact.py",
+        (
+            "the-recording-that-has-the-label-is-compacted",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n",
+            f"{CHOSEN}[compact]",
+        ),
+    ),
+    *_of(
+        "hybridlog/query/answers/follow.py",
+        (
+            "what-was-followed-comes-again",
+            "start = min(read if segment == last else 0, len(table.chunks))",
+            "start = 0",
+            f"{FOLLOW}::test_each_message_comes_once_whenever_it_was_sent",
+        ),
+        (
+            "following-begins-with-the-segment",
+            "                _ = [*self._arrivals(entry, None)]\n",
+            "",
+            f"{FOLLOW}::test_each_message_comes_once_whenever_it_was_sent",
+        ),
+        (
+            "the-rest-of-a-sealed-segment-is-not-followed",
+            "- {*range(last)})",
+            "- {*range(last + (last in map(int, entry.digests)))})",
+            f"{FOLLOW}::test_each_message_comes_once_whenever_it_was_sent",
+        ),
+        (
+            "following-takes-topics-that-nobody-named",
+            "(*self.question.topics, *filter(self._takes, new))",
+            "(*self.question.topics, *new)",
+            f"{FOLLOW}::test_globs_take_topics_that_appear_later",
+        ),
+        (
+            "an-end-that-moves-is-an-end",
+            '(word.startswith("-"), f"has no end',
+            '(False, f"has no end',
+            f"{FOLLOW}::test_what_has_no_end_yet_is_refused",
+        ),
+    ),
+    *_of(
+        "hybridlog/query/answers/lost.py",
+        (
+            "the-last-message-is-behind-the-last-flush",
+            "return end > (begin if",
+            "return end >= (begin if",
+            UNWRITTEN,
+        ),
+        (
+            "all-times-reach-past-the-last-flush",
+            "end = min(end, int(windows[-1, 1])) if len(windows) else begin",
+            "pass",
+            UNWRITTEN,
+        ),
+        (
+            "what-nobody-knows-is-nothing",
+            "missing = sum(known) if len(known) == len(late) else None",
+            "missing = sum(known)",
+            UNWRITTEN,
+        ),
+        (
+            "unwritten-messages-of-all-topics-count",
+            "for t in question.topics)",
+            "for t in taken)",
+            UNWRITTEN,
+        ),
+        (
+            "losses-of-all-topics-count",
+            'row["topic"] not in question.topics:',
+            "False:",
+            LOST,
+        ),
+        (
+            "a-loss-is-as-long-as-its-range",
+            "((asked[:, 0] <= span[1]) & (span[0] < asked[:, 1]))",
+            "(span[0] < asked[:, 1])",
+            LOST,
+        ),
+        (
+            "the-end-of-a-range-is-in-it",
+            "(span[0] < asked[:, 1])",
+            "(span[0] <= asked[:, 1])",
+            LOST,
+        ),
+        (
+            "times-are-lost-in-no-time",
+            "asked = _EVERYTHING if windows is None else windows",
+            "asked = _EVERYTHING",
+            LOST,
+        ),
+    ),
+    *_of(
+        "hybridlog/drawing/chunk_parts.py",
+        (
+            "chunks-that-were-flushed-later-have-other-numbers",
+            "np.repeat(np.arange(known, count), counts[known:])",
+            "np.repeat(np.arange(count - known), counts[known:])",
+            DENSITY,
+        ),
+        (
+            "chunks-are-counted-each-time-they-are-looked-for",
+            "new = table.parts[int(counts[:known].sum()) :]",
+            "new = table.parts[known:]",
+            DENSITY,
+        ),
+        (
+            "a-segment-is-read-up-to-what-was-flushed",
+            "            if not table.is_flushed:\n",
+            "            if True:\n",
+            DENSITY,
+        ),
+        (
+            "another-sealed-segment-of-the-same-number-is-the-same",
+            "before.digests.get(number) in {None, recording.digests.get(number)}",
+            "True",
+            DENSITY,
+        ),
+        (
+            "another-chunk-of-the-same-place-is-the-same",
+            'for name in ("offset", "length", "trailer_crc")',
+            'for name in ("offset",)',
+            DENSITY,
+        ),
+        (
+            "a-part-that-ends-when-a-span-begins-is-left-out",
+            "(rows[:, 5] >= span[0])",
+            "(rows[:, 5] > span[0])",
+            DENSITY,
+        ),
+        (
+            "a-segment-that-ends-when-a-span-begins-is-left-out",
+            "or last < span[0]:",
+            "or last <= span[0]:",
+            DENSITY,
+        ),
+    ),
+    *_of(
+        "hybridlog/tables/reader.py",
+        (
+            "tables-with-other-rows-than-segments-are-believed",
+            "        if not found or rows != sum(messages.get(number, 0) for number in segments):\n",
+            "        if not found:\n",
+            f"{SQL_RUNNING}::test_sealed_segments_answer_from_tables",
+        ),
+    ),
+    *_of(
+        "hybridlog/running.py",
+        (
+            "flushed-messages-count-as-sealed-ones",
+            "channels = {channel.id: replace(channel) for channel in sealed.channels}",
+            "channels = {channel.id: channel for channel in sealed.channels}",
+            RUNNING_ENTRIES,
+        ),
+        (
+            "spans-of-flushed-segments-pile-up",
+            "found = replace(sealed, end=dict(sealed.end), spans=list(sealed.spans))",
+            "found = replace(sealed, end=dict(sealed.end))",
+            RUNNING_ENTRIES,
+        ),
+    ),
+    *_of(
+        "hybridlog/query/rows_differ.py",
+        (
+            "true-is-the-number-one",
+            "return type(one) is type(other) and one == other",
+            "return one == other",
+            CHANGES,
+        ),
+        (
+            "a-tolerance-is-exclusive",
+            "<= tolerance\n        return near",
+            "< tolerance\n        return near",
+            CHANGES,
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/compact.py",
+        (
+            "columns-of-other-bytes-are-believed",
+            "    if any(content[a:b] != data[c:d] for a, b, (c, d) in pieces):\n",
+            "    if False:\n",
+            f"{COMPACT}::test_a_proof_that_fails_leaves_nothing",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/thinning.py",
+        (
+            "chunks-that-do-not-come-back-are-taken-out",
+            '        if memoryview(rebuilt).cast("B") == content:\n',
+            "        if True:\n",
+            DROP,
+        ),
+        (
+            "a-new-segment-is-believed",
+            "    if not is_same:\n",
+            "    if False:\n",
+            DROP,
+        ),
+    ),
+]
+MUTANTS += SILENT

@@ -11,6 +11,7 @@ import duckdb
 import numpy as np
 import pandas as pd
 import polars as pl
+import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pytest
 
@@ -216,6 +217,21 @@ def test_columns_that_lack_a_message_are_refused(
         return piece(self, chunk, rows[:-1], has_publish_time=has_publish_time[:-1])
 
     monkeypatch.setattr(columns.TopicColumns, "piece", shorter)
+    with hl.open(copy) as store:
+        assert {one.reason for one in store.compact()} == {"its columns hold other messages"}
+        assert store.recordings()[0].payloads == []
+
+
+def test_columns_with_other_arrival_numbers_are_refused(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    column_at = columns.column_at
+
+    def other(table: Any, path: str) -> Any:
+        found = column_at(table, path)
+        return pc.add(found, 1) if path == "seq" else found
+
+    monkeypatch.setattr(columns, "column_at", other)  # as the proof reads them
     with hl.open(copy) as store:
         assert {one.reason for one in store.compact()} == {"its columns hold other messages"}
         assert store.recordings()[0].payloads == []

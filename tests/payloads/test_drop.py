@@ -178,6 +178,15 @@ def test_a_topic_can_follow_later(plain: Path, copy: Path) -> None:
             assert [m.raw for m in store.query(topics)] == [m.raw for m in other.query(topics)]
 
 
+def test_only_chunks_of_the_named_topics_are_taken_out(copy: Path) -> None:
+    with hl.open(copy) as store:
+        store.compact()
+        (scans,) = store.compact(topics=["scan"], drop_mcap=True)
+        assert (scans.topic, scans.dropped, scans.both) == ("/scan", COUNT, 0)
+        found = {one.topic: (one.dropped, one.both) for one in store.compact(drop_mcap=True)}
+        assert found == {"/cloud": (COUNT, 0)}
+
+
 @pytest.mark.exhaustive
 def test_what_else_is_in_a_segment_stays(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", robot(40))
