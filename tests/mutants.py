@@ -755,6 +755,8 @@ MAINTENANCE = [
 MUTANTS += MAINTENANCE
 
 OPEN = "tests/storage/test_open_segment.py"
+DIFFER = f"{INTERVALS}::test_rows_differ_as_their_values_do"
+NOTHING = f"{INTERVALS}::test_nan_equals_nan_and_null_only_null"
 CHANGES = "tests/query/test_changes.py"
 COMPACT = "tests/payloads/test_compact.py"
 DROP = "tests/payloads/test_drop.py"
@@ -778,6 +780,24 @@ SILENT = [
             "a-segment-that-was-taken-back-is-not-read-anew",
             "        is_cut = self.is_cut()\n",
             "        is_cut = False\n",
+            OPEN,
+        ),
+        (
+            "another-chunk-in-the-place-of-one-is-not-noticed",
+            "        return bytes(self.reader.read(self._chunks[-1][0], CHUNK_HEAD.size)) != self._last\n",
+            "        return False\n",
+            OPEN,
+        ),
+        (
+            "what-no-writer-leaves-is-the-end",
+            '                        self.stopped = Damage(at, size - at, "there is no whole record")\n',
+            "                        pass\n",
+            OPEN,
+        ),
+        (
+            "a-channel-that-is-not-defined-is-believed",
+            "        if not is_known.all():\n",
+            "        if False:\n",
             OPEN,
         ),
         (
@@ -964,6 +984,12 @@ SILENT = [
     *_of(
         "hybridlog/maintenance/edit.py",
         (
+            "the-recording-that-has-the-label-is-edited",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        Journal",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        Journal",
+            f"{CHOSEN}[tag]",
+        ),
+        (
             "the-recording-that-has-the-label-is-marked",
             "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        inventory",
             "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        inventory",
@@ -977,6 +1003,12 @@ SILENT = [
             "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n",
             "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n",
             f"{CHOSEN}[rm]",
+        ),
+        (
+            "the-last-copy-is-removed-as-a-copy",
+            "        if now != label or directory.labels_of(recording) == [label]:\n",
+            "        if now != label:\n",
+            f"{IDENTITY}::test_a_copy_is_removed_only_while_it_is_one",
         ),
     ),
     *_of(
@@ -1140,9 +1172,51 @@ SILENT = [
             "found = replace(sealed, end=dict(sealed.end))",
             RUNNING_ENTRIES,
         ),
+        (
+            "a-segment-that-is-listed-and-sealed-counts-twice",
+            "            if str(number) in self._sealed.digests:\n                continue\n",
+            "",
+            RUNNING_ENTRIES,
+        ),
+        (
+            "an-unreadable-open-segment-is-no-loss",
+            "            self._unreadable[number] = str(error)\n",
+            "            pass\n",
+            RUNNING_ENTRIES,
+        ),
+        (
+            "damage-of-an-open-segment-is-no-loss",
+            "            yield _damaged(number, damage.reason, damage.offset, damage.length)\n",
+            "            pass\n",
+            RUNNING_ENTRIES,
+        ),
     ),
     *_of(
         "hybridlog/query/rows_differ.py",
+        (
+            "nan-differs-from-nan",
+            "        same |= np.isnan(left) & np.isnan(right)\n",
+            "        pass\n",
+            NOTHING,
+        ),
+        (
+            "null-is-what-stands-in-its-place",
+            "valid[one] != valid[other]\n",
+            "np.zeros(len(one), np.bool_)\n",
+            NOTHING,
+        ),
+        (
+            "a-list-that-begins-alike-is-the-same",
+            "found: NDArray[np.bool_] = count != length[other]",
+            "found: NDArray[np.bool_] = count > length[other]",
+            DIFFER,
+        ),
+        (
+            "a-missing-field-is-null",
+            "m.get(path[0], _MISSING) if isinstance",
+            "m.get(path[0]) if isinstance",
+            f"{CHANGES}::test_null_and_missing_are_different",
+        ),
         (
             "true-is-the-number-one",
             "return type(one) is type(other) and one == other",
@@ -1164,9 +1238,21 @@ SILENT = [
             "    if False:\n",
             f"{COMPACT}::test_a_proof_that_fails_leaves_nothing",
         ),
+        (
+            "columns-of-other-arrival-numbers-are-believed",
+            "        (seq[inside] == chunk.seq[rows]).all()\n        and ",
+            "        ",
+            f"{COMPACT}::test_columns_with_other_arrival_numbers_are_refused",
+        ),
     ),
     *_of(
         "hybridlog/maintenance/thinning.py",
+        (
+            "chunks-of-topics-that-were-not-named-are-taken-out",
+            "        in_columns &= set(topics)\n",
+            "        pass\n",
+            f"{DROP}::test_only_chunks_of_the_named_topics_are_taken_out",
+        ),
         (
             "chunks-that-do-not-come-back-are-taken-out",
             '        if memoryview(rebuilt).cast("B") == content:\n',

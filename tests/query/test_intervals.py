@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -222,6 +223,14 @@ def test_rows_differ_as_their_values_do(
 
     want = [not (same(a[0], b[0]) and a[1:] == b[1:]) for a, b in zip(rows[1:], rows, strict=False)]
     assert found == want
+
+
+def test_nan_equals_nan_and_null_only_null() -> None:
+    one = np.arange(1, 7)
+    numbers = pa.array([math.nan, math.nan, None, None, 0.0, -0.0, 1.0])
+    assert rows_differ(numbers, one, one - 1).tolist() == [False, True, False, True, False, True]
+    words = pa.array(["", None, None, "", "", "a", "a"])
+    assert rows_differ(words, one, one - 1).tolist() == [True, False, True, False, True, False]
 
 
 # --- in a store -----------------------------------------------------------------------
