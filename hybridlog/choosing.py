@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from hybridlog.choice import Choice
     from hybridlog.query.times import TimeLike
     from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
 
 _GLOB = frozenset("*?[")
 
@@ -36,11 +37,11 @@ class Chosen(NamedTuple):
     """The recordings that satisfy a choice.
 
     Attributes:
-        places: Their positions in the snapshot, oldest first.
+        summaries: The recordings in short, oldest first.
         problem: The reason why there is none, with a cure; empty if there are any.
     """
 
-    places: NDArray[np.intp]
+    summaries: list[RecordingSummary]
     problem: str
 
 
@@ -78,8 +79,8 @@ def choose(session: Session, choice: Choice) -> Chosen:
     except _NothingLeftError as nothing:
         asked = ", ".join(choosing.conditions)
         what = f"There is no recording {asked}. " if asked else ""
-        return Chosen(np.empty(0, np.intp), f"{what}{nothing}")
-    return Chosen(choosing.places, "")
+        return Chosen([], f"{what}{nothing}")
+    return Chosen(choosing.summaries, "")
 
 
 def is_exact(session: Session, name: str) -> bool:
@@ -112,6 +113,11 @@ class _Choosing:
         self._snapshot = session.snapshot()
         self.places = np.arange(len(self._snapshot), dtype=np.intp)
         self.conditions: list[str] = []
+
+    @property
+    def summaries(self) -> list[RecordingSummary]:
+        """Those that are left. Positions are of the snapshot at hand: a later one sorts anew."""
+        return [self._snapshot.summaries[place] for place in self.places.tolist()]
 
     def look(self) -> None:
         """See what those that go on have flushed."""

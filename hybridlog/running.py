@@ -71,11 +71,12 @@ class RunningRecording:
         is_same = state == self._state
         if not is_same:
             self._begin()
+        before = dict(self._unreadable)
         is_new = False
         for number, segment in self._segments.items():
             with self._noting(number):
                 is_new |= segment.follow()
-        if is_same and not is_new:
+        if is_same and not is_new and before == self._unreadable:
             return False
         self._state = state
         self.entry = None if self._sealed is None else self._with_flushed(self._sealed)

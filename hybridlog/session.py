@@ -129,12 +129,12 @@ class _Moment:
 
     Attributes:
         snapshot: As above.
-        running: Entries of running recordings that were looked at in this moment, by id.
+        entries: Entries of recordings that were looked at in this moment, by id.
     """
 
     def __init__(self, snapshot: Snapshot | None = None) -> None:
         self.snapshot = snapshot
-        self.running: dict[str, RecordingEntry] = {}
+        self.entries: dict[str, RecordingEntry] = {}
 
 
 class Session:
@@ -467,10 +467,10 @@ class Session:
         """True if files of recordings that were read look different by now."""
         if self.directory.changed() != self._changed:
             return True
-        running = [one for key, one in [*self._running.items()] if key in self._moment.running]
+        running = [one for key, one in [*self._running.items()] if key in self._moment.entries]
         if any(one.is_cut() for one in running):
             return True
-        read = self._entries.keys() | self._moment.running.keys()
+        read = self._entries.keys() | self._moment.entries.keys()
         summaries = [one for one in self.snapshot().summaries if one.id in read]
         looks = self.directory.looks([one.label for one in summaries])
         return any(looks.get(one.label) != one.look for one in summaries)
@@ -499,10 +499,13 @@ class Session:
     def _follow(self, moment: _Moment, recording: str) -> RecordingEntry | None:
         """The entry of a running recording with what is flushed; None if it is gone."""
         with self._following:
-            if recording in moment.running:
-                return moment.running[recording]
+            if recording in moment.entries:
+                return moment.entries[recording]
             snapshot = self._snapshot_of(moment)
-            summary = snapshot.summaries[snapshot.by_id[recording]]
+            place = snapshot.by_id.get(recording)
+            if place is None:
+                return None
+            summary = snapshot.summaries[place]
             running = self._running.get(recording)
             if running is None:
                 from hybridlog.running import RunningRecording
@@ -516,7 +519,7 @@ class Session:
                 del self._running[recording]
             if entry is None:
                 return None
-            moment.running[recording] = entry
+            moment.entries[recording] = entry
             self._schemas |= running.schemas
             now = summary_of(entry, summary.look)
             if now != summary:
@@ -541,7 +544,11 @@ class Session:
         return self._snapshot_of(self._moment)
 
     def _snapshot_of(self, moment: _Moment) -> Snapshot:
-        if moment.snapshot is None:
+        if moment.snapshot is not None:
+            return moment.snapshot
+        with self._following:  # or a thread might keep an older state than `_changed` says
+            if moment.snapshot is not None:
+                return moment.snapshot
             begun = time.monotonic()
             self._changed = self.directory.changed()
             try:
@@ -557,7 +564,7 @@ class Session:
             self._looks_at = ended
             if ended - begun > _LONG_LOOK_S:  # in a store of thousands
                 self._looks_at += min((ended - begun) / _LOOK_SHARE, _MAX_BETWEEN_LOOKS_S)
-        return moment.snapshot
+            return found
 
     def recordings(self) -> list[RecordingEntry]:
         """All recordings, oldest first. Reads the whole catalog; see `snapshot`."""
@@ -586,9 +593,14 @@ class Session:
         moment = self._moment
         snapshot = self._snapshot_of(moment)
         place = snapshot.by_id.get(summary.id)
-        if place is not None and (snapshot.is_open[place] or summary.id in moment.running):
+        if summary.id in moment.entries:
+            return moment.entries[summary.id]
+        if place is not None and snapshot.is_open[place]:
             return self._follow(moment, summary.id)
-        return self._read_entry(summary)
+        found = self._read_entry(summary)
+        if found is not None:
+            moment.entries[summary.id] = found
+        return found
 
     def _read_entry(self, summary: RecordingSummary) -> RecordingEntry | None:
         """The entry of what is sealed of a recording."""
@@ -665,11 +677,12 @@ class Session:
 
     def doubtful(self, question: Question) -> list[RecordingEntry]:
         """The recordings of a question that may lack messages, oldest first."""
+        places = self.chosen(question).tolist()
         summaries = self.snapshot().summaries
         found = []
-        for place in self.chosen(question).tolist():
+        for place in places:
             summary = summaries[place]
-            entry = self._entries.get(summary.id)
+            entry = self._moment.entries.get(summary.id) or self._entries.get(summary.id)
             if entry is None and not summary.has_losses and summary.status == "complete":
                 continue
             entry = entry or self.entry_of(summary)

@@ -319,9 +319,7 @@ class Store:
         from hybridlog.recordings import Recordings
 
         chosen = choose(self.session, choice)
-        summaries = self.session.look().summaries
-        found = (summaries[place] for place in chosen.places.tolist())
-        return Recordings(self.session, found, chosen.problem)
+        return Recordings(self.session, chosen.summaries, chosen.problem)
 
     @of_one_moment
     def summaries(self) -> list[RecordingSummary]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import time
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,6 +20,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.choice import Choice
 from hybridlog.cli.app import app
+from hybridlog.live import LiveOptions
 from hybridlog.query.planner import Planner
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
@@ -30,6 +32,8 @@ from hybridlog_storage.errors import (
     UsageError,
     WhereError,
 )
+from hybridlog_storage.messages import Channel
+from tests.cli.running import run
 from tests.test_snapshot import summary
 
 DAY = 86_400 * 10**9
@@ -466,3 +470,33 @@ def test_lists_say_how_many_they_leave_out() -> None:
     assert Choice.of() == Choice()
     assert Choice.of().is_everything
     assert not Choice.of(tag="x").is_everything
+
+
+def test_a_name_means_its_recording_while_others_are_recorded(tmp_path: Path) -> None:
+    """Recordings that go on get their place among the others when they are looked at."""
+    said = Channel("/said", "json", None)
+    with hl.open(tmp_path / "store", create=True) as store:
+        for number in range(3):
+            with store.start(f"ended-{number}") as recording:
+                recording.write(said, b'{"n": 1}', log_time=(3 + number) * 10**9)
+        options = LiveOptions(flush_interval_s=0.05)
+        with store.start("first", options) as one, store.start("second", options) as two:
+            one.write(said, b'{"n": 2}', log_time=10**9)
+            two.write(said, b'{"n": 3}', log_time=4 * 10**9 + 1)
+            end = time.monotonic() + 30
+            while store.topic("said").count() < 5 and time.monotonic() < end:
+                time.sleep(0.02)
+            for label in ("first", "second", *(f"ended-{number}" for number in range(3))):
+                with hl.open(tmp_path / "store") as other:
+                    assert [entry.label for entry in other.recordings(label)] == [label]
+                with hl.open(tmp_path / "store") as other:
+                    assert [one.label for one in other.recordings(label).summaries] == [label]
+                    query = other.topic("said").in_recording(label)
+                    assert {message.recording for message in query} == {other.entry(label).id}
+                with hl.open(tmp_path / "store") as other:
+                    found = other.recordings(where="said: n > 0", name=label)
+                    assert [entry.label for entry in found] == [label]
+            assert not run("tag", "ended-2", "owner=anna", store=tmp_path / "store").err
+            with hl.open(tmp_path / "store") as other:
+                tagged = [one.label for one in other.summaries() if one.tags]
+            assert tagged == ["ended-2"]

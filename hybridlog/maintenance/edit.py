@@ -20,7 +20,7 @@ from hybridlog_storage.chunk import pack
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.compression import Compressor
 from hybridlog_storage.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import StoreError, TimeError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segment_file import SegmentFile
@@ -81,8 +81,11 @@ def mark(
 
     Raises:
         StoreError: The recording is being written, or a segment of it cannot be read.
+        TimeError: The mark would be before 1970.
         TopicError: It is gone.
     """
+    if moment < 0:
+        raise TimeError("A mark cannot be set before 1970: its log time has no sign.")
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
         path = directory.recording(label)
         inventory = take_inventory(directory, label)

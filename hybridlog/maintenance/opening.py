@@ -540,8 +540,14 @@ def describe_now(
 
     Raises:
         SegmentError: The recording cannot be identified.
+        StoreError: Its files change all the time.
     """
-    return describe_inventory(catalog, take_inventory(directory, label), is_open=is_open)
+    for _ in range(_TRIES):
+        inventory = take_inventory(directory, label)
+        # Of a directory that is renamed meanwhile, files would be missing.
+        if directory.listing(label).print == inventory.listing.print:
+            return describe_inventory(catalog, inventory, is_open=is_open)
+    raise StoreError(f"The files of recording {label!r} change while they are read. Ask again.")
 
 
 def describe_inventory(

@@ -370,8 +370,7 @@ class Query:
         chosen = choose(self.session, choice)
         if chosen.problem:
             raise TopicError(chosen.problem)
-        summaries = self.session.snapshot().summaries
-        return self._on(self.topics, [summaries[n].id for n in chosen.places.tolist()])
+        return self._on(self.topics, [summary.id for summary in chosen.summaries])
 
     @of_one_moment
     def with_topic(self, *names: str) -> Query:

@@ -608,13 +608,13 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     robot = Running(store, RecorderOptions(reserve_bytes=0, budget_bytes=512 << 20))
     robot.recorder.look()
     assert "only 157 MB left: free some." in robot.recorder.reason
-    robot.rows()
+    assert robot.recorder.stop() == []
     robot = Running(store, RecorderOptions(reserve_bytes=120 << 20, budget_bytes=64 << 20))
     robot.recorder.look()
     assert robot.recorder.wait(0)
     assert robot.recorder.stopped_for_disk
     assert "only 157 MB left: free some, or lower --reserve." in robot.recorder.reason
-    robot.rows()
+    assert robot.recorder.stop() == []
 
 
 def test_what_is_expected_is_ready_before_its_first_message(

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.message import messages_in
+from hybridlog.query.answers.lost import flush_interval_ns
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.planner import Planner
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 _EVERY_S: Final = 0.25
 
@@ -114,7 +116,15 @@ class Following(Planner, Iterator["Message"]):
             bounds = self._bounds.get(one.id)
             self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
             parts += self.parts_in(one, bounds, None) if chunks else ()
-        return self.plan(parts), any(one.status == "open" for one in summaries)
+        return self.plan(parts), any(map(self._goes_on, summaries))
+
+    def _goes_on(self, one: RecordingSummary) -> bool:
+        """True if more messages of the question may come."""
+        bounds = self._bounds.get(one.id)
+        is_past = False
+        if bounds is not None and one.span is not None and self.question.clock == "log":
+            is_past = one.span[1] - flush_interval_ns(one) >= bounds[1]
+        return one.status == "open" and not is_past
 
     def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[ChunkEntry]:
         """The chunks that have come since the last call, and may have messages in bounds."""

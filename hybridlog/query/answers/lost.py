@@ -189,13 +189,18 @@ def unwritten(session: Session, question: Question) -> list[tuple[int | None, st
             taken = request(session.directory.path, one.label, "state")["taken"]
             written = session.entry_of(one).messages_by_topic()
             messages = sum(max(taken.get(t, 0) - written[t], 0) for t in question.topics)
-        said = one.source.get("flush_interval_s")
-        what = f"up to {said if isinstance(said, int | float) else _INTERVAL_S:g} s"
+        what = f"up to {flush_interval_ns(one) / 1e9:g} s"
         what = what if messages is None else counted(messages, "message")
         if messages != 0:
             told = f"{one.label} is being recorded: {what} not written yet, nor in this answer."
             found.append((messages, told))
     return found
+
+
+def flush_interval_ns(recording: RecordingSummary) -> int:
+    """Time after which a running recording has written a message at the latest, ns."""
+    said = recording.source.get("flush_interval_s")
+    return int(1e9 * (said if isinstance(said, int | float) else _INTERVAL_S))
 
 
 def _reaches_past(session: Session, question: Question, one: RecordingSummary) -> bool:

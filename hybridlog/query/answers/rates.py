@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hybridlog.query.answers.lost import flush_interval_ns
 from hybridlog.query.intervals import MOST_PIECES, Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.planner import Planner
@@ -116,7 +117,10 @@ class Rates:
                 if not usual[stretch.summary.id]:
                     continue  # one message does not tell when the next one was due
                 limit = max(limit, periods * usual[stretch.summary.id])
-            found += [(stretch.summary.id, rows) for rows in _longer(times, stretch.span, limit)]
+            begin, end = stretch.span
+            if stretch.summary.status == "open":  # other topics may be flushed later than this one
+                end = max(begin, end - flush_interval_ns(stretch.summary))
+            found += [(stretch.summary.id, rows) for rows in _longer(times, (begin, end), limit)]
         return Intervals.of(found)
 
     def _stretches(self) -> Iterator[_Stretch]:
