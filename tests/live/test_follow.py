@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.live import LiveOptions
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.messages import Channel
 from tests.cli.running import COMMAND, complete, environment, run
 from tests.live.robot import Robot, robot
 
@@ -213,7 +215,7 @@ def test_what_has_no_end_yet_is_refused(path: Path) -> None:
         with store.at_one_moment(), pytest.raises(UsageError, match="at_one_moment"):
             next(topic.follow())
         one.end()
-        with pytest.raises(UsageError, match="none is running"):
+        with pytest.raises(UsageError, match="none of those asked about"):
             topic.follow()
 
 
@@ -302,7 +304,7 @@ def test_the_command_refuses_what_makes_no_sense(path: Path) -> None:
             assert not done.out
         assert "no topic '/z'" in run("fetch", "-t", "/z", "--follow", store=path, code=2).err
         one.end()
-        assert "none is running" in run("fetch", "-t", "a", "--follow", store=path, code=2).err
+        assert "none of those asked" in run("fetch", "-t", "a", "--follow", store=path, code=2).err
     assert "--follow" in complete("fetch --fo")
 
 
@@ -322,3 +324,17 @@ def test_only_what_was_flushed_since_and_is_in_the_range_is_read(path: Path) -> 
         assert query.counters.chunks_read == 4
         one.end()
         assert list(following) == []
+
+
+def test_a_range_that_is_past_ends_it(tmp_path: Path) -> None:
+    channel = Channel("/past", "json", None)
+    options = LiveOptions(flush_interval_s=0.05)
+    with hl.open(tmp_path / "store", create=True) as store, store.start("live", options) as rec:
+        for second in range(5):
+            rec.write(channel, b'{"n": 1}', log_time=second * 10**9)
+        deadline = time.monotonic() + 30
+        while not store.topics() or store.topic("past").count() < 5:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        found = [m.log_time_ns for m in store.topic("past").between(10**9, 3 * 10**9).follow()]
+    assert found == [10**9, 2 * 10**9]

@@ -65,7 +65,9 @@ class Following(Planner, Iterator["Message"]):
                 if one.status == "open" and (wanted is None or one.id in wanted)
             ]
             if not running:
-                raise UsageError("Only a running recording can be followed, and none is running.")
+                raise UsageError(
+                    "Only a running recording can be followed, and none of those asked about is."
+                )
             ids = tuple(entry.id for entry in running)
             named = question.names_recording or len(running) > 1
             question = replace(question, recordings=ids, names_recording=named)
