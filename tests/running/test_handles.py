@@ -1,0 +1,102 @@
+"""Handles that are open for long: of several threads, and beside files that cannot be read."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog import session as session_module
+from hybridlog.live import LiveOptions
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segment_reader import SegmentReader
+from tests.running.running import NO_MONGODB
+
+SAID = Channel("/said", "json", None)
+START = 10**18
+
+
+def record(store: hl.Store, name: str, time: int) -> None:
+    with store.start(name) as recording:
+        recording.write(SAID, b'{"n": 1}', log_time=time)
+
+
+def test_a_recording_that_comes_while_another_thread_looks_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hl.open(tmp_path / "store", create=True) as writer:
+        record(writer, "old", START)
+        with hl.open(tmp_path / "store", mongo=NO_MONGODB) as store:
+            store.refresh()
+            look = session_module.repair_on_open
+            has_looked, may_end = threading.Event(), threading.Event()
+
+            def slow(*args: object) -> object:
+                found = look(*args)  # type: ignore[arg-type]
+                if threading.current_thread().name == "slow":
+                    has_looked.set()
+                    may_end.wait(30)
+                return found
+
+            monkeypatch.setattr(session_module, "repair_on_open", slow)
+            first = threading.Thread(target=lambda: store.topic("said").count(), name="slow")
+            first.start()
+            assert has_looked.wait(30)
+            record(writer, "new", START + 1)
+            second = threading.Thread(target=lambda: store.topic("said").count())
+            second.start()
+            may_end.set()
+            first.join()
+            second.join()
+            deadline = time.monotonic() + 20
+            while store.topic("said").count() != 2:
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+
+
+def test_a_segment_that_cannot_be_read_any_more_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = LiveOptions(flush_interval_s=0.05)
+    with (
+        hl.open(tmp_path / "store", create=True) as writer,
+        writer.start("live", options) as recording,
+    ):
+        recording.write(SAID, b'{"n": 1}', log_time=START)
+        with hl.open(tmp_path / "store", mongo=NO_MONGODB) as store:
+            deadline = time.monotonic() + 30
+            while not store.topics() or store.topic("said").count() < 1:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            assert not store.topic("said").lost()
+            before = recording.stored
+            recording.write(SAID, b'{"n": 2}', log_time=START + 1)
+            while recording.stored == before:
+                time.sleep(0.02)
+            time.sleep(0.5)  # until it is flushed
+
+            def fail(self: SegmentReader, *_: object) -> memoryview:
+                raise SegmentError(f"{self.path} cannot be read: Input/output error.")
+
+            with monkeypatch.context() as patch:
+                patch.setattr(SegmentReader, "read", fail)
+                assert store.topic("said").lost()
+            assert store.topic("said").count() == 2
+            assert not store.topic("said").lost()
+
+
+def test_entries_belong_to_their_moment(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        record(store, "one", START)
+        with store.at_one_moment():
+            before = store.entry("one")
+            refresh = threading.Thread(target=store.refresh)
+            refresh.start()
+            refresh.join()
+            assert store.entry("one") is before
+        store.refresh()
+        assert store.entry("one") is not before
