@@ -130,6 +130,14 @@ def silent(known: Known, topic: str, longer: int) -> Any:
     return [(a, b, 0) for a, b in pairwise(edges) if b - a > longer]
 
 
+def between_messages(gaps: Sequence[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+    """Gaps without the one at the end, which ends before what may not be flushed yet.
+
+    Messages have whole milliseconds; a recording ends a nanosecond after its last one.
+    """
+    return [gap for gap in gaps if gap[1] % MS == 0]
+
+
 def around(known: Known, times: Sequence[int], before: int, after: int, *topics: str) -> Any:
     return [
         m for m in known.of(*topics) if any(t - before <= m.log_time < t + after for t in times)
@@ -494,10 +502,13 @@ METHODS: dict[str, Rule] = {
     ),
     "gaps": Rule(
         lambda s: (
-            spans(s.topic("said").gaps(longer_than="25ms")),
-            spans(s.topic("cam").gaps(longer_than="100ms")),
+            between_messages(spans(s.topic("said").gaps(longer_than="25ms"))),
+            between_messages(spans(s.topic("cam").gaps(longer_than="100ms"))),
         ),
-        lambda k: (silent(k, "/said", 25 * MS), silent(k, "/cam", 100 * MS)),
+        lambda k: (
+            between_messages(silent(k, "/said", 25 * MS)),
+            between_messages(silent(k, "/cam", 100 * MS)),
+        ),
     ),
     "held": Rule(
         lambda s: [

@@ -100,3 +100,31 @@ def test_entries_belong_to_their_moment(tmp_path: Path) -> None:
             assert store.entry("one") is before
         store.refresh()
         assert store.entry("one") is not before
+
+
+def test_a_gap_at_the_end_is_longer_than_what_may_not_be_flushed(tmp_path: Path) -> None:
+    second = 10**9
+    often, once = Channel("/often", "json", None), Channel("/once", "json", None)
+    with (
+        hl.open(tmp_path / "store", create=True) as store,
+        store.start("live", LiveOptions(flush_interval_s=1)) as recording,
+    ):
+        for number in range(41):
+            recording.write(often, b"{}", log_time=START + number * second // 4)
+        for number in (0, 1, 2, 37):
+            recording.write(once, b"{}", log_time=START + number * second // 4)
+        deadline = time.monotonic() + 30
+        while not store.topics() or len(list(store.topic("often", "once"))) < 45:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+        def gaps() -> list[tuple[int, int]]:
+            found = store.topic("once").gaps(longer_than="0.5s")
+            return [(one.begin_ns - START, one.end_ns - START) for one in found]
+
+        assert gaps() == [(second // 2, 37 * second // 4)]
+        recording.write(often, b"{}", log_time=START + 20 * second)
+        while store.topic("often").count() < 42:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        assert gaps() == [(second // 2, 37 * second // 4), (37 * second // 4, 19 * second + 1)]
