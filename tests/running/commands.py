@@ -20,6 +20,7 @@ from tests.cli.within import Answer
 from tests.running.methods import (
     LABEL,
     beside,
+    between_messages,
     changed,
     held,
     in_force,
@@ -325,8 +326,8 @@ COMMANDS: dict[str, list[Asked]] = {
     "gaps": [
         asked(
             "gaps -t cam --longer-than 100ms --json",
-            listed("begin_ns", "end_ns", "messages"),
-            lambda k: silent(k, "/cam", 100 * MS),
+            lambda *told: between_messages(listed("begin_ns", "end_ns", "messages")(*told)),
+            lambda k: between_messages(silent(k, "/cam", 100 * MS)),
         )
     ],
     "stats": [
