@@ -1045,9 +1045,6 @@ class Session:
         self._indexed.clear()
         self._belief = None
         self._places = None
-        self._schemas = {}
-        for running in [*self._running.values()]:
-            self._schemas |= running.schemas
         self._channels.clear()
         with self._lock:
             self._contents.clear()
