@@ -179,7 +179,8 @@ class Session:
         self._doubted: set[str] = set()  # recordings that the index may lack
         self._latest = _Moment()
         self._pinned = threading.local()  # the moment that this thread asks about
-        self._changed = 0  # when `recordings` was changed last, as of the snapshot
+        self._changed = 0, False  # as of the snapshot, see `StoreDirectory.changed`
+        self._names: list[str] = []  # in `recordings`
         self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._running: dict[str, RunningRecording] = {}
         self._following = threading.RLock()
@@ -456,16 +457,22 @@ class Session:
         snapshot = self._latest.snapshot
         if snapshot is None:
             return self._latest
-        has_changed = self.directory.changed() != self._changed
-        if has_changed and time.monotonic() >= self._looks_at:
+        if self._has_names_changed() and time.monotonic() >= self._looks_at:
             self.invalidate()
         elif snapshot.is_open.any():
             self._latest = _Moment(snapshot)
         return self._latest
 
+    def _has_names_changed(self) -> bool:
+        """True if recordings may have come, gone, or got other names since the snapshot."""
+        now, before = self.directory.changed(), self._changed
+        if now[0] == before[0] and not before[1] and self.directory.names() == self._names:
+            self._changed = now
+        return now[0] != before[0] or self._changed != now
+
     def has_changed(self) -> bool:
         """True if files of recordings that were read look different by now."""
-        if self.directory.changed() != self._changed:
+        if self._has_names_changed():
             return True
         running = [one for key, one in [*self._running.items()] if key in self._moment.entries]
         if any(one.is_cut() for one in running):
@@ -551,6 +558,7 @@ class Session:
                 return moment.snapshot
             begun = time.monotonic()
             self._changed = self.directory.changed()
+            self._names = self.directory.names()
             try:
                 found = repair_on_open(self.directory, self.catalog, self.repairs)
             except DiskFullError as error:

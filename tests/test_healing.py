@@ -542,7 +542,7 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
     spare = [number for number in range(1000) if number not in used]
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     failures = []
-    for limit in spare[:10]:
+    for limit in spare[:12]:
         if not has_catalog:
             (store / "catalog.sqlite").unlink(missing_ok=True)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
@@ -552,7 +552,7 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
             failures.append(str(error))
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    assert 3 <= len(failures) < 10
+    assert 3 <= len(failures) < 12
     assert all("ulimit -n" in failure for failure in failures)
     assert ask() == want
     assert run("verify", store=store).err == ""

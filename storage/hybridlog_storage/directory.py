@@ -205,16 +205,16 @@ class StoreDirectory:
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
 
-    def changed(self) -> int:
-        """When a recording got or lost its name last, ns; 0 if that was just now, or is unknown.
+    def changed(self) -> tuple[int, bool]:
+        """When a recording got or lost its name last, ns, and whether that is a while ago.
 
         Within a tick of the file system's clock another change would show the same time.
         """
         try:
             changed = files.status(self.recordings, depth=files.IN_STORE).st_mtime_ns
         except OSError:
-            return 0
-        return 0 if abs(time.time_ns() - changed) < _TICK_NS else changed
+            return 0, False
+        return changed, abs(time.time_ns() - changed) > _TICK_NS
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
         """The look of each recording's directory, by label.

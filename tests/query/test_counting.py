@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,8 @@ def test_what_no_recording_has_is_not_counted(
     database.delete("hybridlog.recordings", {"_id": GONE})
     database.delete("state", {"_meta.rec": GONE})
     if trace == "directory":
-        (store.directory.path / "recordings" / "gone").rmdir()
+        with suppress(FileNotFoundError):  # the next look at the store removes it, too
+            (store.directory.path / "recordings" / "gone").rmdir()
 
 
 def test_a_short_range_is_read_by_its_keys_whatever_indexes_there_are(
