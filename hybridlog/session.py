@@ -468,7 +468,7 @@ class Session:
         now, before = self.directory.changed(), self._changed
         if now[0] == before[0] and not before[1] and self.directory.names() == self._names:
             self._changed = now
-        return now[0] != before[0] or self._changed != now
+        return self._changed != now
 
     def has_changed(self) -> bool:
         """True if files of recordings that were read look different by now."""
