@@ -542,17 +542,23 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
     spare = [number for number in range(1000) if number not in used]
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     failures = []
-    for limit in spare[:12]:
+    answers = 0
+    # Threads of other tests in this process may take some of the handles.
+    for limit in spare[:100]:
         if not has_catalog:
             (store / "catalog.sqlite").unlink(missing_ok=True)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
         try:
             assert ask() == want
+            answers += 1
         except ResourceError as error:
             failures.append(str(error))
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    assert 3 <= len(failures) < 12
+        if answers == 3:
+            break
+    assert answers == 3
+    assert len(failures) >= 3
     assert all("ulimit -n" in failure for failure in failures)
     assert ask() == want
     assert run("verify", store=store).err == ""

@@ -140,7 +140,17 @@ ROBOT = """
         message = serialize_message(kind(data=bytes(size)))
         for _ in range(rounds):
             for name in names:
-                publishers[name][0].publish(message)
+                send(publishers[name][0], message)
+
+    def send(publisher, message):
+        # A reliable publisher refuses for a moment when its subscribers do not keep up.
+        deadline = time.monotonic() + 30
+        while True:
+            try:
+                return publisher.publish(message)
+            except rclpy._rclpy_pybind11.RCLError:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
 
     print("ready", flush=True)
     for line in sys.stdin:
