@@ -974,13 +974,15 @@ class Store:
     ) -> ImportReport:
         """Import recordings from another store; earlier copies are not repeated.
 
+        Recordings that have not ended are left out; the report says why.
+
         Args:
             other: The other store's directory.
             recordings: The recordings, or what they must satisfy; None for all.
             progress: Called while files are copied and checked.
 
         Raises:
-            StoreError: It is not a store, or a recording of it is damaged or being written.
+            StoreError: It is not a store, or a recording of it is damaged.
         """
         from hybridlog.maintenance import imports
 

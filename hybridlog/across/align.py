@@ -16,7 +16,7 @@ from hybridlog.across.match import HOWS, UNKNOWN, How, match
 from hybridlog.across.regular_times import RegularTimes
 from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, together
 from hybridlog.frames.names import free_name
-from hybridlog.query.answers.remarks import about_names, remarks
+from hybridlog.query.answers.remarks import about_names, completeness, remarks
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
@@ -167,6 +167,7 @@ class Aligned:
             found.append(f"{counted(len(lines) - _SHOWN, 'more column')} are empty in some rows.")
         for stream in streams:
             found += remarks(self._session, stream.question, stream.counters, (), is_empty=False)
+        found += completeness(self._session, *(stream.question for stream in streams))
         return [*dict.fromkeys(found)]
 
     def __repr__(self) -> str:

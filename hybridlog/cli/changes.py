@@ -57,4 +57,4 @@ def command(
         found = query.changes(*names, pause=pause, tolerance=tolerance)
         return found if at_least is None else found.at_least(at_least)
 
-    print_intervals(IntervalChoices(**parameters), answer)
+    print_intervals(IntervalChoices(**parameters), answer, "change")

@@ -38,4 +38,4 @@ def command(*, longer_than: str | None, periods: float | None, **parameters: Any
     def answer(query: Query) -> Intervals:
         return query.gaps(longer_than, periods)
 
-    print_intervals(IntervalChoices(**parameters), answer)
+    print_intervals(IntervalChoices(**parameters), answer, "gap")

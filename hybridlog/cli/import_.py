@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
+from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
     from hybridlog.choice import Choice
@@ -41,3 +43,6 @@ def command(*, other: Path, choice: Choice, store: Path | None, as_json: bool, q
             output.say(f"imported {label}")
         for label in report.known:
             output.say(f"{label} is here already")
+    if report.refused:
+        sys.stdout.flush()
+        raise StoreError(" ".join(report.refused.values()))

@@ -37,12 +37,15 @@ class IntervalChoices:
     quiet: bool
 
 
-def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Intervals]) -> None:
+def print_intervals(
+    choices: IntervalChoices, answer: Callable[[Query], Intervals], noun: str = "interval"
+) -> None:
     """Open the store, answer the query, and print the intervals.
 
     Args:
         choices: Parameters of the command.
         answer: Gives the intervals of the query.
+        noun: What one of them is called.
     """
     started = time.monotonic()
     quiet = choices.quiet or choices.as_json
@@ -67,7 +70,7 @@ def print_intervals(choices: IntervalChoices, answer: Callable[[Query], Interval
         if choices.quiet:
             return
         if not len(found) and not choices.count:
-            output.note("No interval.")
+            output.note(f"No {noun}.")
         print_cost(query.counters, time.monotonic() - started, count=True)
         print_remarks(query, [choices.topic], is_empty=not len(found))
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridlog.latching import depth_of, publisher_of
 from hybridlog.live.snapshots import Trigger
+from hybridlog.query.answers.remarks import completeness
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
@@ -46,7 +47,7 @@ class Rehearsal:
         snapshots: A recording that it would have written each; `messages` are those in it.
         payload_bytes: Payload bytes in all of these; what is in two counts twice.
         stored_bytes: Payload bytes of these recordings.
-        remarks: Topics on which it can never fire, and why.
+        remarks: Topics on which it can never fire, and why; what the recordings may lack.
         counters: What the answer has cost.
     """
 
@@ -127,6 +128,7 @@ def rehearse(
         messages, size = _kept(session, counters, asked, spans)
         payload += int(size.sum())
         parts.append((entry.id, np.column_stack([spans, messages])))
+    remarks += completeness(session, everything)
     counters.elapsed_s = time.monotonic() - started
     return Rehearsal(
         text,

@@ -35,11 +35,13 @@ class ImportReport:
     Attributes:
         imported: Labels in this store of the copied recordings.
         known: Labels of recordings that were here already.
+        refused: Why recordings that have not ended were not copied, by their labels there.
         bytes_copied: Bytes copied now, without those copied by an interrupted import.
     """
 
     imported: list[str] = field(default_factory=list)
     known: list[str] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
     bytes_copied: int = 0
 
 
@@ -61,7 +63,7 @@ def run(
         progress: Called with the bytes copied and checked.
 
     Raises:
-        StoreError: A recording is damaged or being written; those before it are imported.
+        StoreError: A recording is damaged; those before it are imported.
         DiskFullError: No room; the import can be run again.
     """
     target.check_writable()
@@ -72,15 +74,17 @@ def run(
             report.known.append(present[entry.id])
             continue
         if entry.status == "open":
-            raise StoreError(
+            report.refused[entry.label] = (
                 f"Recording {entry.label!r} of {source.path} is being written. Import it when "
                 "it has ended."
             )
+            continue
         if entry.status == "unfinished":
-            raise StoreError(
+            report.refused[entry.label] = (
                 f"Recording {entry.label!r} of {source.path} was cut short by a crash. Open that "
                 "store once with write permission, which recovers it, then import it."
             )
+            continue
         with _importing(target, entry.id) as hidden:
             present = _present(target, present)
             if entry.id in present:  # another process has imported it meanwhile

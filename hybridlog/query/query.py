@@ -991,7 +991,7 @@ class Query:
             names: The topics as they were written; further topics may end with a short name.
             is_empty: Whether the answer was empty; without, if `counters` has no messages.
         """
-        from hybridlog.query.answers.remarks import remarks
+        from hybridlog.query.answers.remarks import completeness, remarks
 
         if is_empty is None:
             is_empty = not self.counters.messages
@@ -1000,6 +1000,8 @@ class Query:
             nothing = self.question.during is not None and not self.question.during
             found += remarks(self.session, one.question, one.counters, (), is_empty=nothing)
         found += remarks(self.session, self.question, self.counters, names, is_empty=is_empty)
+        asked = (self.question, *(one.question for one in self.conditions))
+        found += completeness(self.session, *asked, counters=self.counters)
         return [*dict.fromkeys(found)]
 
     @of_one_moment

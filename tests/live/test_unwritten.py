@@ -89,12 +89,50 @@ def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
             ["changes", "-t", "/a", "--fields", "data"],
             ["export", tmp_path / "a.mcap", "-t", "/a", "--force"],
             ["sql", "select count(*) from a"],
+            ["trigger", "--rehearse", "/a: data == '1'"],
         ):
             done = run(*words, *mongo, store=path)
             assert told in done.err, (words, done.err)
             assert "lost" not in done.err
         ended = run("fetch", "-t", "/a", "--count", "--between", "start", "-1s", store=path)
         assert "being recorded" not in ended.err
+
+
+def test_an_alignment_tells_it_once_for_all_topics(tmp_path: Path) -> None:
+    with half_written(tmp_path / "store") as store:
+        aligned = store.align("/a", ["/quiet"])
+        aligned.to_arrow()
+        told = [line for line in aligned.remarks() if "being recorded" in line]
+        assert told == ["live is being recorded: 3 messages not written yet, nor in this answer."]
+
+
+def test_an_answer_that_is_full_lacks_nothing_that_comes_later(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with half_written(path) as store:
+        for limit, lacks in ((1, False), (2, False), (3, True)):
+            query = store.topic("/a").limit(limit)
+            assert len(list(query)) == min(limit, 2)
+            assert bool(query.remarks()) == lacks
+        last = store.topic("/a").limit(1).reverse()
+        list(last)
+        assert last.remarks()
+
+
+def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with hl.open(path, create=True) as store:
+        for name in ("before", "zulu"):
+            recording = store.start(name)
+            recording.write(CHANNEL, text("x"), log_time=SECOND)
+            recording.close()
+    with half_written(path):
+        other = tmp_path / "other"
+        done = run("import", path, store=other, code=5)
+        assert done.lines == ["imported before", "imported zulu"]
+        assert "'live' of" in done.err
+        assert "is being written. Import it when it has ended." in done.err
+    with hl.open(other, mongo=NOWHERE) as store:
+        assert [one.label for one in store.recordings()] == ["before", "zulu"]
 
 
 def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from hybridlog.query.answers.lost import JOURNAL_LOST, losses_in, unindexed, unw
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
-from hybridlog.query.question import field_types
+from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time, is_relative
 from hybridlog.query.topics import namesakes
@@ -24,7 +24,7 @@ from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
-    from hybridlog.query.question import Question, RecordedChannel, Span
+    from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
 
 _MOST = 100  # recordings looked at
@@ -40,7 +40,7 @@ def remarks(
     *,
     is_empty: bool,
 ) -> Iterator[str]:
-    """Sentences about an answer, for people.
+    """Sentences about an answer, for people; `completeness` has those about its recordings.
 
     Args:
         session: The open store.
@@ -65,15 +65,31 @@ def remarks(
     yield from _missing_fields(session, question, is_empty=is_empty)
     if is_empty and question.limit != 0:
         yield from _causes(session, question)
-    yield from completeness(session, question)
 
 
-def completeness(session: Session, question: Question) -> Iterator[str]:
-    """Sentences about what the recordings of a question may lack in its range."""
-    yield from (told for _, told in unwritten(session, question))
-    with suppress(TimeError):  # nothing is in the range
-        for entry, rows in groupby(losses_in(session, question), itemgetter(0)):
-            yield from _about_losses(entry.label, [row for _, row in rows])
+def completeness(
+    session: Session, *questions: Question, counters: Counters | None = None
+) -> Iterator[str]:
+    """Sentences about what the recordings of questions may lack in their ranges.
+
+    Args:
+        session: The open store.
+        questions: The questions; what concerns several topics of a range is said once.
+        counters: Of the answer; an answer that was limited lacks nothing that comes later.
+    """
+    topics: dict[Question, list[str]] = defaultdict(list)
+    for one in questions:
+        plain = Question((), one.recordings, one.bounds, one.clock, during=one.during)
+        topics[plain] += one.topics
+    limit = questions[0].limit
+    is_full = counters is not None and limit is not None and counters.messages >= limit
+    for plain, names in topics.items():
+        question = replace(plain, topics=tuple(dict.fromkeys(names)))
+        if not is_full or questions[0].reverse:
+            yield from (told for _, told in unwritten(session, question))
+        with suppress(TimeError):  # nothing is in the range
+            for entry, rows in groupby(losses_in(session, question), itemgetter(0)):
+                yield from _about_losses(entry.label, [row for _, row in rows])
 
 
 def _about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
