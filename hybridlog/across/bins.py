@@ -14,6 +14,7 @@ from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import FieldTypes
+from hybridlog.schema.arrow_types import is_number, is_time
 from hybridlog.schema.summary import Totals
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TimeError, UsageError
@@ -266,13 +267,12 @@ class _Column:
 
 def _values_of(column: Any) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
     """The numbers of a column, and which of them count: finite ones. None for other types."""
-    types = pa.types
     kind = column.type
-    if types.is_timestamp(kind) or types.is_duration(kind):
+    if is_time(kind):
         column = column.cast(pa.int64())
-    elif types.is_boolean(kind):
+    elif pa.types.is_boolean(kind):
         column = column.cast(pa.uint8())
-    elif not (types.is_integer(kind) or types.is_floating(kind)):
+    elif not is_number(kind):
         return None
     is_value = np.ones(len(column), np.bool_)
     if column.null_count:

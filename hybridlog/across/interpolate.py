@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import numbers
+from hybridlog.schema.arrow_types import is_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -68,7 +69,7 @@ def interpolated(
         done.update(names)
     for name, column in columns.items():
         kind = column.type
-        if name in done or not (_types.is_floating(kind) or _types.is_integer(kind)):
+        if name in done or not is_number(kind):
             continue
         low, high = _doubles(before[name]), _doubles(after[name])
         with np.errstate(invalid="ignore", over="ignore"):

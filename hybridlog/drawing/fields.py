@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from itertools import islice
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
+from hybridlog.schema.kinds import NUMERIC, element_of, width_of
 from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ MAX_FIELDS: Final = 5000
 MAX_ELEMENTS: Final = 36
 """Most elements of an array that are listed one by one: those of a covariance."""
 
-_NUMBER: Final = re.compile(r"bool|byte|char|time|duration|float(32|64)|u?int(8|16|32|64)")
-_WIDTH: Final = re.compile(r"\[(\d{1,9})\]$")
 _SUMMARIES: Final = ("min", "max", "mean", "n")
 _IN_JSON: Final = ("bool", "integer", "number")
 
@@ -55,23 +53,21 @@ def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[
     for path, kind in known.items():
         if "[" in path:
             continue  # within the elements of an array
-        if _NUMBER.fullmatch(kind):
+        if kind in NUMERIC:
             yield Field(path, kind)
             continue
         summaries = (f"{path}.{name}" for name in _SUMMARIES)
         yield from (Field(name, "summary") for name in summaries if is_summary(name, known))
-        element, bracket, _ = kind.partition("[")
-        if bracket and _NUMBER.fullmatch(element):
+        element = element_of(kind)
+        if element in NUMERIC:
             width = _width(kind, path, values)
             yield from (Field(f"{path}[{n}]", element) for n in range(width))
 
 
 def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
     """Number of elements that are listed: of a fixed array, or of the first message."""
-    fixed = _WIDTH.search(kind)
-    if fixed:
-        width = int(fixed[1])
-    else:
+    width = width_of(kind)
+    if width is None:
         value: Any = values
         for name in path.split("."):
             value = value.get(name) if isinstance(value, Mapping) else None

@@ -13,7 +13,8 @@ from hybridlog.frames.names import FIELD
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps, usual_period
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.schema.arrow_types import is_list, lengths_of
+from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
+from hybridlog.schema.kinds import NUMERIC, element_of
 from hybridlog.wording import listed
 from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TopicError, UsageError
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
-_NUMBER = re.compile(r"bool|byte|char|time|duration|float(32|64)|u?int(8|16|32|64)")
 _SHOWN = 8  # names of fields in a message
 
 
@@ -154,7 +154,7 @@ def _asked(query: Asked, wanted: Sequence[_Wanted], span: Span | None) -> tuple[
 def numbers_of(query: Asked) -> list[str]:
     """Paths of the fields that are single numbers; none where no definition fixes them."""
     known = query.field_types() or {}
-    return [p for p, kind in known.items() if _NUMBER.fullmatch(kind) and "[" not in p]
+    return [p for p, kind in known.items() if kind in NUMERIC and "[" not in p]
 
 
 def _check(wanted: Sequence[_Wanted], known: Mapping[str, str]) -> None:
@@ -166,15 +166,15 @@ def _check(wanted: Sequence[_Wanted], known: Mapping[str, str]) -> None:
     for one in wanted:
         kind = known.get(one.path)
         has_fields = any(path.startswith(f"{one.path}.") for path in known)
-        if kind and not (one.access or has_fields or _NUMBER.fullmatch(kind)):
+        if kind and not (one.access or has_fields or kind in NUMERIC):
             raise UsageError(_no_number(one.text, kind))
 
 
 def _no_number(text: str, kind: str) -> str:
-    element, bracket, _ = kind.partition("[")
-    if not bracket:
+    element = element_of(kind)
+    if element is None:
         return f"{text} is no number but {kind}: only numbers can be drawn."
-    if _NUMBER.fullmatch(element):
+    if element in NUMERIC:
         return (
             f"{text} is an array ({kind}): name one element, {text}[0], or a summary, {text}.min."
         )
@@ -246,11 +246,11 @@ def _numbers(array: Any) -> Numbers | None:
     types, kind = pa.types, array.type
     if kind == pa.json_():
         array = _numbers_in_json(array.cast(pa.string()))
-    elif types.is_timestamp(kind) or types.is_duration(kind):
+    elif is_time(kind):
         array = array.cast(pa.int64())
     elif types.is_boolean(kind):
         array = array.cast(pa.uint8())
-    elif not (types.is_integer(kind) or types.is_floating(kind) or types.is_null(kind)):
+    elif not (is_number(kind) or types.is_null(kind)):
         return None
     values: Numbers
     if types.is_int64(array.type) or types.is_uint64(array.type):

@@ -336,11 +336,13 @@ def _numbers(table: pa.Table, path: str) -> NDArray[np.float64]:
     """
     import pyarrow as pa
 
+    from hybridlog.schema.arrow_types import is_number
+
     for field, column in zip(table.schema, table.columns, strict=True):
         if (field.metadata or {}).get(FIELD, field.name.encode()).decode() != path:
             continue
         kind = field.type
-        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_null(kind)):
+        if not (is_number(kind) or pa.types.is_null(kind)):
             raise UsageError(f"{path} is no number but {kind}: only numbers can be drawn.")
         values: NDArray[np.float64] = column.cast(pa.float64(), safe=False).to_numpy()
         return values

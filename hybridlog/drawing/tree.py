@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.query.times import format_time
+from hybridlog.schema.arrow_types import is_numeric
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.times import BEGIN, END
 
@@ -159,10 +160,8 @@ def _numbers(value: Any) -> Any:
     elements = getattr(value, "values", None)
     if isinstance(elements, pa.Array) and not elements.null_count:
         kind = elements.type
-        if pa.types.is_integer(kind) or pa.types.is_floating(kind):
-            return elements.to_numpy(zero_copy_only=True)
-        if pa.types.is_boolean(kind):
-            return elements.to_numpy(zero_copy_only=False)
+        if is_numeric(kind):
+            return elements.to_numpy(zero_copy_only=not pa.types.is_boolean(kind))
     return None
 
 

@@ -15,6 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.schema.arrow_types import is_bytes, is_list, is_text, is_time
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -48,7 +50,7 @@ def json_pieces(array: pa.Array) -> Iterator[str]:
             yield f"{', ' if index else '{'}{json.dumps(field.name)}: "
             yield from json_pieces(array.field(index))
         yield "}"
-    elif _is_list(kind):
+    elif is_list(kind):
         elements = array.flatten()
         rows = max(PIECE_BYTES * len(elements) // max(elements.nbytes, 1), 1)
         yield "["
@@ -60,13 +62,13 @@ def json_pieces(array: pa.Array) -> Iterator[str]:
             else:
                 yield ", ".join(json_column(part).to_pylist())
         yield "]"
-    elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+    elif is_text(kind):
         text = array[0].as_py()
         yield '"'
         for begin in range(0, len(text), PIECE_BYTES):
             yield json.dumps(text[begin : begin + PIECE_BYTES])[1:-1]
         yield '"'
-    elif is_binary(kind):
+    elif is_bytes(kind):
         data = memoryview(array[0].as_buffer())
         yield '"'
         for begin in range(0, len(data), PIECE_BYTES):  # a multiple of three bytes
@@ -88,15 +90,15 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         return array.cast(pa.string())
     if pa.types.is_floating(kind):
         return _floats(array)
-    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+    if is_time(kind):
         unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
         return array.cast(unit).cast(pa.int64()).cast(pa.string())
-    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+    if is_text(kind):
         # Usually few strings are distinct: each is quoted once.
         words = array.dictionary_encode()
         quoted = [json.dumps(word) for word in words.dictionary.to_pylist()]
         return pa.array(quoted, pa.string()).take(words.indices)
-    if is_binary(kind):
+    if is_bytes(kind):
         return pc.binary_join_element_wise('"', base64_column(array), '"', "")
     if pa.types.is_temporal(kind):  # dates, times of day, intervals
         texts = [None if value is None else _temporal(value) for value in array.to_pylist()]
@@ -113,7 +115,7 @@ def _temporal(value: object) -> str:
 
 def _nested(array: pa.Array) -> pa.Array:
     kind = array.type
-    if _is_list(kind):
+    if is_list(kind):
         return _lists(array)
     if pa.types.is_struct(kind):
         return _structs(array)
@@ -181,15 +183,3 @@ def _with_nulls(text: pa.Array, array: pa.Array) -> pa.Array:
     if not array.null_count:
         return text
     return pc.if_else(array.is_valid(), text, pa.scalar(None, pa.string()))
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return bool(
-        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    )
-
-
-def is_binary(kind: pa.DataType) -> bool:
-    """True for bytes of any width."""
-    kinds = (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_fixed_size_binary)
-    return any(is_kind(kind) for is_kind in kinds)

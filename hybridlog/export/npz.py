@@ -29,7 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.export.base import FileWriter, Sink, Target, failures
-from hybridlog.schema.arrow_types import converted
+from hybridlog.schema.arrow_types import converted, is_bytes, is_list, is_numeric, is_text, is_time
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.unfinished import scratch_directory
 
@@ -263,7 +263,7 @@ class _Texts(_Column):
 
     def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
         super().__init__(name, kind, spools)
-        self._text = bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+        self._text = is_text(kind)
         self._bytes = _Spool(f"{name}.values", np.dtype(np.uint8), spools)
         self._offsets = _Spool(f"{name}.offsets", np.dtype(np.int64), spools)
         self._offsets.append(np.zeros(1, np.int64))
@@ -394,15 +394,11 @@ class _Nulls(_Column):
 def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
     types = pa.types
     table: list[tuple[bool, type[_Column]]] = [
-        (types.is_boolean(kind) or types.is_integer(kind) or types.is_floating(kind), _Numbers),
-        (types.is_timestamp(kind) or types.is_duration(kind), _Times),
-        (types.is_string(kind) or types.is_large_string(kind), _Texts),
-        (types.is_binary(kind) or types.is_large_binary(kind), _Texts),
-        (_is_matrix(kind), _FixedLists),
-        (
-            types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind),
-            _Lists,
-        ),
+        (is_numeric(kind), _Numbers),
+        (is_time(kind), _Times),
+        (is_text(kind) or is_bytes(kind), _Texts),
+        (types.is_fixed_size_list(kind) and is_numeric(kind.value_type), _FixedLists),
+        (is_list(kind), _Lists),
         (types.is_struct(kind), _Structs),
         (types.is_dictionary(kind), _Decoded),
         (types.is_null(kind), _Nulls),
@@ -413,14 +409,6 @@ def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
     raise UsageError(
         f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
     )
-
-
-def _is_matrix(kind: pa.DataType) -> bool:
-    if not pa.types.is_fixed_size_list(kind):
-        return False
-    item = kind.value_type
-    numeric = pa.types.is_integer(item) or pa.types.is_floating(item) or pa.types.is_boolean(item)
-    return bool(numeric)
 
 
 def _dtype(kind: pa.DataType) -> np.dtype[Any]:

@@ -21,12 +21,12 @@ from hybridlog.export.base import FileWriter, Sink, Target
 from hybridlog.export.json_text import (
     PIECE_BYTES,
     base64_column,
-    is_binary,
     json_column,
     json_pieces,
 )
 from hybridlog.export.jsonl import rows_within
-from hybridlog.schema.arrow_types import common_schema, converted, is_list
+from hybridlog.schema.arrow_types import common_schema, converted, is_bytes
+from hybridlog.tables.parquet_file import leaf_paths
 from hybridlog_storage.errors import UsageError
 
 HELD_BYTES = 32 << 20
@@ -183,7 +183,7 @@ class ParquetWriter(TableFileWriter):
     format_name = "parquet"
 
     def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        leaves = [leaf for field in schema for leaf in _leaves(field.name, field.type)]
+        leaves = list(leaf_paths(schema))
         # Arrow holds the dictionary of a long array, and many copies of a long text.
         has_long_rows = self._bytes > _LONG_ROW * max(self._rows, 1)
         writer: _ArrowFile = pa.parquet.ParquetWriter(
@@ -206,17 +206,6 @@ class ParquetWriter(TableFileWriter):
             if pa.types.is_struct(field.type) and field.type.num_fields == 0:
                 table = table.set_column(index, field.name, pa.nulls(table.num_rows))
         return table
-
-
-def _leaves(path: str, kind: pa.DataType) -> Iterator[tuple[str, pa.DataType]]:
-    """Paths and types of the leaves of a column, as Parquet spells them."""
-    if pa.types.is_struct(kind):
-        for field in kind:
-            yield from _leaves(f"{path}.{field.name}", field.type)
-    elif is_list(kind):
-        yield from _leaves(f"{path}.list.element", kind.value_type)
-    else:
-        yield path, kind
 
 
 class ArrowWriter(TableFileWriter):
@@ -293,7 +282,7 @@ def _row_pieces(row: pa.Table) -> Iterator[bytes]:
             for begin in range(0, len(text), PIECE_BYTES):
                 yield text[begin : begin + PIECE_BYTES].replace('"', '""').encode()
             yield b'"'
-        elif array.null_count or not (pa.types.is_nested(column.type) or is_binary(column.type)):
+        elif array.null_count or not (pa.types.is_nested(column.type) or is_bytes(column.type)):
             cell = io.BytesIO()
             pa.csv.write_csv(
                 _as_text(row.select([index])), cell, pa.csv.WriteOptions(include_header=False)
@@ -320,7 +309,7 @@ def _as_text(table: pa.Table) -> pa.Table:
             column = table.column(index).cast(
                 pa.string() if pa.types.is_null(kind) else kind.value_type
             )
-        elif is_binary(kind):
+        elif is_bytes(kind):
             chunks = [base64_column(chunk) for chunk in table.column(index).chunks]
             column = pa.chunked_array(chunks, pa.string())
         elif pa.types.is_nested(kind):

@@ -45,14 +45,7 @@ def _forms(
     from pyarrow import types
 
     from hybridlog.query.times import format_duration
-
-    def is_list(kind: pa.DataType) -> bool:
-        return bool(
-            types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
-        )
-
-    def is_binary(kind: pa.DataType) -> bool:
-        return bool(types.is_binary(kind) or types.is_large_binary(kind))
+    from hybridlog.schema.arrow_types import is_bytes, is_list
 
     return [
         (types.is_floating, _exact if exact else lambda value: f"{value.as_py():.6g}"),
@@ -61,7 +54,7 @@ def _forms(
         (types.is_map, functools.partial(_map, exact=exact)),
         (is_list, functools.partial(_list, exact=exact)),
         (types.is_struct, functools.partial(_struct, exact=exact)),
-        (is_binary, lambda value: f"{len(value.as_py())} bytes"),
+        (is_bytes, lambda value: f"{len(value.as_py())} bytes"),
     ]
 
 

@@ -9,10 +9,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.frames.names import summary_of
-from hybridlog.schema.arrow_columns import OFFSET_LIMIT, numbers, structs
-from hybridlog.schema.arrow_types import is_list, lengths_of, missing_of, with_values
-from hybridlog.schema.column import Scalars
-from hybridlog.schema.summary import summarise
+from hybridlog.schema.arrow_columns import OFFSET_LIMIT, structs
+from hybridlog.schema.arrow_types import (
+    has_empty,
+    is_array,
+    is_list,
+    is_time,
+    missing_of,
+    statistic,
+    with_values,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -49,7 +55,7 @@ def _children(prefix: str, array: pa.StructArray) -> list[tuple[str, pa.Array[An
 
 def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
     """The array with `true` for messages without fields, which few formats support."""
-    if not _has_empty(array.type):
+    if not has_empty(array.type):
         return array
     if is_list(array.type):
         return with_values(array, _with_fields(array.flatten()))
@@ -58,13 +64,6 @@ def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
         return pa.array(np.ones(len(array), np.bool_), mask=missing)
     children = zip(array.type, array.flatten(), strict=True)
     return structs({f.name: _with_fields(child) for f, child in children}, len(array), missing)
-
-
-def _has_empty(kind: pa.DataType) -> bool:
-    """True if a type contains structs without fields."""
-    if _types.is_struct(kind):
-        return not kind.num_fields or any(_has_empty(field.type) for field in kind)
-    return is_list(kind) and _has_empty(kind.value_type)
 
 
 def with_summaries(
@@ -100,33 +99,15 @@ def _covers(path: str, field: str) -> bool:
 
 def summary_array(array: pa.Array[Any], what: str) -> pa.Array[Any] | None:
     """One summary of each row; None if the array has no such summary."""
-    if _types.is_binary(array.type) or _types.is_large_binary(array.type):
-        return pc.binary_length(array).cast(pa.int64()) if what == "n" else None
-    if not is_list(array.type):
+    kind = array.type
+    if not is_array(kind):
         return None
-    missing = missing_of(array)
-    counts = lengths_of(array)
-    if what == "n":
-        return _numbers(counts, missing)
-    values = array.flatten()
-    kind = values.type
-    if not (_types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind)):
-        # If all arrays are empty, the type of the elements is unknown.
-        return pa.nulls(len(array), pa.float64()) if _types.is_null(kind) else None
-    offset = np.zeros(len(counts) + 1, np.int64)
-    if values.null_count:
-        there = values.is_valid().to_numpy(zero_copy_only=False)
-        seen = np.concatenate(([0], np.cumsum(there)))
-        ends = np.cumsum(counts)
-        counts = seen[ends] - seen[ends - counts]
-        values = values.drop_null()
-    np.cumsum(counts, out=offset[1:])
-    made = summarise(Scalars(values.to_numpy(zero_copy_only=False)), offset)
-    return _numbers(getattr(made, what), ~made.has)
-
-
-def _numbers(values: NDArray[Any], missing: NDArray[np.bool_] | None) -> pa.Array[Any]:
-    return numbers(values) if missing is None else pa.array(values, mask=missing)
+    if what != "n" and is_list(kind):
+        if _types.is_null(kind.value_type):  # all arrays are empty
+            return pa.nulls(len(array), pa.float64())
+        if is_time(kind.value_type):
+            return None
+    return statistic(array, what)
 
 
 def in_order(column: pa.ChunkedArray[Any], order: NDArray[np.intp]) -> pa.ChunkedArray[Any]:

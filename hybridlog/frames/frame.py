@@ -20,7 +20,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.schema.arrow_types import is_list, lengths_of, missing_of
+from hybridlog.schema.arrow_types import is_list, is_numeric, is_text, lengths_of, missing_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -81,7 +81,7 @@ def frame_of_intervals(
 
 def _array(column: pa.ChunkedArray[Any]) -> Any:
     kind = column.type
-    if _types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind):
+    if is_numeric(kind):
         return _numbers(column)
     if _types.is_timestamp(kind):
         return _times(column)
@@ -90,7 +90,7 @@ def _array(column: pa.ChunkedArray[Any]) -> Any:
     if kind == pa.json_():
         column = pa.chunked_array([chunk.storage for chunk in column.chunks], pa.string())
         kind = column.type
-    if _types.is_string(kind) or _types.is_large_string(kind):
+    if is_text(kind):
         return _string_dtype().__from_arrow__(column.cast(pa.large_string()))
     cells = np.empty(len(column), object)
     place, shared = 0, None
@@ -131,9 +131,7 @@ def _integers(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
 
 def _is_plain(chunk: pa.Array[Any]) -> bool:
     """True if the elements of lists are numbers or booleans, without nulls."""
-    kind = chunk.type.value_type
-    plain = _types.is_integer(kind) or _types.is_floating(kind) or _types.is_boolean(kind)
-    return bool(plain) and not chunk.flatten().null_count
+    return is_numeric(chunk.type.value_type) and not chunk.flatten().null_count
 
 
 def _fill(cells: NDArray[Any], chunk: pa.Array[Any], shared: NDArray[Any] | None) -> NDArray[Any]:

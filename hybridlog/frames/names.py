@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.schema.kinds import NUMBERS, element_of
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
@@ -114,17 +116,7 @@ def is_summary(path: str, known: Mapping[str, str]) -> bool:
     if found is None or path in known:
         return False
     kind = known.get(found[0], "")
-    element, bracket, _ = kind.partition("[")
+    element = element_of(kind)
     if found[1] == "n":
-        return bool(bracket) or kind == "bytes"
-    return bool(bracket) and element in _NUMBERS
-
-
-_NUMBERS = {
-    "bool",
-    "byte",
-    "char",
-    "float32",
-    "float64",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-}
+        return element is not None or kind == "bytes"
+    return element == "bool" or element in NUMBERS

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.query.predicate.numbers import equal, is_number, nearest
+from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.schema.column import ranges
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def rows_differ(
         for inner in column.flatten():
             differs |= there & rows_differ(inner, one, other, tolerance)
         return differs
-    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+    if is_list(kind):
         rows = np.flatnonzero(there)
         differs[rows] = _lists(column, one[rows], other[rows], tolerance)
         return differs
@@ -77,8 +78,7 @@ def _values(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> 
 
 
 def _lists(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> NDArray[np.bool_]:
-    length = pc.fill_null(pc.list_value_length(column), 0).to_numpy(zero_copy_only=False)
-    length = length.astype(np.int64)
+    length = lengths_of(column)
     start = np.cumsum(length) - length  # of the elements that `flatten` returns
     elements = column.flatten()
     count = length[one]

@@ -14,7 +14,7 @@ from hybridlog.schema.column import Column, Records, Scalars, Strings
 from hybridlog.schema.utf8 import repaired
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
@@ -60,7 +60,10 @@ def numbers(
 
 
 def structs(
-    fields: Mapping[str, pa.Array[Any]], rows: int, missing: NDArray[np.bool_] | None = None
+    fields: Mapping[str, pa.Array[Any]],
+    rows: int,
+    missing: NDArray[np.bool_] | None = None,
+    kind: Iterable[pa.Field] | None = None,
 ) -> pa.StructArray:
     """Fields side by side; the number of fields may be zero.
 
@@ -68,8 +71,11 @@ def structs(
         fields: Arrays of `rows` rows.
         rows: Number of rows.
         missing: bool[rows], True for null rows.
+        kind: The fields with their metadata; None for plain ones.
     """
-    kind = pa.struct([pa.field(name, array.type) for name, array in fields.items()])
+    if kind is None:
+        kind = [pa.field(name, array.type) for name, array in fields.items()]
+    kind = pa.struct(list(kind))
     return pa.Array.from_buffers(kind, rows, [_validity(missing)], children=list(fields.values()))
 
 

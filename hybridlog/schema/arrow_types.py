@@ -1,4 +1,4 @@
-"""The common exact type of Arrow arrays, and arrays converted to it.
+"""Types of Arrow arrays: their kinds, common types, conversion, and summaries of arrays.
 
 A conversion never rounds. Integers become the narrowest integer type for all of them.
 They become doubles only beside doubles and within 2^53. Times beside integers become
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import base64
 import json
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -18,106 +19,27 @@ import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_columns import lists, structs
 from hybridlog.schema.arrow_objects import EXACT, json_array
+from hybridlog.schema.column import Scalars
+from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
+    from hybridlog.schema.summary import Summary
+
 _INT64_MAX = (1 << 63) - 1
+_SUMMARIES: Final = (("n", "min", "max", "mean"), ("n",))
 _types = pa.types
 
-
-def common_type(arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    """The type that represents the values of all arrays exactly."""
-    kinds = list(dict.fromkeys(array.type for array in arrays))
-    if len(kinds) > 1 and pa.null() in kinds:
-        kinds.remove(pa.null())
-        arrays = [array for array in arrays if array.type != pa.null()]
-    if not kinds:
-        return pa.null()
-    if len(kinds) == 1:
-        return kinds[0]
-    merges = (merge for applies, merge in _MERGES if all(map(applies, kinds)))
-    merge = next(merges, None)
-    found = pa.json_() if merge is None else merge(kinds, arrays)
-    if found != pa.json_():
-        return found
-    # The type of an array without values, such as the elements of empty lists, is irrelevant.
-    valued = [array for array in arrays if array.null_count < len(array)]
-    return common_type(valued) if 0 < len(valued) < len(arrays) else found
+Array = Any
+"""An Arrow array. Its stubs differ too much between versions to be useful here."""
+Kinds: TypeAlias = "Sequence[pa.DataType]"
+Arrays: TypeAlias = "Sequence[Array]"
 
 
-def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
-    """One schema that represents the values of all tables exactly, columns in first-seen order.
-
-    Args:
-        tables: Each is released before the next one is taken.
-    """
-    fields: dict[str, pa.Field] = {}
-    seen: dict[str, dict[pa.DataType, pa.Array[Any]]] = {}
-    for table in tables:
-        for field, column in zip(table.schema, table.columns, strict=True):
-            fields.setdefault(field.name, field)
-            kinds = seen.setdefault(field.name, {field.type: pa.nulls(0, field.type)})
-            for chunk in column.chunks:
-                before = kinds.get(chunk.type)
-                parts = [extremes(chunk), *([] if before is None else [before])]
-                kinds[chunk.type] = extremes(pa.concat_arrays(parts))
-    return pa.schema(
-        [field.with_type(common_type(list(seen[name].values()))) for name, field in fields.items()]
-    )
-
-
-def converted(array: pa.Array[Any], kind: pa.DataType) -> pa.Array[Any]:
-    """The values of an array in another type that represents them.
-
-    Raises:
-        pa.ArrowInvalid: the type does not represent them exactly.
-    """
-    if array.type == kind:
-        return array
-    if array.null_count == len(array):
-        return pa.nulls(len(array), kind)
-    if kind == pa.json_():
-        return json_array(plain_values(array))
-    if _types.is_struct(kind) and _types.is_struct(array.type):
-        return _converted_struct(array, kind)
-    if is_list(kind) and is_list(array.type):
-        return _converted_list(array, kind)
-    if any(same(kind) and same(array.type) for same in (_is_number, _is_text, _is_bytes)):
-        return array.cast(kind)
-    raise pa.ArrowInvalid(f"{array.type} is not {kind}")
-
-
-def extremes(array: pa.Array[Any]) -> pa.Array[Any]:
-    """Two rows that determine the same common type as all rows."""
-    kind = array.type
-    if _types.is_integer(kind) and len(array):
-        found = pc.min_max(array)
-        return pa.array([found["min"].as_py(), found["max"].as_py()], kind)
-    if _types.is_struct(kind):
-        children = zip(kind, array.flatten(), strict=True)
-        return structs({field.name: extremes(child) for field, child in children}, 2)
-    if _types.is_fixed_size_list(kind):
-        inner = extremes(array.flatten()).take(pa.array(np.arange(2 * kind.list_size) % 2))
-        return pa.Array.from_buffers(kind, 2, [None], children=[inner])
-    if is_list(kind):
-        return lists(extremes(array.flatten()), np.array([0, 2, 2])).cast(kind)
-    return _example(array)
-
-
-def _example(array: pa.Array[Any]) -> pa.Array[Any]:
-    """Two rows of the type of an array, one with a value where the array has one."""
-    kind = array.type
-    if array.null_count == len(array):
-        return pa.nulls(2, kind)
-    if kind == pa.json_():
-        return pa.ExtensionArray.from_storage(kind, pa.array(["0", None]))
-    if _is_text(kind) or _is_bytes(kind):
-        return pa.array([b"", None], pa.binary()).cast(kind)
-    valid = int(np.argmax(array.is_valid().to_numpy(zero_copy_only=False)))
-    return pa.concat_arrays([array.slice(valid, 1), pa.nulls(1, kind)])
+# Kinds of types.
 
 
 def is_list(kind: pa.DataType) -> bool:
@@ -127,7 +49,54 @@ def is_list(kind: pa.DataType) -> bool:
     )
 
 
-def missing_of(array: pa.Array[Any]) -> NDArray[np.bool_] | None:
+def is_text(kind: pa.DataType) -> bool:
+    """True for strings of any offset type."""
+    return bool(_types.is_string(kind) or _types.is_large_string(kind))
+
+
+def is_bytes(kind: pa.DataType) -> bool:
+    """True for bytes, of any length and offset type."""
+    return bool(
+        _types.is_binary(kind) or _types.is_large_binary(kind) or _types.is_fixed_size_binary(kind)
+    )
+
+
+def is_array(kind: pa.DataType) -> bool:
+    """True for lists and bytes, which tables may hold as a summary."""
+    return is_list(kind) or is_bytes(kind)
+
+
+def is_time(kind: pa.DataType) -> bool:
+    """True for times and durations."""
+    return bool(_types.is_timestamp(kind) or _types.is_duration(kind))
+
+
+def is_number(kind: pa.DataType) -> bool:
+    """True for integers and floats."""
+    return bool(_types.is_integer(kind) or _types.is_floating(kind))
+
+
+def is_numeric(kind: pa.DataType) -> bool:
+    """True for numbers and booleans."""
+    return is_number(kind) or bool(_types.is_boolean(kind))
+
+
+def is_summary(kind: pa.DataType) -> bool:
+    """True for the type of a summary of an array."""
+    return bool(_types.is_struct(kind)) and tuple(f.name for f in kind) in _SUMMARIES
+
+
+def has_empty(kind: pa.DataType) -> bool:
+    """True if a type contains structs without fields."""
+    if _types.is_struct(kind):
+        return not kind.num_fields or any(has_empty(field.type) for field in kind)
+    return is_list(kind) and has_empty(kind.value_type)
+
+
+# Rows of arrays.
+
+
+def missing_of(array: Array) -> NDArray[np.bool_] | None:
     """Mask of the null rows of an array; None if there are none."""
     if not array.null_count:
         return None
@@ -135,110 +104,120 @@ def missing_of(array: pa.Array[Any]) -> NDArray[np.bool_] | None:
     return missing
 
 
-def lengths_of(array: pa.Array[Any]) -> NDArray[np.int64]:
-    """Number of elements of each row of a list array; 0 for null rows."""
-    lengths = pc.fill_null(pc.list_value_length(array), 0).cast(pa.int64())
-    counts: NDArray[np.int64] = lengths.to_numpy(zero_copy_only=False)
+def lengths_of(array: Array) -> NDArray[np.int64]:
+    """Number of elements, or bytes, of each row; 0 for null rows."""
+    lengths = pc.binary_length(array) if is_bytes(array.type) else pc.list_value_length(array)
+    if lengths.null_count:
+        lengths = pc.fill_null(lengths, 0)
+    counts: NDArray[np.int64] = lengths.to_numpy(zero_copy_only=False).astype(np.int64)
     return counts
 
 
-def with_values(array: pa.Array[Any], values: pa.Array[Any]) -> pa.Array[Any]:
+def bounds_of(array: Array) -> NDArray[np.int64]:
+    """int64[n + 1], where the elements of each row begin among those of `flatten()`."""
+    bounds = np.zeros(len(array) + 1, np.int64)
+    np.cumsum(lengths_of(array), out=bounds[1:])
+    return bounds
+
+
+def with_values(array: Array, values: Array) -> Array:
     """Lists of the same lengths as those of a list array, with other elements.
 
     Args:
         array: The list array.
         values: As many elements as its `flatten()` has.
     """
-    offset = np.zeros(len(array) + 1, np.int64)
-    np.cumsum(lengths_of(array), out=offset[1:])
-    return lists(values, offset, missing_of(array))
+    return lists(values, bounds_of(array), missing_of(array))
 
 
-def plain_values(array: pa.Array[Any]) -> list[Any]:
-    """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
+# Common types.
 
-    Null fields of structs are left out.
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """How values of several types become values of one.
+
+    Attributes:
+        leaf: The type for values that are neither structs nor lists.
+        summaries: True if arrays become summaries beside summaries.
     """
-    kind = array.type
-    if kind == pa.json_():
-        texts = array.storage.to_pylist()
-        return [None if text is None else json.loads(text) for text in texts]
-    if _types.is_struct(kind):
-        names = [field.name for field in kind]
-        columns = [plain_values(child) for child in array.flatten()]
-        rows = [
-            {n: v for n, v in zip(names, row, strict=True) if v is not None}
-            for row in (zip(*columns, strict=True) if names else [()] * len(array))
-        ]
-        return [row if there else None for row, there in zip(rows, _is_there(array), strict=True)]
-    if is_list(kind):
-        values = iter(plain_values(array.flatten()))
-        counted = zip(lengths_of(array).tolist(), _is_there(array), strict=True)
-        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
-    if _is_time(kind):
-        array = array.cast(pa.int64())
-    elif _is_bytes(kind):
-        cells = array.to_pylist()
-        return [None if v is None else base64.b64encode(v).decode() for v in cells]
-    plain: list[Any] = array.to_pylist()
-    return plain
+
+    leaf: Callable[[Kinds, Arrays], pa.DataType]
+    summaries: bool = False
 
 
-def _is_there(array: pa.Array[Any]) -> list[bool]:
-    there: list[bool] = array.is_valid().to_pylist()
-    return there
+def common_type(arrays: Arrays, rules: Rules | None = None) -> pa.DataType:
+    """The type that represents the values of all arrays exactly.
+
+    Args:
+        arrays: The arrays.
+        rules: Other rules for values that are neither structs nor lists.
+    """
+    rules = rules or EXACT_VALUES
+    kinds = list(dict.fromkeys(array.type for array in arrays))
+    if len(kinds) > 1 and pa.null() in kinds:
+        kinds.remove(pa.null())
+        arrays = [array for array in arrays if array.type != pa.null()]
+    if len(kinds) <= 1:
+        return kinds[0] if kinds else pa.null()
+    if rules.summaries and _are_summaries(kinds):
+        arrays = [array if is_summary(array.type) else summary(array) for array in arrays]
+        found = _common_struct(arrays, rules)
+    elif all(map(_types.is_struct, kinds)):
+        found = _common_struct(arrays, rules)
+    elif all(map(is_list, kinds)):
+        found = _common_list(kinds, arrays, rules)
+    else:
+        found = rules.leaf(kinds, arrays)
+    if found != pa.json_():
+        return found
+    # The type of an array without values, such as the elements of empty lists, is irrelevant.
+    valued = [array for array in arrays if array.null_count < len(array)]
+    return common_type(valued, rules) if 0 < len(valued) < len(arrays) else found
 
 
-def _converted_struct(array: pa.Array[Any], kind: pa.DataType) -> pa.Array[Any]:
-    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
-    if not {field.name for field in kind} >= set(have):
-        raise pa.ArrowInvalid(f"{array.type} has fields that {kind} lacks")
-    children = {
-        field.name: converted(have[field.name], field.type)
-        if field.name in have
-        else pa.nulls(len(array), field.type)
-        for field in kind
-    }
-    return structs(children, len(array), missing_of(array))
+def _are_summaries(kinds: Kinds) -> bool:
+    """True for types of arrays and of their summaries."""
+    return any(map(is_summary, kinds)) and all(is_summary(k) or is_array(k) for k in kinds)
 
 
-def _converted_list(array: pa.Array[Any], kind: pa.DataType) -> pa.Array[Any]:
-    made = with_values(array, converted(array.flatten(), kind.value_type))
-    return made if made.type == kind else made.cast(kind)
+def _common_list(kinds: Kinds, arrays: Arrays, rules: Rules) -> pa.DataType:
+    item = common_type([array.flatten() for array in arrays], rules)
+    sizes = {kind.list_size if _types.is_fixed_size_list(kind) else None for kind in kinds}
+    if len(sizes) == 1 and None not in sizes:
+        return pa.list_(item, sizes.pop())
+    return pa.large_list(item) if any(map(_types.is_large_list, kinds)) else pa.list_(item)
 
 
-def _is_text(kind: pa.DataType) -> bool:
-    return bool(_types.is_string(kind) or _types.is_large_string(kind))
+def _common_struct(arrays: Arrays, rules: Rules) -> pa.DataType:
+    fields: dict[str, pa.Field] = {}
+    children: dict[str, list[Array]] = {}
+    for array in arrays:
+        for field, child in zip(array.type, array.flatten(), strict=True):
+            known = fields.setdefault(field.name, field)
+            if known.metadata != field.metadata:
+                raise pa.ArrowInvalid(f"{field.name} stands for two fields")
+            children.setdefault(field.name, []).append(child)
+    return pa.struct(
+        [field.with_type(common_type(children[name], rules)) for name, field in fields.items()]
+    )
 
 
-def _is_bytes(kind: pa.DataType) -> bool:
-    return bool(_types.is_binary(kind) or _types.is_large_binary(kind))
+def _exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
+    if all(is_number(kind) or is_time(kind) for kind in kinds):
+        return _exact_number(kinds, arrays)
+    if all(map(is_text, kinds)):
+        return pa.large_string()
+    return pa.large_binary() if all(map(is_bytes, kinds)) else pa.json_()
 
 
-def _is_time(kind: pa.DataType) -> bool:
-    return bool(_types.is_timestamp(kind) or _types.is_duration(kind))
-
-
-def _is_number(kind: pa.DataType) -> bool:
-    """True for a number, or a time, which is a number of nanoseconds."""
-    return bool(_types.is_integer(kind) or _types.is_floating(kind) or _is_time(kind))
-
-
-def _merged_text(kinds: Sequence[pa.DataType], _arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    return pa.large_string() if len(kinds) > 1 else kinds[0]
-
-
-def _merged_bytes(kinds: Sequence[pa.DataType], _arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    return pa.large_binary() if len(kinds) > 1 else kinds[0]
-
-
-def _merged_numbers(kinds: Sequence[pa.DataType], arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
+def _exact_number(kinds: Kinds, arrays: Arrays) -> pa.DataType:
     whole = [kind for kind in kinds if not _types.is_floating(kind)]
     if not whole:
         return pa.float64()
     if len(whole) == len(kinds):
-        return _merged_integers(whole, arrays)
-    if any(map(_is_time, kinds)):
+        return _exact_integer(whole, arrays)
+    if any(map(is_time, kinds)):
         return pa.json_()
     narrow = {pa.int8(), pa.uint8(), pa.int16(), pa.uint16()}
     if narrow.issuperset(whole) and pa.float64() not in kinds:
@@ -247,8 +226,8 @@ def _merged_numbers(kinds: Sequence[pa.DataType], arrays: Sequence[pa.Array[Any]
     return pa.float64() if low >= -EXACT and high <= EXACT else pa.json_()
 
 
-def _merged_integers(kinds: Sequence[pa.DataType], arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    if any(map(_is_time, kinds)):
+def _exact_integer(kinds: Kinds, arrays: Arrays) -> pa.DataType:
+    if any(map(is_time, kinds)):
         return pa.int64() if pa.uint64() not in kinds else pa.json_()
     signed = [kind for kind in kinds if _types.is_signed_integer(kind)]
     unsigned = max((k.bit_width for k in kinds if k not in signed), default=0)
@@ -273,31 +252,200 @@ def _range(arrays: Any) -> tuple[int, int]:
     return low, high
 
 
-def _merged_lists(kinds: Sequence[pa.DataType], arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    item = common_type([array.flatten() for array in arrays])
-    sizes = {kind.list_size if _types.is_fixed_size_list(kind) else None for kind in kinds}
-    if len(sizes) == 1 and None not in sizes:
-        return pa.list_(item, sizes.pop())
-    return pa.large_list(item) if any(map(_types.is_large_list, kinds)) else pa.list_(item)
+def _widened(kinds: Kinds, arrays: Arrays) -> pa.DataType:
+    whole = all(map(_types.is_integer, kinds)) and not (
+        pa.uint64() in kinds and any(map(_types.is_signed_integer, kinds))
+    )
+    if whole or all(map(_types.is_floating, kinds)) or all(map(is_text, kinds)):
+        return _exact(kinds, arrays)
+    raise pa.ArrowInvalid(f"{', '.join(map(str, kinds))} have no common type")
 
 
-def _merged_structs(_kinds: Sequence[pa.DataType], arrays: Sequence[pa.Array[Any]]) -> pa.DataType:
-    children: dict[str, list[pa.Array[Any]]] = {}
-    for array in arrays:
-        for field, child in zip(array.type, array.flatten(), strict=True):
-            children.setdefault(field.name, []).append(child)
-    return pa.struct([pa.field(name, common_type(found)) for name, found in children.items()])
+EXACT_VALUES: Final = Rules(_exact)
+COLUMNS: Final = Rules(_exact, summaries=True)
+"""For columns of tables: arrays become summaries beside summaries."""
+WIDENED: Final = Rules(_widened, summaries=True)
+"""For columns of tables whose later values are unknown: all values of the types must fit."""
 
 
-_MERGES: list[
-    tuple[
-        Callable[[pa.DataType], bool],
-        Callable[[Sequence[pa.DataType], Sequence[pa.Array[Any]]], pa.DataType],
-    ]
-] = [
-    (_types.is_struct, _merged_structs),
-    (is_list, _merged_lists),
-    (_is_number, _merged_numbers),
-    (_is_text, _merged_text),
-    (_is_bytes, _merged_bytes),
-]
+def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
+    """One schema that represents the values of all tables exactly, columns in first-seen order.
+
+    Args:
+        tables: Each is released before the next one is taken.
+    """
+    fields: dict[str, pa.Field] = {}
+    seen: dict[str, dict[pa.DataType, Array]] = {}
+    for table in tables:
+        for field, column in zip(table.schema, table.columns, strict=True):
+            fields.setdefault(field.name, field)
+            kinds = seen.setdefault(field.name, {field.type: pa.nulls(0, field.type)})
+            for chunk in column.chunks:
+                before = kinds.get(chunk.type)
+                parts = [extremes(chunk), *([] if before is None else [before])]
+                kinds[chunk.type] = extremes(pa.concat_arrays(parts))
+    return pa.schema(
+        [field.with_type(common_type(list(seen[name].values()))) for name, field in fields.items()]
+    )
+
+
+def extremes(array: Array) -> Array:
+    """Two rows that determine the same common type as all rows."""
+    kind = array.type
+    if _types.is_integer(kind) and len(array):
+        found = pc.min_max(array)
+        return pa.array([found["min"].as_py(), found["max"].as_py()], kind)
+    if _types.is_struct(kind):
+        children = zip(kind, array.flatten(), strict=True)
+        return structs({field.name: extremes(child) for field, child in children}, 2)
+    if _types.is_fixed_size_list(kind):
+        inner = extremes(array.flatten()).take(pa.array(np.arange(2 * kind.list_size) % 2))
+        return pa.Array.from_buffers(kind, 2, [None], children=[inner])
+    if is_list(kind):
+        return lists(extremes(array.flatten()), np.array([0, 2, 2])).cast(kind)
+    return _example(array)
+
+
+def _example(array: Array) -> Array:
+    """Two rows of the type of an array, one with a value where the array has one."""
+    kind = array.type
+    if array.null_count == len(array):
+        return pa.nulls(2, kind)
+    if kind == pa.json_():
+        return pa.ExtensionArray.from_storage(kind, pa.array(["0", None]))
+    if is_text(kind) or is_bytes(kind):
+        return pa.array([b"", None], pa.binary()).cast(kind)
+    valid = int(np.argmax(array.is_valid().to_numpy(zero_copy_only=False)))
+    return pa.concat_arrays([array.slice(valid, 1), pa.nulls(1, kind)])
+
+
+# Conversion.
+
+
+def converted(array: Array, kind: pa.DataType) -> Array:
+    """The values of an array in another type that represents them.
+
+    Arrays become summaries where the type is that of summaries.
+
+    Raises:
+        pa.ArrowInvalid: the type does not represent them exactly.
+    """
+    if array.type == kind:
+        return array
+    if array.null_count == len(array):
+        return pa.nulls(len(array), kind)
+    if kind == pa.json_():
+        return json_array(plain_values(array))
+    if _types.is_struct(kind):
+        return _converted_struct(array, kind)
+    if is_list(kind) and is_list(array.type):
+        made = with_values(array, converted(array.flatten(), kind.value_type))
+        return made if made.type == kind else made.cast(kind)
+    if any(same(kind) and same(array.type) for same in (_is_countable, is_text, is_bytes)):
+        return array.cast(kind)
+    raise pa.ArrowInvalid(f"{array.type} is not {kind}")
+
+
+def _is_countable(kind: pa.DataType) -> bool:
+    return is_number(kind) or is_time(kind)
+
+
+def _converted_struct(array: Array, kind: pa.DataType) -> Array:
+    if is_summary(kind) and is_array(array.type):
+        array = summary(array)
+    if not _types.is_struct(array.type):
+        raise pa.ArrowInvalid(f"{array.type} is not {kind}")
+    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
+    if not {field.name for field in kind} >= set(have):
+        raise pa.ArrowInvalid(f"{array.type} has fields that {kind} lacks")
+    children = {
+        field.name: converted(have[field.name], field.type)
+        if field.name in have
+        else pa.nulls(len(array), field.type)
+        for field in kind
+    }
+    return structs(children, len(array), missing_of(array), kind)
+
+
+def plain_values(array: Array) -> list[Any]:
+    """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
+
+    Null fields of structs are left out.
+    """
+    kind = array.type
+    if kind == pa.json_():
+        texts = array.storage.to_pylist()
+        return [None if text is None else json.loads(text) for text in texts]
+    if _types.is_struct(kind):
+        names = [field.name for field in kind]
+        columns = [plain_values(child) for child in array.flatten()]
+        rows = [
+            {n: v for n, v in zip(names, row, strict=True) if v is not None}
+            for row in (zip(*columns, strict=True) if names else [()] * len(array))
+        ]
+        return [row if there else None for row, there in zip(rows, _is_there(array), strict=True)]
+    if is_list(kind):
+        values = iter(plain_values(array.flatten()))
+        counted = zip(lengths_of(array).tolist(), _is_there(array), strict=True)
+        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
+    if is_time(kind):
+        array = array.cast(pa.int64())
+    elif is_bytes(kind):
+        cells = array.to_pylist()
+        return [None if v is None else base64.b64encode(v).decode() for v in cells]
+    plain: list[Any] = array.to_pylist()
+    return plain
+
+
+def _is_there(array: Array) -> list[bool]:
+    there: list[bool] = array.is_valid().to_pylist()
+    return there
+
+
+# Summaries.
+
+
+def summary(array: Array) -> pa.StructArray:
+    """Each list as the summary that the index has of a long one.
+
+    Args:
+        array: Lists or bytes.
+
+    Returns:
+        `{n, min, max, mean}` of the finite numbers; `{n}` of other elements and of bytes.
+    """
+    found = _summarised(array)
+    parts = {"n": pa.array(lengths_of(array))}
+    if found is not None:
+        values = {"min": found.min, "max": found.max, "mean": found.mean}
+        parts |= {name: pa.array(value, mask=~found.has) for name, value in values.items()}
+    return structs(parts, len(array), missing_of(array))
+
+
+def statistic(array: Array, name: str) -> Array | None:
+    """One number of each summary; None if summaries of such elements lack it.
+
+    Args:
+        array: Lists or bytes.
+        name: `n`, `min`, `max` or `mean`.
+    """
+    if name == "n":
+        return pa.array(lengths_of(array), mask=missing_of(array))
+    found = _summarised(array)
+    return None if found is None else pa.array(getattr(found, name), mask=~found.has)
+
+
+def _summarised(array: Array) -> Summary | None:
+    """Summaries of numbers, booleans and times, without nulls; None of other elements."""
+    if not is_list(array.type):
+        return None
+    values, bounds = array.flatten(), bounds_of(array)
+    if is_time(values.type):
+        values = values.view(pa.int64())
+    elif not is_numeric(values.type):
+        return None
+    if values.null_count:
+        there = values.is_valid().to_numpy(zero_copy_only=False)
+        bounds = np.concatenate(([0], np.cumsum(there, dtype=np.int64)))[bounds]
+        values = values.drop_null()
+    return summarise(Scalars(values.to_numpy(zero_copy_only=False)), bounds)

@@ -26,6 +26,7 @@ from hybridlog.schema.definition_text import (
     parse_parts,
     split_sections,
 )
+from hybridlog.schema.kinds import DTYPES
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
@@ -46,22 +47,6 @@ MAX_WIDTH = 1 << 28
 MAX_FIXED_BYTES = 1 << 40
 """Largest minimum size of a message in bytes; nested fixed arrays multiply."""
 
-PrimitiveName: TypeAlias = Literal[
-    "bool",
-    "byte",
-    "char",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float32",
-    "float64",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Primitive:
@@ -72,7 +57,7 @@ class Primitive:
         dtype: Native numpy type; `byte` and `char` differ between ROS 1 and ROS 2.
     """
 
-    name: PrimitiveName
+    name: str
     dtype: np.dtype[np.generic]
 
 
@@ -144,20 +129,6 @@ class FieldPath:
     array: bool
 
 
-_DTYPES: dict[str, str] = {
-    "bool": "?",
-    "char": "u1",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
-}
 _NOT_PORTABLE = frozenset({"wstring", "wchar", "float128"})
 _DUMMY = "structure_needs_at_least_one_member"
 _TIME_FIELDS = (("sec", "int32"), ("nanosec", "uint32"))
@@ -166,7 +137,7 @@ _TIME_TYPES: dict[str, Literal["time", "duration"]] = {
     "builtin_interfaces/Duration": "duration",
 }
 _ROS1_TIMES = {"time": Instant("time", False, False), "duration": Instant("duration", True, True)}
-_WORDS = frozenset({*_DTYPES, "byte", "string", *_NOT_PORTABLE})
+_WORDS = frozenset({*DTYPES, "string", *_NOT_PORTABLE})
 
 
 Release: TypeAlias = str
@@ -430,9 +401,9 @@ class _Resolver:
         if kind == "string":
             return Text(raw.text_bound), _Extent(0, 0, 0, 4)
         if kind in _WORDS:
-            code = ("i1" if self._ros == 1 else "u1") if kind == "byte" else _DTYPES[kind]
+            code = "i1" if kind == "byte" and self._ros == 1 else DTYPES[kind]
             dtype: np.dtype[np.generic] = np.dtype(code)
-            return Primitive(cast("PrimitiveName", kind), dtype), _Extent(0, 0, 0, dtype.itemsize)
+            return Primitive(kind, dtype), _Extent(0, 0, 0, dtype.itemsize)
         name = self._name(owner, kind)
         if (instant := self._instant(name)) is not None:
             return instant, _Extent(0, 0, 0, 8)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 from hybridlog.schema.definition_text import RawField, canonical
+from hybridlog.schema.kinds import INTEGERS
 from hybridlog_storage.errors import DefinitionError
 
 # An unclosed token extends to the end of the text. Otherwise a failed match would be
@@ -62,7 +63,7 @@ _WORDS = {
     "double": "float64",
     "string": "string",
     "wstring": "wstring",
-    **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    **{name: name for name in INTEGERS if "int" in name},
 }
 _PRIMITIVES = frozenset(_WORDS.values())
 _ENUM = "uint32"

@@ -18,8 +18,22 @@ import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import json_array
-from hybridlog.schema.arrow_types import is_list, missing_of, plain_values, with_values
-from hybridlog.tables.fields import LIMIT, is_summary, summary
+from hybridlog.schema.arrow_types import (
+    Rules,
+    common_type,
+    is_array,
+    is_bytes,
+    is_list,
+    is_number,
+    is_summary,
+    is_text,
+    is_time,
+    missing_of,
+    plain_values,
+    summary,
+    with_values,
+)
+from hybridlog.tables.fields import LIMIT
 from hybridlog.tables.layout import OWN_COLUMNS, TOPIC_COLUMN, column_names
 
 OWN: Final = pa.schema(
@@ -135,7 +149,7 @@ def _may_be_summary(kind: Any) -> bool:
     """True if tables may hold an array as a summary."""
     if _types.is_fixed_size_list(kind):
         return bool(kind.list_size > LIMIT)
-    return is_list(kind) or bool(_types.is_binary(kind) or _types.is_large_binary(kind))
+    return is_array(kind)
 
 
 def summary_type(kind: Any) -> Any:
@@ -148,25 +162,15 @@ def merged(kinds: Sequence[Any]) -> Any:
 
     Integers beside floats become doubles. Values that no type represents become JSON text.
     """
-    kinds = list(dict.fromkeys(kind for kind in kinds if not _types.is_null(kind)))
-    if len(kinds) <= 1:
-        return kinds[0] if kinds else pa.null()
-    for applies, merge in _MERGES:
-        if all(map(applies, kinds)):
-            return merge(kinds)
-    return pa.json_()
+    return common_type([pa.nulls(0, kind) for kind in kinds], _MERGES)
 
 
-def _merged_structs(kinds: Sequence[Any]) -> Any:
-    found: dict[str, list[Any]] = {}
-    for kind in kinds:
-        for field in kind:
-            found.setdefault(field.name, []).append(field.type)
-    return pa.struct([pa.field(name, merged(inner)) for name, inner in found.items()])
-
-
-def _merged_lists(kinds: Sequence[Any]) -> Any:
-    return pa.list_(merged([kind.value_type for kind in kinds]))
+def _merged_leaves(kinds: Sequence[Any], _: Sequence[Any]) -> Any:
+    if all(map(is_number, kinds)):
+        return _merged_numbers(kinds)
+    if all(map(is_text, kinds)):
+        return pa.string()
+    return pa.binary() if all(map(is_bytes, kinds)) else pa.json_()
 
 
 def _merged_numbers(kinds: Sequence[Any]) -> Any:
@@ -180,25 +184,7 @@ def _merged_numbers(kinds: Sequence[Any]) -> Any:
     return pa.type_for_alias(f"int{bits}") if bits <= 64 else pa.decimal128(20, 0)
 
 
-def _is_number(kind: Any) -> bool:
-    return bool(_types.is_integer(kind) or _types.is_floating(kind))
-
-
-def _is_text(kind: Any) -> bool:
-    return bool(_types.is_string(kind) or _types.is_large_string(kind))
-
-
-def _is_bytes(kind: Any) -> bool:
-    return bool(_types.is_binary(kind) or _types.is_large_binary(kind))
-
-
-_MERGES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Sequence[Any]], Any]]]] = (
-    (_types.is_struct, _merged_structs),
-    (is_list, _merged_lists),
-    (_is_number, _merged_numbers),
-    (_is_text, lambda _: pa.string()),
-    (_is_bytes, lambda _: pa.binary()),
-)
+_MERGES: Final = Rules(_merged_leaves)
 
 
 def whole_message(kind: Any) -> Any:
@@ -258,8 +244,8 @@ def _sql_struct(kind: Any) -> Any:
 _SQL_TYPES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Any], Any]]]] = (
     (_types.is_timestamp, lambda _: pa.timestamp("ns")),
     (_types.is_duration, lambda _: pa.int64()),
-    (lambda kind: kind == pa.json_() or _is_text(kind), lambda _: pa.string()),
-    (_is_bytes, lambda _: pa.binary()),
+    (lambda kind: kind == pa.json_() or is_text(kind), lambda _: pa.string()),
+    (is_bytes, lambda _: pa.binary()),
     (_types.is_null, lambda _: pa.int32()),  # as DuckDB has it
     (is_list, lambda kind: pa.list_(sql_type(kind.value_type))),
     (_types.is_struct, _sql_struct),
@@ -296,7 +282,7 @@ def _converted(array: Any, kind: Any, target: Any) -> Any:
     if _types.is_struct(have) and _types.is_boolean(target):  # a message without fields
         there = np.ones(len(array), np.bool_)
         return pa.array(there, mask=missing_of(array))
-    if _types.is_timestamp(have) or _types.is_duration(have):
+    if is_time(have):
         return array.view(pa.int64()).view(target)
     try:
         return array.cast(target)

@@ -16,6 +16,7 @@ import pyarrow as pa
 
 from hybridlog.losses import lost_spans
 from hybridlog.query.question import RecordedChannel
+from hybridlog.schema.arrow_types import has_empty
 from hybridlog.sql.columns import whole_message
 from hybridlog.sql.counts import Paths, ScanCounts
 from hybridlog.tables.fields import without
@@ -208,14 +209,7 @@ def _is_fixed(channel: RecordedChannel) -> bool:
     """True if the definition of a channel fixes the fields of its messages."""
     encoding = channel.channel.message_encoding
     # The keys of a map of protobuf are fields, which no definition knows.
-    return encoding in _FIXED or (encoding == "protobuf" and not _has_open(channel.arrow_type()))
-
-
-def _has_open(kind: Any) -> bool:
-    """True if a type has a struct without fields."""
-    if pa.types.is_struct(kind):
-        return not kind.num_fields or any(_has_open(field.type) for field in kind)
-    return bool(pa.types.is_list(kind)) and _has_open(kind.value_type)
+    return encoding in _FIXED or (encoding == "protobuf" and not has_empty(channel.arrow_type()))
 
 
 class _TableRows:

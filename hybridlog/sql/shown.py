@@ -7,6 +7,7 @@ from typing import Any
 import pyarrow as pa
 
 from hybridlog.frames.cells import UNITS, cells
+from hybridlog.schema.arrow_types import is_number
 
 
 def shown(table: pa.Table, most: int) -> dict[str, Any]:
@@ -24,17 +25,15 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
     """
     first = table.select(range(min(table.num_columns, most)))
     return {
-        "columns": [[field.name, _is_number(field.type)] for field in first.schema],
+        "columns": [
+            [field.name, is_number(field.type) or pa.types.is_decimal(field.type)]
+            for field in first.schema
+        ],
         "columns_left_out": table.num_columns - first.num_columns,
         "rows": cells(first, exact=True),
         "times": _times(table),
         "recordings": _texts(table, "recording"),
     }
-
-
-def _is_number(kind: pa.DataType) -> bool:
-    types = pa.types
-    return bool(types.is_integer(kind) or types.is_floating(kind) or types.is_decimal(kind))
 
 
 def _times(table: pa.Table) -> list[range | None]:

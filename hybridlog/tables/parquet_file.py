@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from hybridlog.schema.arrow_types import is_list
 from hybridlog.tables.layout import ABOUT, IN_TOPIC, About
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
@@ -417,17 +418,12 @@ def _walk(top: pa.Field) -> Iterator[tuple[tuple[str, ...], str, pa.DataType]]:
         for number in range(kind.num_fields):
             for names, path, leaf in _walk(kind.field(number)):
                 yield (top.name, *names), f"{top.name}.{path}", leaf
-    elif _is_list(kind):
+    elif is_list(kind):
         for names, path, leaf in _walk(kind.value_field.with_name("element")):
             rest = path.removeprefix("element")
             yield (top.name, *names[1:]), f"{top.name}.list.element{rest}", leaf
     else:
         yield (top.name,), top.name, kind
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    kinds = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
-    return any(is_kind(kind) for is_kind in kinds)
 
 
 def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
@@ -447,7 +443,7 @@ def _inner_values(path: str, array: pa.Array[Any]) -> Iterator[tuple[str, pa.Arr
         for number in range(array.type.num_fields):
             inner = array.type.field(number)
             yield from _inner_values(f"{path}.{inner.name}", array.field(number))
-    elif _is_list(array.type):
+    elif is_list(array.type):
         yield from _inner_values(f"{path}.list.element", array.flatten())
     else:
         yield path, array

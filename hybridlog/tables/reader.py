@@ -22,6 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.arrow_types import is_list
 from hybridlog.schema.column import ranges
 from hybridlog.tables.fields import UnfitError, alike, original_name, records_of
 from hybridlog.tables.layout import (
@@ -694,7 +695,7 @@ def _only(field: Any, chosen: Collection[_Leaf], above: tuple[str, ...], top: st
         inner = [_only(kind.field(n), chosen, names, top) for n in range(kind.num_fields)]
         kept = [part for part in inner if part is not None]
         return field.with_type(pa.struct(kept)) if kept else None
-    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+    if is_list(kind):
         # The elements have no name of their own.
         element = kind.value_field.with_metadata({ORIGINAL: names[-1]})
         value = _only(element, chosen, above, top)

@@ -12,6 +12,7 @@ import numpy as np
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.schema.kinds import NUMBERS
 from hybridlog.schema.summary import Totals
 from hybridlog_storage.errors import UsageError
 
@@ -20,12 +21,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Question
     from hybridlog.session import Session
-
-_NUMBERS = {
-    "float32",
-    "float64",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +123,7 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         one = replace(question, topics=(topic,))
         known = session.field_types((topic,), question.recordings)
         if question.fields is None and known is not None:
-            numeric = tuple(path for path, kind in known.items() if kind in _NUMBERS)
+            numeric = tuple(path for path, kind in known.items() if kind in NUMBERS)
             if not numeric:
                 continue
             one = replace(one, fields=numeric)
@@ -150,14 +145,10 @@ def _columns(
     session: Session, question: Question, counters: Counters
 ) -> Iterator[tuple[str, pa.ChunkedArray[Any]]]:
     """The numeric columns of an answer, a block at a time; elements of arrays that are named."""
-    import pyarrow as pa
     import pyarrow.compute as pc
 
     from hybridlog.frames.answer import stream
-    from hybridlog.schema.arrow_types import is_list
-
-    def is_number(kind: pa.DataType) -> bool:
-        return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+    from hybridlog.schema.arrow_types import is_list, is_number
 
     counted = Counters()
     for table in stream(Planner(session, question, counted)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +20,7 @@ from hybridlog.query.engines.base import (
 )
 from hybridlog.query.message_filter import meta_array
 from hybridlog.query.predicate.tree import is_meta
+from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 _OPEN_S = 2e-4  # seconds to query an open table
 _BYTE_S = 1.5e-9  # seconds to read and decode a stored byte
-_SINGLE = re.compile(r"(bool|byte|char|string|time|duration|float(32|64)|u?int(8|16|32|64))")
-_FIXED_ARRAY = re.compile(_SINGLE.pattern + r"\[(?P<length>\d+)\]")
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 
 
@@ -271,10 +269,8 @@ def _are_whole(part: Part, fields: Collection[str] | None) -> bool:
             return False
         for name in below:
             inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
-            fixed = _FIXED_ARRAY.fullmatch(types[name])
-            is_short = fixed is not None and int(fixed["length"]) <= _WHOLE
-            if not (_SINGLE.fullmatch(types[name]) or is_short) and not (
-                inner and not types[name].endswith("]")
-            ):
+            kind, width = types[name], width_of(types[name])
+            is_short = width is not None and width <= _WHOLE and element_of(kind) in SINGLE
+            if not (kind in SINGLE or is_short) and not (inner and not kind.endswith("]")):
                 return False
     return True

@@ -41,6 +41,16 @@ from hybridlog.query.predicate.tree import (
     root_of,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, Stat
+from hybridlog.schema.arrow_types import (
+    is_array,
+    is_bytes,
+    is_list,
+    is_numeric,
+    is_text,
+    is_time,
+    lengths_of,
+    statistic,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -251,9 +261,9 @@ class _Columns:
                 raise _UnfitError  # it may be the summary of an array of any type
             yield from self._reach(leaves, (stat,), ())
             return
-        if not _is_list(kind) or not (_is_scalar(kind.value_type) or _is_list(kind.value_type)):
+        if not is_list(kind) or not (_is_scalar(kind.value_type) or is_list(kind.value_type)):
             raise _UnfitError  # elements may have a field of that name
-        if stat == "n" or (_is_numeric(kind.value_type) and not leaves.values.flatten().null_count):
+        if stat == "n" or (is_numeric(kind.value_type) and not leaves.values.flatten().null_count):
             yield _computed(leaves, stat)
             return
         raise _UnfitError
@@ -279,14 +289,14 @@ class _Columns:
             return
         part, rest = parts[0], parts[1:]
         if isinstance(part, Slice):
-            if _is_list(kind):
+            if is_list(kind):
                 yield from self._reach(_sliced(values, rows, part), rest, names)
         elif pa.types.is_struct(kind):
             if kind.get_field_index(str(part)) >= 0:
                 values, rows = _some(values, rows, _valid(values))
                 inner = _Leaves(pc.struct_field(values, str(part)), rows)
                 yield from self._reach(inner, rest, (*names, str(part)))
-        elif _is_list(kind):
+        elif is_list(kind):
             yield from self._into_list(values, rows, parts, names)
         elif not _is_scalar(kind):
             raise _UnfitError
@@ -297,7 +307,7 @@ class _Columns:
         """The values at a path through lists."""
         part = parts[0]
         elements = _flattened(values, rows)
-        while isinstance(part, str) and _is_list(elements.values.type):
+        while isinstance(part, str) and is_list(elements.values.type):
             elements = _flattened(elements.values, elements.rows)
         inside = elements.values.type
         named = pa.types.is_struct(inside) and inside.get_field_index(str(part)) >= 0
@@ -307,7 +317,7 @@ class _Columns:
             yield from self._reach(_at_place(values, rows, part), parts[1:], names)
         elif named:
             yield from self._reach(elements, parts, names)
-        elif not (_is_scalar(inside) or pa.types.is_struct(inside) or _is_list(inside)):
+        elif not (_is_scalar(inside) or pa.types.is_struct(inside) or is_list(inside)):
             raise _UnfitError
 
     def _is_summary(self, kind: pa.DataType, names: tuple[str, ...], *, is_element: bool) -> bool:
@@ -365,32 +375,10 @@ def _names(kind: pa.DataType) -> list[str]:
     return [kind.field(index).name for index in range(kind.num_fields)]
 
 
-def _is_list(kind: pa.DataType) -> bool:
-    test = pa.types
-    return bool(test.is_list(kind) or test.is_large_list(kind) or test.is_fixed_size_list(kind))
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
-
-
-def _is_time(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_timestamp(kind) or pa.types.is_duration(kind))
-
-
-def _is_numeric(kind: pa.DataType) -> bool:
-    test = pa.types
-    return bool(test.is_integer(kind) or test.is_floating(kind) or test.is_boolean(kind))
-
-
-def _is_binary(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_binary(kind) or pa.types.is_large_binary(kind))
-
-
 def _is_scalar(kind: pa.DataType) -> bool:
     if pa.types.is_dictionary(kind):
         return _is_scalar(kind.value_type)
-    is_plain = _is_numeric(kind) or _is_text(kind) or _is_binary(kind) or _is_time(kind)
+    is_plain = is_numeric(kind) or is_text(kind) or is_bytes(kind) or is_time(kind)
     return is_plain or bool(pa.types.is_null(kind))
 
 
@@ -417,12 +405,6 @@ def _flattened(values: pa.Array, rows: Rows) -> _Leaves:
     return _Leaves(pc.list_flatten(values), rows[parents], is_element=True)
 
 
-def _lengths(values: pa.Array) -> NDArray[np.int64]:
-    """Number of elements of each list, 0 for a null."""
-    lengths = _numpy(pc.fill_null(pc.list_value_length(values), 0)).astype(np.int64)
-    return np.where(_valid(values), lengths, 0)
-
-
 def _sliced(values: pa.Array, rows: Rows, part: Slice) -> _Leaves:
     """Some elements of each list; a null has none."""
     values, rows = _some(values, rows, _valid(values))
@@ -431,7 +413,7 @@ def _sliced(values: pa.Array, rows: Rows, part: Slice) -> _Leaves:
 
 def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
     """The element at an index of each list that is long enough."""
-    values, rows = _some(values, rows, _lengths(values) > place)
+    values, rows = _some(values, rows, lengths_of(values) > place)
     if not len(values):
         return _Leaves(pa.nulls(0, values.type.value_type), rows, is_element=True)
     return _Leaves(pc.list_element(values, place), rows, is_element=True)
@@ -439,24 +421,20 @@ def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
 
 def _computed(leaves: _Leaves, stat: Stat) -> _Leaves:
     """A statistic of lists, equal to that of their summaries in the index."""
-    from hybridlog.schema.column import Scalars
-    from hybridlog.schema.summary import summarise
-
     values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
     kind = values.type
     if pa.types.is_null(kind):
         return _Leaves(pa.nulls(0), rows[:0])
-    if not _is_list(kind) and not (_is_binary(kind) and stat == "n"):
+    if not is_array(kind):
         raise _UnfitError
-    if stat == "n":
-        count = pc.binary_length(values) if _is_binary(kind) else pa.array(_lengths(values))
-        return _Leaves(count, rows, is_element=True)
-    elements = _as_integers(pc.list_flatten(values))
-    if elements.null_count or not _is_numeric(elements.type):
+    if stat != "n" and is_list(kind):
+        elements = values.flatten()
+        if elements.null_count or (is_time(elements.type) and elements.type.unit != "ns"):
+            raise _UnfitError
+    found = statistic(values, stat)
+    if found is None:
         raise _UnfitError
-    offset = np.concatenate(([0], np.cumsum(_lengths(values))))
-    found = summarise(Scalars(_numpy(elements)), offset)
-    return _Leaves(pa.array(getattr(found, stat), mask=~found.has), rows, is_element=True)
+    return _Leaves(found, rows, is_element=True)
 
 
 def _as_integers(values: pa.Array) -> pa.Array:
@@ -465,7 +443,7 @@ def _as_integers(values: pa.Array) -> pa.Array:
     Raises:
         _UnfitError: they have another unit.
     """
-    if not _is_time(values.type):
+    if not is_time(values.type):
         return values
     if values.type.unit != "ns":
         raise _UnfitError
@@ -486,7 +464,7 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
         if values.null_count:
             none = rows[~_valid(values)]
             yield _Leaves(pa.nulls(len(none)), none, is_element=leaves.is_element or is_element)
-        if not _is_list(values.type):
+        if not is_list(values.type):
             break
         inner = _flattened(values, rows)
         values, rows, is_element = _plain(inner.values), inner.rows, True
@@ -526,7 +504,7 @@ def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> _Pair:
 
 
 def _matching(values: pa.Array, pattern: str) -> Mask:
-    if not _is_text(values.type):
+    if not is_text(values.type):
         return np.zeros(len(values), np.bool_)
     try:
         found = pc.match_substring_regex(values, pattern)
@@ -547,7 +525,7 @@ def _compared(values: pa.Array, order: str, value: Value) -> Mask:
     if isinstance(value, bool):
         return _filled(pc.equal(values, value)) if pa.types.is_boolean(kind) else none
     if isinstance(value, str):
-        return _texts_compared(values, order, value) if _is_text(kind) else none
+        return _texts_compared(values, order, value) if is_text(kind) else none
     if not is_number(value):
         return none
     if pa.types.is_decimal(kind):

@@ -21,6 +21,7 @@ from hybridlog.query.predicate.tree import (
     Predicate,
     Value,
 )
+from hybridlog.schema.kinds import FLOATS, INTEGERS, NUMBERS, TIMES
 from hybridlog.wording import listed
 from hybridlog_storage.errors import WhereError
 
@@ -31,16 +32,13 @@ STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 """Names of the statistics in the summary of an array."""
 _SHOWN = 10
 _ANY_ELEMENT = re.compile(r"\[\*?\]")
-_FLOATS = {"float", "double", "float32", "float64"}
-_SMALL = {"byte", "char", "octet", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32"}
 _KINDS: dict[str, Kind] = {
     "bool": "bool",
     "boolean": "bool",
     "string": "string",
-    "time": "time",
-    "duration": "time",
     "date": "date",
-    **dict.fromkeys(_FLOATS | _SMALL | {"uint64", "int", "uint", "number", "integer"}, "number"),
+    **dict.fromkeys(TIMES, "time"),
+    **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
 _META = {
     "_meta.inserted_at": "date",
@@ -122,11 +120,11 @@ class FieldTypes:
 
     def are_floats(self, path: str) -> bool:
         """True if a field, or the elements of an array, are floating-point numbers."""
-        return self.base(path) in _FLOATS
+        return self.base(path) in FLOATS
 
     def are_int64(self, path: str) -> bool:
         """True if a field, or the elements of an array, are integers that fit into int64."""
-        return self.base(path) in _SMALL
+        return self.base(path) in INTEGERS - {"uint64"}
 
 
 @lru_cache(maxsize=64)
