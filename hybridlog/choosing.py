@@ -20,7 +20,7 @@ from hybridlog.query.question import Question
 from hybridlog.query.times import TIME_LIMIT, format_time, is_relative, parse_range
 from hybridlog.query.topics import matcher, resolve, split_topic
 from hybridlog.wording import listed
-from hybridlog_storage.errors import IndexChangedError, TimeError, TopicError, UsageError
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -237,15 +237,7 @@ class _Choosing:
 
     def _having_any(self, question: Question) -> set[str]:
         """Ids of the recordings with at least one message of the answer."""
-        try:
-            return Planner(self._session, question, Counters()).recordings_with_any()
-        except IndexChangedError:
-            # Another process has changed the index: query its new state once.
-            now = self._session.snapshot()
-            if not now.by_id.keys() >= set(question.recordings or ()):
-                raise
-            self._snapshot = now
-            return Planner(self._session, question, Counters()).recordings_with_any()
+        return Planner(self._session, question, Counters()).recordings_with_any()
 
 
 def _is_side(moment: TimeLike | None) -> bool:

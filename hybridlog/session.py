@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.guarded import Belief, GuardedIndex
+    from hybridlog.index_version import GuardedIndex, IndexVersion
     from hybridlog.payloads.reader import PayloadReader
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
@@ -176,7 +176,7 @@ class Session:
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
         self._indexed: set[str] = set()  # ids of those that it has in any case
-        self._doubted: set[str] = set()  # recordings that the index may lack
+        self._stale: set[str] = set()  # recordings that the index may lack
         self._latest = _Moment()
         self._pinned = threading.local()  # the moment that this thread asks about
         self._changed = 0, False  # as of the snapshot, see `StoreDirectory.changed`
@@ -185,7 +185,7 @@ class Session:
         self._running: dict[str, RunningRecording] = {}
         self._following = threading.RLock()
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
-        self._belief: Belief | None = None
+        self._index_version: IndexVersion | None = None
         self._places: TopicPlaces | None = None
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
@@ -220,20 +220,22 @@ class Session:
                 self.connect()
         return self.connected
 
-    def database_about(
-        self, entry: RecordingEntry, others: Callable[[], Iterable[RecordingEntry]]
-    ) -> Database | None:
-        """The index of a recording; None if MongoDB is unavailable.
+    def database_about(self, purpose: str, entries: Sequence[RecordingEntry]) -> Database:
+        """The index of some recordings; the rest of the store need not be in it.
 
         Args:
-            entry: The recording.
-            others: Returns other recordings of the question. The rest of the store need not
-                be in the index.
+            purpose: The activity, for messages.
+            entries: The recordings.
+
+        Raises:
+            DatabaseError: it is unavailable; has the purpose and the reason.
         """
-        is_ready = self._is_indexed or entry.id in self._indexed
+        is_ready = self._is_indexed or self._indexed.issuperset(entry.id for entry in entries)
         if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
             with suppress(HybridlogError):
-                self.connect({entry.id: entry, **{other.id: other for other in others()}}.values())
+                self.connect(entries)
+        if self.connected is None:
+            raise self._missing_database(purpose)
         return self.connected
 
     def connect(self, recordings: Collection[RecordingEntry] | None = None) -> Database:
@@ -269,7 +271,7 @@ class Session:
         from hybridlog.maintenance import index
 
         if self.connected is None:
-            self._belief = self._places = None
+            self._index_version = self._places = None
             self._is_indexed = False
             self._indexed.clear()
         repairs = RepairReport()
@@ -285,7 +287,7 @@ class Session:
                     self.snapshot(),
                     self.entry_of,
                     index=self.connection.index,
-                    doubted=self._doubted,
+                    stale=self._stale,
                     wanted=None if wanted is None else wanted.keys(),
                     report=repairs,
                     progress=self._progress,
@@ -298,7 +300,7 @@ class Session:
             self.repairs.removed += repairs.removed
         self._unavailable = None
         self._rests_until = 0.0
-        self._doubted = set() if wanted is None else self._doubted - wanted.keys()
+        self._stale = set() if wanted is None else self._stale - wanted.keys()
         known = self._indexed.copy()
         if has_changed:
             self.invalidate()
@@ -309,12 +311,12 @@ class Session:
     def disconnect(self) -> None:
         """Disconnect from MongoDB; questions are then answered from the files."""
         self.connection.close()
-        self._belief = None
+        self._index_version = None
         self._places = None
 
     def take_over(self) -> None:
         """Record in the index that the store is at this location."""
-        self._belief = None
+        self._index_version = None
         self.connection.take_over()
         self._unavailable = None
         self._rests_until = 0.0
@@ -332,13 +334,16 @@ class Session:
         """
         database = self.database
         if database is None:
-            raise DatabaseError(f"{purpose} needs MongoDB. {self._unavailable or ''}".strip())
+            raise self._missing_database(purpose)
         if writes and not self.connection.may_write:
             raise DatabaseError(
                 f"{purpose} needs a MongoDB user who may write. This one may only read: grant "
                 f"the role readWrite on the database {database.name!r}."
             )
         return database
+
+    def _missing_database(self, purpose: str) -> DatabaseError:
+        return DatabaseError(f"{purpose} needs MongoDB. {self._unavailable or ''}".strip())
 
     @property
     def writable_database(self) -> Database | None:
@@ -365,11 +370,13 @@ class Session:
             DatabaseError: it is unavailable; has the purpose and the reason.
             IndexChangedError: documents of these recordings are missing, or being removed.
         """
-        from hybridlog.guarded import GuardedIndex
+        from hybridlog.index_version import GuardedIndex
 
         database = self.connected or self.database_for(purpose)
         try:
-            return GuardedIndex(database, recordings, self.belief, partial(self._doubt, recordings))
+            return GuardedIndex(
+                database, recordings, self.index_version, partial(self._mark_stale, recordings)
+            )
         except IndexChangedError as error:
             if self.connection.may_write:
                 raise
@@ -377,9 +384,9 @@ class Session:
                 f"{error} This MongoDB user may only read: ask once as a user who may write."
             ) from error
 
-    def _doubt(self, recordings: Sequence[RecordingEntry]) -> None:
+    def _mark_stale(self, recordings: Sequence[RecordingEntry]) -> None:
         """Look again at what the index has of some recordings, when it is next connected."""
-        self._doubted.update(entry.id for entry in recordings)
+        self._stale.update(entry.id for entry in recordings)
         self.invalidate()
 
     def places(self, purpose: str) -> TopicPlaces:
@@ -395,7 +402,9 @@ class Session:
             self._places = TopicPlaces(database)
         return self._places
 
-    def belief(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
+    def index_version(
+        self, database: Database, keys: Collection[str], *, anew: bool = False
+    ) -> IndexVersion:
         """The state of the index of some recordings, as of the catalog's snapshot.
 
         Args:
@@ -403,9 +412,11 @@ class Session:
             keys: Keys of the recordings.
             anew: True to read it from the database now.
         """
-        from hybridlog.guarded import Belief
+        from hybridlog.index_version import IndexVersion
 
-        found = self._belief = Belief.of(database, keys, None if anew else self._belief)
+        found = self._index_version = IndexVersion.of(
+            database, keys, None if anew else self._index_version
+        )
         return found
 
     # The moment.
@@ -648,7 +659,7 @@ class Session:
             return None  # another process has just renamed or removed it
         if entry is not None and is_new:
             # The index may have what the files had before.
-            self._doubted.add(entry.id)
+            self._stale.add(entry.id)
             self._indexed.discard(entry.id)
             self._is_indexed = False
         return entry
@@ -1051,7 +1062,7 @@ class Session:
         self._entries = {}
         self._is_indexed = False
         self._indexed.clear()
-        self._belief = None
+        self._index_version = None
         self._places = None
         self._channels.clear()
         with self._lock:

@@ -51,33 +51,6 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/query/predicate/to_mongo.py",
-        (
-            "long-json-arrays-have-no-elements",
-            "            self._of_extremes(asked, order, bounds),\n",
-            "",
-            JSON_ARRAYS,
-        ),
-        (
-            "arrays-in-arrays-have-no-elements",
-            "if isinstance(asked.parts[-1], str) or not self._types.is_open(asked):",
-            "if asked.parts:",
-            JSON_ARRAYS,
-        ),
-        (
-            "negation-keeps-what-is-certain",
-            'return _Pair({"$nor": [pair.certain]}, {"$nor": [pair.possible]})',
-            'return _Pair({"$nor": [pair.possible]}, {"$nor": [pair.certain]})',
-            f"{AGREEMENT}::test_of_ros_messages",
-        ),
-        (
-            "large-integers-are-not-rounded",
-            'return _Bounds({"$lte": near}, {"$lt": near})',
-            'return _Bounds({"$lt": near}, {"$lt": near})',
-            f"{AGREEMENT}::test_of_ros_messages",
-        ),
-    ),
-    *_of(
         "hybridlog/query/predicate/to_mask.py",
         (
             "a-null-is-missing",

@@ -21,7 +21,6 @@ import hybridlog as hl
 from hybridlog.choice import Choice
 from hybridlog.cli.app import app
 from hybridlog.live import LiveOptions
-from hybridlog.query.planner import Planner
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
 from hybridlog.wording import listed
@@ -162,23 +161,6 @@ def test_without_mongodb_the_same_are_chosen(store: hl.Store) -> None:
     with hl.open(store.directory.path, mongo="mongodb://localhost:1/?timeoutMS=20") as away:
         assert list(away.recordings(**asked).labels) == ["monday-2", "tuesday"]
         assert away.without_database is None, "it was not even asked"
-
-
-@pytest.mark.parametrize(
-    ("predicate", "labels"),
-    [
-        ("n > 3", ["monday-2", "tuesday"]),
-        ("n = 0", ["run-1"]),
-        # MongoDB narrows down, and the messages decide.
-        ("n > 3 or s ~ 'x+y'", ["monday-2", "tuesday"]),
-    ],
-)
-def test_the_index_chooses_the_same(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, predicate: str, labels: list[str]
-) -> None:
-    store.connect()
-    monkeypatch.setattr(Planner, "_files", lambda *_: ())
-    assert list(store.recordings(where=f"scan: {predicate}").labels) == labels
 
 
 @pytest.mark.parametrize(

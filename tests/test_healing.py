@@ -25,13 +25,12 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog import session as session_module
 from hybridlog.demo.write import write_bag
-from hybridlog.query import chunk_scan
+from hybridlog.query import index_reader
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines import mongo as mongo_module
 from hybridlog.query.engines.base import Outcomes
-from hybridlog.query.engines.mongo import Mongo
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Part
 from hybridlog_storage.database import Database
@@ -40,6 +39,7 @@ from hybridlog_storage.errors import (
     DatabaseError,
     IndexChangedError,
     ResourceError,
+    StoreError,
 )
 from hybridlog_storage.mongod import find_mongod
 from tests.cli.running import run
@@ -233,7 +233,7 @@ def test_a_killed_mongod_is_started_again(store: Path) -> None:
 def test_a_mongod_killed_in_the_middle_of_an_answer(
     store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mongo_module, "_DOCUMENTS", 5)  # in one batch
+    monkeypatch.setattr(index_reader, "_DOCUMENTS", 5)  # in one batch
     with hl.open(store, require_database=True) as opened:
         want = [d["_id"] for d in opened.topic(*TOPICS).documents()]
         answer = opened.topic(*TOPICS).documents()
@@ -271,63 +271,48 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
             assert len(tried) == 2
 
 
-def only_mongo(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let MongoDB be chosen first, as for long recordings."""
-    cost = PayloadScan.cost
-    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
-    monkeypatch.setattr(PayloadScan, "cost", lambda *asked: cost(*asked) and 1e6)
-
-
 def test_another_engine_goes_on_where_one_fails(
     store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with hl.open(store, require_database=True) as opened:
+    with hl.open(store) as opened:
         question = opened.topic(IMU).where(WHERE).question
         planner = Planner(opened.session, question, Counters())
         part = planner.parts()[0]
         want = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
-        only_mongo(monkeypatch)
 
-        def breaking(engine: Mongo, part: Part) -> Iterator[Outcomes]:
-            whole = next(PayloadScan.outcomes(engine, part))  # type: ignore[arg-type]
+        def breaking(engine: TablesEngine, part: Part) -> Iterator[Outcomes]:
+            whole = next(PayloadScan(opened.session, Counters()).outcomes(part))
             yield Outcomes(*(column[:7] for column in whole))
             yield Outcomes(*(column[:0] for column in whole))
-            raise ConnectionLostError("gone")
+            raise StoreError("gone")
 
-        monkeypatch.setattr(Mongo, "outcomes", breaking)
-        monkeypatch.setattr(Mongo, "plan", PayloadScan.plan, raising=False)
-        monkeypatch.setattr(Mongo, "_scan", PayloadScan._scan, raising=False)
+        monkeypatch.setattr(TablesEngine, "outcomes", breaking)
         planner = Planner(opened.session, question, Counters())
         got = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
         assert got == want
         assert len(want) > 100
 
 
-@pytest.mark.parametrize("where", [WHERE, {"header.seq": {"$mod": [7, 0]}}])
-def test_a_selection_goes_on_without_mongodb_or_with_a_new_one(
-    store: Path, monkeypatch: pytest.MonkeyPatch, where: object
+@pytest.mark.parametrize("error", [ConnectionLostError, IndexChangedError])
+def test_what_only_mongodb_knows_is_asked_once_more(
+    store: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
-    """Messages can decide the first predicate; only MongoDB understands the second."""
-    select = Mongo.select
+    holding = IndexReader._holding
     calls: list[int] = []
 
-    def breaking(engine: Mongo, parts: Any, tasks: Any) -> Any:
-        calls.append(len(tasks))
-        if len(calls) == 2:
-            raise ConnectionLostError("gone")
-        return select(engine, parts, tasks)
+    def breaking(reader: IndexReader, *asked: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 1:
+            raise error("gone")
+        return holding(reader, *asked)
 
     with hl.open(store, require_database=True) as opened:
-        asked = opened.topic(IMU).where(where)
+        asked = opened.topic(IMU).where({"header.seq": {"$mod": [7, 0]}})
         want = [(m.recording, m.seq) for m in asked]
-        only_mongo(monkeypatch)
-        monkeypatch.setattr(Mongo, "select", breaking)
-        # A group for each chunk.
-        monkeypatch.setattr(chunk_scan, "_groups", lambda tasks: ([task] for task in tasks))
-        assert [(m.recording, m.seq) for m in asked] == want
         assert len(want) > 20
-        assert len(calls) == (2 if where == WHERE else len(calls))
-        assert len(calls) >= 2
+        monkeypatch.setattr(IndexReader, "_holding", breaking)
+        assert [(m.recording, m.seq) for m in asked] == want
+        assert len(calls) == 3  # two groups of recordings, one of them twice
 
 
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])

@@ -57,7 +57,7 @@ def bring_up_to_date(
     entry_of: Callable[[RecordingSummary], RecordingEntry],
     *,
     index: str,
-    doubted: Collection[str],
+    stale: Collection[str],
     wanted: Collection[str] | None = None,
     report: RepairReport,
     progress: Progress | None = None,
@@ -75,7 +75,7 @@ def bring_up_to_date(
         snapshot: All recordings.
         entry_of: Returns the entry of a recording.
         index: Id of the index.
-        doubted: Ids of recordings to look at in any case.
+        stale: Ids of recordings to look at in any case.
         wanted: Ids of the recordings that the index must have; None for all.
         report: Collects the actions.
         progress: Called while a recording is indexed.
@@ -93,7 +93,7 @@ def bring_up_to_date(
         one
         for one in snapshot.summaries
         if wanted is None or one.id in wanted
-        if is_other or one.indexed_by != index or one.id in doubted
+        if is_other or one.indexed_by != index or one.id in stale
     ]
     has_strangers = wanted is None and (is_other or tables.are_more_than(directory, len(snapshot)))
     if not behind and not has_strangers:

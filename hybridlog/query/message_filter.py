@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.query.predicate.tree import And, Opaque, Predicate, nodes
-from hybridlog_storage.errors import DefinitionError, PayloadError, WhereError
+from hybridlog.query.predicate.tree import Predicate
+from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -17,25 +17,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch
-
-
-def residual(predicate: Predicate) -> Predicate | None:
-    """The part of a predicate left for the messages after MongoDB has answered the rest.
-
-    Raises:
-        WhereError: a part that only MongoDB understands and a part that MongoDB may get
-            wrong are not joined by *and*.
-    """
-    items = predicate.root.items if isinstance(predicate.root, And) else (predicate.root,)
-    left = [item for item in items if not isinstance(item, Opaque)]
-    if any(isinstance(node, Opaque) for item in left for node in nodes(item)):
-        raise WhereError(
-            "This filter mixes operators that only MongoDB understands with conditions that it "
-            "does not answer exactly, such as regular expressions: join them with $and."
-        )
-    if not left:
-        return None
-    return Predicate(left[0] if len(left) == 1 else And(tuple(left)), predicate.text)
 
 
 class Matches(NamedTuple):

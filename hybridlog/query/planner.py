@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,10 +25,6 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.column import STAMP
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import (
-    ConnectionLostError,
-    DatabaseError,
-    HybridlogError,
-    IndexChangedError,
     ResourceError,
     SegmentError,
     StoreError,
@@ -43,31 +38,21 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines.base import Engine, Objects, Outcomes, Values
-    from hybridlog.query.engines.mongo import Mongo
     from hybridlog.query.engines.payload_columns import PayloadColumns
     from hybridlog.query.engines.running import RunningTables
     from hybridlog.query.engines.tables import TablesEngine
+    from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.message_filter import MessageFilter
-    from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-_CONNECT_S = 0.3  # seconds to start and reach the embedded MongoDB
 _MORE_TOGETHER = 64  # so many times more recordings are planned after each group
 _MOST_TOGETHER = 4096  # recordings planned at once, if they do not overlap
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
-_T = TypeVar("_T")
 _Rows = TypeVar("_Rows", "Outcomes", "Values")
 _Key = tuple[int, int]
-_RETRIED = (
-    DatabaseError,
-    IndexChangedError,
-    ResourceError,
-    SegmentError,
-    StoreError,
-    UndecidedError,
-)
+_RETRIED = (ResourceError, SegmentError, StoreError, UndecidedError)
 """Failures of one engine that another engine may not have."""
 
 
@@ -84,17 +69,19 @@ class Planner:
         self.session = session
         self.question = question
         self.counters = counters
-        self._asked: Sequence[Part] = ()  # parts that are answered at the same time
-        self._told: set[Part] = set()  # parts whose messages without fields are counted
+        self._batch: Sequence[Part] = ()  # parts that are answered one after the other
+        self._decidable: dict[Part, Part] = {}  # without what only MongoDB answers
+        self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
         self._scan = PayloadScan(session, counters)
         self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
 
     @lazy
-    def _mongo(self) -> Mongo:
-        from hybridlog.query.engines.mongo import Mongo
+    def index(self) -> IndexReader:
+        """The index documents in MongoDB."""
+        from hybridlog.query.index_reader import IndexReader
 
-        return Mongo(self.session, self.counters, lambda: self._asked)
+        return IndexReader(self.session, self.counters)
 
     @lazy
     def _tables(self) -> TablesEngine:
@@ -115,7 +102,7 @@ class Planner:
         return RunningTables(self.session, self.counters)
 
     def _files(self, part: Part, need: Need) -> tuple[Engine, ...]:
-        """The engines that need no server."""
+        """The engines that may be able to answer."""
         if part.recording.status in UNFINISHED:
             is_plain = part.predicate is None and need is not Need.VALUES
             return *self._catalog, *(() if is_plain else (self._running,)), self._scan
@@ -134,7 +121,8 @@ class Planner:
             TimeError: the time range is empty, or outside all recordings.
             TopicError: a topic does not have the requested clock.
         """
-        return [part for resolved in self._ranges.resolve() for part in self.parts_in(*resolved)]
+        found = self._ranges.resolve()
+        return self.batch_hint([part for one in found for part in self.parts_in(*one)])
 
     def parts_in(
         self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
@@ -220,54 +208,42 @@ class Planner:
 
     def recordings_with_any(self) -> set[str]:
         """Ids of the recordings that have a message in the answer."""
-        found: set[str] = set()
-        groups: dict[Engine, list[Part]] = defaultdict(list)
-        narrowed: list[Part] = []
-        for part in self.together(self.parts()):
-            if self._is_narrowed(part):
-                narrowed.append(part)
-            else:
-                groups[next(self._choose(part, Need.COUNT))].append(part)
-        for engine, group in groups.items():
-            for part, count in self._count_each(engine, group):
-                if count:
-                    found.add(part.recording.id)
-        if narrowed:
-            for run in ChunkScan(self.plan(narrowed), self.session.segment).unordered():
-                rows = np.unique(run.batch.channel).tolist()
-                found.update(run.channels[row].recording.id for row in rows)
-        return found
+        return {
+            part.recording.id
+            for part in self._decided(self.parts())
+            if self._count_part(self._choose(part, Need.COUNT), part)
+        }
 
-    def _count_each(self, engine: Engine, parts: Sequence[Part]) -> Iterator[tuple[Part, int]]:
-        """The count of each part; a server is asked about all at once."""
-        if engine is self._mongo:
-            try:
-                yield from self._mongo.counts(parts)
-            except _RETRIED as error:
-                yield from ((part, self._count_otherwise(part, engine, error)) for part in parts)
-            return
-        for part in parts:
-            try:
-                yield part, engine.count([part])
-            except _RETRIED as error:
-                yield part, self._count_otherwise(part, engine, error)
-
-    def together(self, parts: Sequence[Part]) -> Sequence[Part]:
-        """Announce parts that will be asked about one by one; a server is asked at once."""
-        self._asked = parts
+    def batch_hint(self, parts: list[Part]) -> list[Part]:
+        """Announce parts that will be asked about one by one; MongoDB is asked at once."""
+        self._batch = parts
         return parts
+
+    def _decided(self, parts: Sequence[Part]) -> list[Part]:
+        """Parts with predicates that columns and messages decide, see `IndexReader`."""
+        self._count_unreadable(parts)
+        wanted = [part for part in parts if part.needs_index and part not in self._decidable]
+        if wanted:
+            if {*wanted} <= {*self._batch}:
+                wanted = [part for part in self._batch if part.needs_index]
+            found = self.index.without_index(wanted)
+            self._counted.update(found)
+            self._count_unasked(wanted, found)
+            self._decidable.update(zip(wanted, found, strict=True))
+        return [self._decidable.get(part, part) for part in parts]
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """For each message of a part, whether it matches, in order."""
-        self._tell_unasked([part])
+        (part,) = self._decided([part])
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
         """True if the fields of the messages of a part come from its table or columns."""
-        costs = self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields)
-        if costs and part.recording.payloads and costs[0][1] is self._columns:
+        (part,) = self._decided([part])
+        engine = self._choose(part, Need.VALUES, fields)[0]
+        if part.recording.payloads and engine is self._columns:
             return True
-        if not costs or costs[0][1] is not self._tables:
+        if engine is not self._tables:
             return False
         try:
             self._tables.check(part)
@@ -277,10 +253,7 @@ class Planner:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
-        if not self._costs(self._files(part, Need.VALUES), part, Need.VALUES, fields):
-            # Only MongoDB finds the messages; the fields are those of the messages.
-            return self._scan.values_of(self.plan([part]), fields)
-        self._tell_unasked([part])
+        (part,) = self._decided([part])
         return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
 
     def objects(self, part: Part) -> Iterator[Objects]:
@@ -301,23 +274,22 @@ class Planner:
         """All messages that match, in order; recordings are read when their turn comes."""
         limit = self.question.limit
         ahead = limit is None or limit > _READ_AHEAD_FROM
-        for group in self._groups():
+        for group in self.groups():
             plan = self.plan(group)
             yield from ChunkScan(plan, self.session.segment, ahead=ahead).runs()
 
     def unordered(self) -> Iterator[MessageRun]:
         """The messages of an answer without `limit` and `every`, unordered."""
-        for group in self._groups():
+        for group in self.groups():
             plan = self.plan(group)
             for run in ChunkScan(plan, self.session.segment).unordered():
                 self.counters.add_messages(run.batch)
                 yield run
 
-    def _groups(self) -> Iterator[list[Part]]:
+    def groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.
 
-        The first group is small, so that the first message needs few recordings; there are few
-        groups, since a server is asked once for each.
+        The first group is small, so that the first message needs few recordings.
         """
         found = self._ranges.resolve()
         # In the order of the answer; going back, a recording begins with its last message.
@@ -337,48 +309,41 @@ class Planner:
 
     def plan(self, parts: Sequence[Part]) -> ScanPlan:
         """The plan for reading the matching messages of some parts."""
+        parts = self._decided(parts)
         plan = self._scan.plan(parts, filtered=False)
         plan.reverse = self.question.reverse
         if self.question.predicate is None or not parts:
             return plan
         from hybridlog.query.message_filter import MessageFilter
 
-        self.together(parts)
-        self._tell_unasked(parts)
         selecting: dict[Engine, list[Part]] = defaultdict(list)
         unindexed: set[int] = set()
         filters: dict[int, MessageFilter] = {}
         place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
-        for part in parts:
-            engine = self._selecting(part)
-            indexes = [place[part.recording.id, c.channel_id] for c in part.channels]
-            if engine is self._scan:
-                unindexed.update(indexes)
-                decide = part.predicate
-            else:
-                selecting[engine].append(part)
-                decide = self._undecided(part) if engine is self._mongo else None
-            if decide is not None:
-                filters.update(dict.fromkeys(indexes, MessageFilter(decide, part.field_types)))
-        plan.filters = filters
 
-        def read_instead(part: Part, failure: HybridlogError) -> None:
-            if not self._costs([self._scan], part, Need.SELECTION, ()):
-                raise failure
+        def read(part: Part) -> None:
             assert part.predicate is not None
             indexes = [place[part.recording.id, c.channel_id] for c in part.channels]
             decide = MessageFilter(part.predicate, part.field_types)
             filters.update(dict.fromkeys(indexes, decide))  # before chunks are read for it
             unindexed.update(indexes)
 
+        for part in parts:
+            engine = self._selecting(part)
+            if engine is self._scan:
+                read(part)
+            else:
+                selecting[engine].append(part)
+        plan.filters = filters
+
         def select(tasks: Sequence[ChunkTask]) -> RowSelection:
             offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
             for engine, chosen in [*selecting.items()]:
                 try:
-                    found = self._again(partial(engine.select, chosen, tasks), chosen)
-                except _RETRIED as error:
+                    found = engine.select(chosen, tasks)
+                except _RETRIED:
                     for part in chosen:
-                        read_instead(part, error)
+                        read(part)
                     del selecting[engine]
                     continue
                 for key, rows in found.offsets.items():
@@ -389,22 +354,32 @@ class Planner:
         plan.selector = select if selecting else None
         return plan
 
-    def _tell_unasked(self, parts: Sequence[Part]) -> None:
+    def _count_unasked(self, parts: Sequence[Part], decided: Sequence[Part]) -> None:
+        """Count the messages without documents to ask; engines count those they cannot read."""
+        from hybridlog.query.index_reader import TOO_LARGE, WITHOUT_FIELDS
+
+        groups: dict[bool, list[Part]] = defaultdict(list)
+        for part, now in zip(parts, decided, strict=True):
+            if part.lacks_fields:
+                groups[now.predicate is not None and now.predicate.asks_fields].append(part)
+        for is_asked, group in groups.items():
+            own = TOO_LARGE if is_asked else WITHOUT_FIELDS
+            self.counters.unreadable += self.index.count(group, own)
+
+    def _count_unreadable(self, parts: Sequence[Part]) -> None:
         """Count, once, the messages of which the predicate cannot be asked for want of fields.
 
         Engines count the messages that they find to be unreadable.
         """
         for part in parts:
-            if part in self._told or part.predicate is None:
+            if part in self._counted or part.predicate is None:
                 continue
-            self._told.add(part)
+            self._counted.add(part)
             if part.blind:
                 unseen = replace(part, channels=part.blind, blind=(), predicate=None)
                 self.counters.unreadable += self._count_stored(unseen)
-            if part.needs_index and self._mongo.reaches(part):
+            if part.needs_index:
                 self.counters.unindexed += self.count_unindexed([part])
-            if part.predicate.is_opaque and self._mongo.reaches(part):
-                self.counters.unreadable += self._mongo.count_unasked(part)
 
     def _count_stored(self, part: Part) -> int:
         """Number of messages of a part without a predicate."""
@@ -423,15 +398,8 @@ class Planner:
         for part in (part for part in parts if part.recording.status == "open"):
             channels = (*part.channels, *part.blind)
             whole = replace(part, channels=channels, blind=(), predicate=None)
-            total += max(self._count_stored(whole) - self._mongo.count([whole]), 0)
+            total += max(self._count_stored(whole) - self.index.count([whole]), 0)
         return total
-
-    def _undecided(self, part: Part) -> Predicate | None:
-        """The share of a part's predicate that is left when MongoDB has answered."""
-        from hybridlog.query.message_filter import residual
-
-        assert part.predicate is not None
-        return residual(part.predicate) if self._mongo.undecided(part) else None
 
     # Choosing.
 
@@ -444,30 +412,12 @@ class Planner:
                 except _RETRIED:
                     continue
             return engine
-        self.session.database_for("A MongoDB filter")
-        raise DatabaseError("No engine answers this question.")
+        return self._scan
 
-    def _choose(
-        self, part: Part, need: Need, fields: Collection[str] | None = ()
-    ) -> Iterator[Engine]:
-        """The engines that can answer, the cheapest first.
-
-        MongoDB is connected to only if that pays, or if nothing else can answer.
-
-        Raises:
-            DatabaseError: only MongoDB can, and it is unavailable.
-        """
-        files = self._files(part, need)
-        costs = self._costs(files, part, need, fields)
-        is_connected = self.session.connected is not None
-        if costs and not is_connected and costs[0][0] < _CONNECT_S:
-            yield from (engine for _, engine in costs)
-            costs = []
-        costs = sorted([*costs, *self._costs([self._mongo], part, need, fields)], key=itemgetter(0))
-        yield from (engine for _, engine in costs)
-        if not costs and not self._costs(files, part, need, fields):
-            self.session.database_for("A MongoDB filter")
-            raise DatabaseError("No engine answers this question.")
+    def _choose(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> list[Engine]:
+        """The engines that can answer, the cheapest first; the last one always can."""
+        costs = self._costs(self._files(part, need), part, need, fields)
+        return [engine for _, engine in costs]
 
     def _costs(
         self, engines: Sequence[Engine], part: Part, need: Need, fields: Collection[str] | None
@@ -478,78 +428,28 @@ class Planner:
         return sorted(able, key=itemgetter(0))
 
     def _count(self, parts: Sequence[Part]) -> int:
-        self.together(parts)
-        self._tell_unasked(parts)
         groups: dict[Engine, list[Part]] = defaultdict(list)
-        narrowed: list[Part] = []
-        for part in parts:
-            if self._is_narrowed(part):
-                narrowed.append(part)
-                continue
-            engine = next(self._choose(part, Need.COUNT))
-            groups[engine].append(part)
+        for part in self._decided(parts):
+            groups[self._choose(part, Need.COUNT)[0]].append(part)
         total = 0
         for engine, group in groups.items():
             try:
                 total += engine.count(group)
-            except _RETRIED as error:
-                total += sum(self._count_otherwise(part, engine, error) for part in group)
-        if narrowed:
-            scan = ChunkScan(self.plan(narrowed), self.session.segment)
-            total += sum(len(run.batch) for run in scan.unordered())
+            except _RETRIED:
+                total += sum(self._count_part(self._choose(p, Need.COUNT), p) for p in group)
         return total
 
-    def _is_narrowed(self, part: Part) -> bool:
-        """True if MongoDB finds candidates and the messages decide."""
-        if part.predicate is None:
-            return False
-        costs = self._costs(self._files(part, Need.COUNT), part, Need.COUNT, ())
-        if costs and (costs[0][1] is not self._scan or costs[0][0] < _CONNECT_S):
-            return False
-        if not self._mongo.reaches(part) or self._costs([self._mongo], part, Need.COUNT, ()):
-            return False
-        return self._mongo.cost(part, Need.SELECTION) is not None
-
-    def _count_otherwise(self, part: Part, failed: Engine, failure: Exception) -> int:
-        """The count of an engine that failed, by the next ones."""
-        for engine in self._others(part, Need.COUNT, failed, failure):
+    def _count_part(self, engines: Sequence[Engine], part: Part) -> int:
+        """The count of the first engine that does not fail."""
+        failure: Exception | None = None
+        for engine in engines:
             try:
                 return engine.count([part])
             except _RETRIED as error:
-                failure = error if isinstance(failure, UndecidedError) else failure
+                if failure is None or isinstance(failure, UndecidedError):
+                    failure = error
+        assert failure is not None
         raise failure
-
-    def _others(
-        self,
-        part: Part,
-        need: Need,
-        failed: Engine,
-        failure: Exception,
-        fields: Collection[str] | None = (),
-    ) -> Iterator[Engine]:
-        """The engines to ask after one has failed.
-
-        If the connection was lost, MongoDB is connected to again only if no other can answer:
-        the index may have to be built again first.
-        """
-        if not isinstance(failure, ConnectionLostError):
-            yield from (e for e in self._choose(part, need, fields) if e is not failed)
-            return
-        self._mongo.forget()
-        files = self._costs(self._files(part, need), part, need, fields)
-        yield from (engine for _, engine in files)
-        if self._costs([self._mongo], part, need, fields):
-            yield self._mongo
-
-    def _again(self, ask: Callable[[], _T], parts: Sequence[Part]) -> _T:
-        """An answer; asked for once more if the connection was lost and MongoDB must answer."""
-        try:
-            return ask()
-        except ConnectionLostError:
-            if all(self._costs([self._scan], part, Need.SELECTION, ()) for part in parts):
-                raise
-            self._mongo.forget()
-            return ask()
 
     def _first(
         self,
@@ -559,17 +459,9 @@ class Planner:
         fields: Collection[str] | None = (),
     ) -> Iterator[_Rows]:
         """Items of the cheapest engine; the next one goes on where it fails."""
-        failed = next(self._choose(part, need, fields))
-        failure: Exception
+        failure: Exception | None = None
         last: _Key | None = None
-        try:
-            for item in ask(failed):
-                yield item
-                last = _last_key(item) or last
-            return
-        except _RETRIED as error:
-            failure = error
-        for engine in self._others(part, need, failed, failure, fields):
+        for engine in self._choose(part, need, fields):
             try:
                 for item in ask(engine):
                     rest = item if last is None else _after(item, last)
@@ -578,7 +470,9 @@ class Planner:
                         last = _last_key(rest) or last
                 return
             except _RETRIED as error:
-                failure = error if isinstance(failure, UndecidedError) else failure
+                if failure is None or isinstance(failure, UndecidedError):
+                    failure = error
+        assert failure is not None
         raise failure
 
     def _check_clock(self, channel: RecordedChannel) -> None:

@@ -33,7 +33,6 @@ from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
     IncompleteError,
-    IndexChangedError,
     PayloadError,
     TopicError,
     UsageError,
@@ -548,15 +547,7 @@ class Query:
     def count(self) -> int:
         """Number of messages."""
         with self.counters.timed():
-            try:
-                found = Planner(self.session, self.question, self.counters).count()
-            except IndexChangedError:
-                # Another process has changed the index: query its new state once.
-                asked = self.question.recordings
-                if asked is not None and not self.session.snapshot().by_id.keys() >= set(asked):
-                    raise
-                self.counters.reset()
-                found = Planner(self.session, self.question, self.counters).count()
+            found = Planner(self.session, self.question, self.counters).count()
             self.counters.messages = found
         return found
 

@@ -170,6 +170,13 @@ class Part:
         """True if only MongoDB can answer the predicate."""
         return self.predicate is not None and self.predicate.needs_index
 
+    @property
+    def lacks_fields(self) -> bool:
+        """True if the predicate asks fields that documents may lack: those of unreadable ones."""
+        if self.predicate is None or not self.predicate.asks_fields:
+            return False
+        return self.recording.status == "open" or any(stats.unreadable for stats in self.stats)
+
     @lazy
     def field_types(self) -> Mapping[str, str] | None:
         """Types of the fields by path; None where a definition does not fix them."""

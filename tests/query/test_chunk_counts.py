@@ -92,7 +92,7 @@ def many(store: hl.Store) -> hl.Store:
 
 @pytest.fixture(autouse=True)
 def without_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the chunk index and MongoDB answer."""
+    """Let the chunk index answer."""
     monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
 
 
@@ -120,9 +120,9 @@ def test_a_count_by_time_where_a_segment_cannot_be_read(many: hl.Store) -> None:
     ):
         path.write_bytes(whole[: chunk.offset] + bytes(length) + whole[chunk.offset + length :])
         try:
-            assert opened.topic("/state").between("+5s", "+165s").count() == 160  # by the index
-            with pytest.raises(SegmentError, match=path.name):
-                alone.topic("/state").between("+5s", "+165s").count()
+            for store in (opened, alone):
+                with pytest.raises(SegmentError, match=path.name):
+                    store.topic("/state").between("+5s", "+165s").count()
         finally:
             path.write_bytes(whole)
         assert alone.topic("/state").between("+5s", "+165s").count() == 160
@@ -149,13 +149,7 @@ def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) ->
     damaged[index + at] ^= 1
     path.write_bytes(damaged)
     try:
-        with (
-            hl.open(many.directory.path, require_database=True) as opened,
-            hl.open(many.directory.path, mongo=AWAY) as alone,
-        ):
-            query = opened.topic("/state").between("+5s", "+165s")
-            assert query.count() == 160  # by the index
-            assert query.counters.chunks_read == 0
+        with hl.open(many.directory.path, mongo=AWAY) as alone:
             query = alone.topic("/state").between("+5s", "+165s")
             if damage in {"time", "place"}:
                 # The messages have a checksum of their own, and so have the arrival numbers.

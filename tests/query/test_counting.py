@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import bson
 import numpy as np
-import pymongo
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import UsageError
@@ -101,43 +98,6 @@ def test_what_no_recording_has_is_not_counted(
     if trace == "directory":
         with suppress(FileNotFoundError):  # the next look at the store removes it, too
             (store.directory.path / "recordings" / "gone").rmdir()
-
-
-def test_a_short_range_is_read_by_its_keys_whatever_indexes_there_are(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An index on a field that fits nearly all would look at nearly all documents."""
-    for engine in (TablesEngine, PayloadScan):
-        monkeypatch.setattr(engine, "cost", lambda *_: None)
-    rows = [(second, "/state", {"s": 1, "x": 1.5}) for second in range(2000)]
-    recorded(store, {"a": rows})
-    database = store.database_for("the test")
-    database.create_index("state", [("s", 1)])
-    near = store.topic("/state").where("s >= 1 and x > 1").between("+100s", "+110s")
-    with pymongo.MongoClient[dict[str, Any]](database.address) as client:
-        plain = client[database.name]
-
-        def looked_at() -> int:
-            done = list(plain["system.profile"].find({"ns": f"{database.name}.state"}))
-            plain.command("profile", 0)
-            plain["system.profile"].drop()
-            assert done
-            return sum(int(step.get("docsExamined", 0)) for step in done)
-
-        windows = near.windows("500ms", "500ms")
-        answers: dict[str, Callable[[], int]] = {
-            "count": near.count,
-            "messages": lambda: len(list(near)),
-            "windows": lambda: store.topic("/state").where("s >= 1").during(windows).count(),
-            "containing": lambda: len(windows.containing(store.topic("/state").where("s >= 1"))),
-            "states": lambda: near.intervals()[0].messages,
-        }
-        for name, answer in answers.items():
-            plain.command("profile", 2)
-            assert answer() == 10, name
-            # Trying both ways costs some, and chunks hold more than the range.
-            assert looked_at() < 900, name
-    database.drop("state")
 
 
 # --- intervals that contain a message -------------------------------------------------

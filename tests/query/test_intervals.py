@@ -21,7 +21,6 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
-from hybridlog.query.engines import mongo
 from hybridlog.query.intervals import Changing, Holding, Interval, Intervals
 from hybridlog.query.rows_differ import rows_differ
 from hybridlog.schema.arrow_columns import array_of
@@ -384,18 +383,14 @@ several = settings(
     text=st.sampled_from(sorted(HOLDS)),
     between=st.none() | st.tuples(st.integers(-1, 12), st.integers(1, 9)),
     gap=st.none() | st.integers(1, 4),
-    batch=st.sampled_from([1, 2, 50_000]),
 )
 def test_what_a_store_says_is_what_a_loop_says(
     store: hl.Store,
-    monkeypatch: pytest.MonkeyPatch,
     logs: dict[str, Any],
     text: str,
     between: tuple[int, int] | None,
     gap: int | None,
-    batch: int,
 ) -> None:
-    monkeypatch.setattr(mongo, "_BATCH", batch)
     model = recorded(store, logs)
     if "/state" not in store.topics():
         return

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.choice import Choice
+from hybridlog.query import index_reader
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines import mongo
-from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from tests.faults import logs
 from tests.servers.commands import Sent, commands
@@ -23,33 +23,41 @@ MESSAGES = 12
 GAP = 1000  # messages that would lie between two recordings
 ABSOLUTE = f"{logs.BEGIN_NS + 3 * logs.STEP_NS}ns", f"{logs.BEGIN_NS + 9_005 * logs.STEP_NS}ns"
 RELATIVE = "+0s", "+0.055s"
-QUESTIONS: dict[str, Callable[[hl.Store], object]] = {
+RAW = {"$expr": {"$gt": ["$n", 1]}}
+"""What only MongoDB understands."""
+BY_COLUMNS: dict[str, Callable[[hl.Store], object]] = {
     "count": lambda s: s.topic("/number").where("x > 1").count(),
-    "count of times": lambda s: s.topic("/number").where("x > 1").between(*ABSOLUTE).count(),
     "count of relative times": lambda s: (
         s.topic("/number").where("n > 1").between(*RELATIVE).count()
     ),
     "count by stamps": lambda s: (
         s.topic("/stamped").where("n > 1").clock("header").between(*ABSOLUTE).count()
     ),
-    "count of several topics": lambda s: s.topic("/number", "/stamped").where("n > 1").count(),
-    "count that messages decide": lambda s: s.topic("/text").where("s ~ '^xx$'").count(),
+    "count of elements": lambda s: s.topic("/text").where("s ~ '^x.$'").count(),
     "fetch": lambda s: [m.raw for m in s.topic("/number").where("x > 1")],
-    "fetch of relative times": lambda s: [
-        m.raw for m in s.topic("/number").where("x > 1").between(*RELATIVE)
-    ],
-    "fetch that messages decide": lambda s: [m.raw for m in s.topic("/text").where("s ~ '^xx$'")],
     "table": lambda s: s.topic("/number").where("x > 1").to_pandas()["n"].tolist(),
+    "intervals": lambda s: [*s.topic("/number").where("n > 3").intervals()],
+    "windows": lambda s: [*s.topic("/number").where("n > 3").windows(0, "1ms")],
+    "single message": lambda s: s.topic("/number").where("n > 1").at(ABSOLUTE[1]).raw,
+    "recordings": lambda s: s.choose(Choice(where=("/number: n > 3",))).ids,
+}
+BY_MONGODB: dict[str, Callable[[hl.Store], object]] = {
+    "count": lambda s: s.topic("/number").where(RAW).count(),
+    "count of times": lambda s: s.topic("/number").where(RAW).between(*ABSOLUTE).count(),
+    "count of relative times": lambda s: s.topic("/number").where(RAW).between(*RELATIVE).count(),
+    "count of several topics": lambda s: s.topic("/number", "/stamped").where(RAW).count(),
+    "fetch": lambda s: [m.raw for m in s.topic("/number").where(RAW).where("x > 1")],
+    "table": lambda s: s.topic("/number").where(RAW).to_pandas()["n"].tolist(),
     "documents": lambda s: [d["n"] for d in s.topic("/number").where("n > 1").documents()],
     "last documents": lambda s: [
         d["n"] for d in s.topic("/number").where("n > 1").reverse().limit(3).documents()
     ],
-    "intervals": lambda s: [*s.topic("/number").where("n > 3").intervals()],
+    "all documents": lambda s: [d["n"] for d in s.topic("/number").documents()],
+    "intervals": lambda s: [*s.topic("/number").where(RAW).intervals()],
     "intervals of relative times": lambda s: [
-        *s.topic("/number").where("n > 3").between("+0.025s", "+0.045s").intervals()
+        *s.topic("/number").where(RAW).between("+0.025s", "+0.045s").intervals()
     ],
-    "windows": lambda s: [*s.topic("/number").where("n > 3").windows(0, "1ms")],
-    "single message": lambda s: s.topic("/number").where("n > 1").at(ABSOLUTE[1]).raw,
+    "windows": lambda s: [*s.topic("/number").where(RAW).windows(0, "1ms")],
 }
 
 
@@ -79,21 +87,18 @@ def asked(path: Path) -> tuple[dict[str, list[Sent]], dict[str, object]]:
         sent.clear()
         store.remove(more.entry.id)
         heard["remove"] = [*sent]
-    for name, ask in QUESTIONS.items():
+    for name, ask in BY_MONGODB.items():
         with hl.open(path, require_database=True) as store, commands() as sent:
             answers[name] = ask(store)
             heard[name] = [*sent]
     return heard, answers
 
 
-def test_no_question_asks_once_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_question_asks_once_a_recording(tmp_path: Path) -> None:
     path = tmp_path / "store"
     add(path, range(10))
     with hl.open(path, require_database=True) as store:  # one mongod for all
-        truth = {name: ask(store) for name, ask in QUESTIONS.items()}
-        # Only MongoDB answers what it can.
-        monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
-        monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
+        truth = {name: ask(store) for name, ask in BY_MONGODB.items()}
         few, answers = asked(path)
         assert answers == truth
         add(path, range(10, 40))
@@ -113,22 +118,20 @@ def test_some_of_many_recordings(
     path = tmp_path / "store"
     add(path, range(7))
     with hl.open(path, require_database=True) as store:
-        monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
-        monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
-        monkeypatch.setattr(mongo, "_MOST_APART", most)
+        monkeypatch.setattr(index_reader, "_MAX_RANGES", most)
         for chosen, apart in (([0, 1, 2, 4, 6], 3), ([6], 1), ([0, 3], 2), (range(7), 1)):
             query = store.topic("/number").in_recording(*(f"log {n}" for n in chosen))
             there = [n * GAP + k for n in chosen for k in range(MESSAGES)]
             parts = Planner(store.session, query.question, Counters()).parts()
-            engine = mongo.Mongo(store.session, Counters())
-            ranges = engine._ranges(parts, [part.recording.span for part in parts])
+            reader = IndexReader(store.session, Counters())
+            ranges = reader._ranges(parts, [part.recording.span for part in parts], most)
             assert len(ranges) == (apart if most == 1 else len(chosen))
             assert [p for _, own in ranges for p in own] == parts
             assert query.where("n >= 5").count() == len([n for n in there if n >= 5])
             assert [d["n"] for d in query.where("n >= 5").documents()] == [
                 n for n in there if n >= 5
             ]
-            asked = query.where("n > 1").between("+0.025s", "+0.075s")
+            asked = query.where(RAW).between("+0.025s", "+0.075s")
             wanted = [n for n in there if 3 <= n % GAP < 8]
             assert asked.count() == len(wanted)
             assert [m.fields["n"] for m in asked] == wanted
@@ -136,16 +139,22 @@ def test_some_of_many_recordings(
             assert len(asked.windows(0, "1ms")) == len(wanted)
 
 
-def test_the_state_of_the_index_is_read_once_a_question(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where the messages of recordings are too many to be asked about together."""
+def test_what_columns_answer_asks_mongodb_nothing(tmp_path: Path) -> None:
     path = tmp_path / "store"
     add(path, range(4))
-    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
-    monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
-    monkeypatch.setattr(mongo, "_AHEAD", 0)
+    for name, ask in BY_COLUMNS.items():
+        with hl.open(path) as alone:
+            want = ask(alone)
+            assert alone.session.connected is None, name
+        with hl.open(path, require_database=True) as store, commands() as sent:
+            assert ask(store) == want
+            assert not sent, name
+
+
+def test_the_state_of_the_index_is_read_once_a_question(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    add(path, range(4))
     with hl.open(path, require_database=True) as store, commands() as sent:
-        assert len(store.topic("/number").where("n > 3").windows(0, "1ms"))
+        assert len(store.topic("/number").where(RAW).windows(0, "1ms"))
         assert [one.collection for one in sent].count("hybridlog.recordings") == 1
-        assert [one.collection for one in sent].count("number") >= 4
+        assert [one.collection for one in sent].count("number") == 1

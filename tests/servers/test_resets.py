@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.query.engines import mongo
-from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query import index_reader
 from hybridlog_storage.errors import DatabaseError
 from tests.faults import logs
 from tests.servers.mongods import Mongod
@@ -39,19 +37,21 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return logs.write(tmp_path_factory.mktemp("log") / "a.mcap", logs.content(0, MESSAGES))
 
 
+RAW = {"$expr": {"$gte": ["$n", 10]}}
+"""What only MongoDB understands."""
+
+
 @pytest.fixture(autouse=True)
-def only_mongodb(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let nothing else answer what MongoDB can, and let answers come in several parts."""
-    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
-    monkeypatch.setattr(PayloadScan, "cost", lambda *_: None)
-    monkeypatch.setattr(mongo, "_DOCUMENTS", 100)
+def in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let answers come in several parts."""
+    monkeypatch.setattr(index_reader, "_DOCUMENTS", 100)
 
 
 def test_answers_go_on_behind_a_reset(way: Proxy, uri: str, log: Path, tmp_path: Path) -> None:
     path = tmp_path / "store"
     with hl.open(path, create=True, mongo=uri, require_database=True) as store:
         store.record(log)
-        query = store.topic("/number").where("n >= 10")
+        query = store.topic("/number").where(RAW)
         way.reset_after = 80_000  # bytes: a batch of documents, but not all of them
         assert [d["n"] for d in query.documents()] == list(range(10, MESSAGES))
         assert [d["n"] for d in query.reverse().documents()] == list(range(10, MESSAGES))[::-1]
@@ -74,8 +74,8 @@ def test_resets_at_any_time(way: Proxy, uri: str, log: Path, tmp_path: Path, aft
     ask = f"{uri}?serverSelectionTimeoutMS=1000"
     try:
         with hl.open(path, mongo=ask, require_database=True) as store:
-            assert store.topic("/number").where("n >= 10").count() == MESSAGES - 10
-            assert sum(1 for _ in store.topic("/number").where("n >= 10")) == MESSAGES - 10
+            assert store.topic("/number").where(RAW).count() == MESSAGES - 10
+            assert sum(1 for _ in store.topic("/number").where(RAW)) == MESSAGES - 10
     except DatabaseError as error:
         said = str(error)
         assert "does not answer" in said
@@ -84,7 +84,7 @@ def test_resets_at_any_time(way: Proxy, uri: str, log: Path, tmp_path: Path, aft
     assert way.resets
     way.reset_after = 0
     with hl.open(path, mongo=uri, require_database=True) as store:
-        assert store.topic("/number").where("n >= 10").count() == MESSAGES - 10
+        assert store.topic("/number").where(RAW).count() == MESSAGES - 10
         assert store.verify().findings == []
 
 

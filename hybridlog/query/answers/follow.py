@@ -149,7 +149,7 @@ class Following(Planner, Iterator["Message"]):
     def _selecting(self, part: Part) -> Engine:
         return self._scan
 
-    def _tell_unasked(self, parts: Sequence[Part]) -> None:
+    def _count_unreadable(self, parts: Sequence[Part]) -> None:
         for part in (part for part in parts if part.blind):
             unseen = replace(part, channels=part.blind, blind=(), predicate=None)
             self.counters.unreadable += self._scan.count([unseen])

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import bson
+import numpy as np
 
-from hybridlog.query.engines.mongo import Mongo
+from hybridlog.query.index_reader import without_documents
 from hybridlog.query.planner import Planner
-from hybridlog_storage.errors import ConnectionLostError, TopicError
+from hybridlog_storage.errors import ConnectionLostError
+from hybridlog_storage.index_columns import KeyColumns
 from hybridlog_storage.index_documents import KEY_BYTES
 
 if TYPE_CHECKING:
@@ -61,24 +63,15 @@ def _matching(
     """All matching documents with their topics, in order."""
     planner = Planner(session, question, counters)
     parts = planner.parts()
-    missing = sorted({part.topic for part in parts if not part.is_indexed})
-    if missing:
-        raise TopicError(
-            f"{missing[0]} has no index documents: it was recorded with --no-index. Ask for its "
-            "messages or tables."
-        )
-    mongo = Mongo(session, counters, lambda: parts)
-    if not all(mongo.reaches(part) for part in parts[:1]):
-        session.database_for("Reading index documents")
+    missing = next((part.topic for part in parts if not part.is_indexed), None)
+    if missing is not None:
+        raise without_documents(missing)
+    planner.index.connect(parts)
     counters.unindexed = planner.count_unindexed(parts)
     by_topic: dict[str, list[Part]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)
-    streams = [
-        stream
-        for of_topic in by_topic.values()
-        for stream in _of_topic(planner, mongo, of_topic, reverse=question.reverse)
-    ]
+    streams = [stream for of_topic in by_topic.values() for stream in _of_topic(planner, of_topic)]
     # Keys are ordered by log time, recording and arrival, over all topics.
     return heapq.merge(*streams, key=_key, reverse=question.reverse)
 
@@ -88,40 +81,31 @@ def _key(pair: tuple[str, Document]) -> bytes:
     return bytes(pair[1]["_id"][-KEY_BYTES:])
 
 
-def _of_topic(
-    planner: Planner, mongo: Mongo, parts: Sequence[Part], *, reverse: bool
-) -> list[Iterator[tuple[str, Document]]]:
+def _of_topic(planner: Planner, parts: Sequence[Part]) -> list[Iterator[tuple[str, Document]]]:
     """Streams of the documents of one topic that match, each in order."""
-    matching = _Matching(planner, mongo, parts)
+    reverse = planner.question.reverse
 
     def read(stream: Iterator[bytes]) -> Iterator[tuple[str, Document]]:
         for raw in stream:
             documents = bson.decode_all(raw)
             planner.counters.documents_read += len(documents)
-            yield from ((parts[0].topic, d) for d in documents if matching.has(d["_meta"]))
+            yield from ((parts[0].topic, document) for document in documents)
 
-    return [read(stream) for stream in mongo.documents(parts, reverse=reverse)]
+    if planner.question.predicate is None:
+        return [read(stream) for stream in planner.index.documents(parts, reverse=reverse)]
+    keys = _keys(planner, parts)
+    return [read(planner.index.documents_with(parts, keys, reverse=reverse))]
 
 
-class _Matching:
-    """Knows which of the documents that MongoDB finds match, where it cannot decide."""
-
-    def __init__(self, planner: Planner, mongo: Mongo, parts: Sequence[Part]) -> None:
-        self._planner = planner
-        self._unsure = {p.recording.key: p for p in parts if not mongo.filter_of(p).is_exact}
-        self._found: dict[str, set[tuple[int, int]]] = {}
-
-    def has(self, meta: Mapping[str, Any]) -> bool:
-        """True if a document matches, by its `_meta`."""
-        key = meta["rec"]
-        part = self._unsure.get(key)
-        if part is None:
-            return True
-        if key not in self._found:
-            found = self._found[key] = set()
-            for outcomes in self._planner.outcomes(part):
-                rows = outcomes.holds
-                found.update(
-                    zip(outcomes.log_time[rows].tolist(), outcomes.seq[rows].tolist(), strict=True)
-                )
-        return (meta["t"], meta["seq"]) in self._found[key]
+def _keys(planner: Planner, parts: Sequence[Part]) -> KeyColumns:
+    """The keys of the matching messages of one topic, in order; columns or messages decide."""
+    empty = np.empty(0, np.int64), np.empty(0, np.uint64), np.empty(0, np.int64)
+    found = [empty]
+    for part in parts:
+        own = np.uint64(int(part.recording.key, 16))
+        for outcomes in planner.outcomes(part):
+            time = outcomes.log_time[outcomes.holds]
+            found.append((time, np.full(len(time), own), outcomes.seq[outcomes.holds]))
+    time, recording, seq = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    order = np.lexsort((seq, recording, time))
+    return KeyColumns(time[order], recording[order], seq[order])

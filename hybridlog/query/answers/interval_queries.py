@@ -69,7 +69,7 @@ class IntervalQueries:
             (part, span, _bounded(part, span), _just_before(part, span))
             for part, span in self._spans()
         ]
-        self._planner.together([p for *_, inner, before in spans for p in (*before, inner)])
+        self._planner.batch_hint([p for *_, inner, before in spans for p in (*before, inner)])
         for part, span, inner, before in spans:
             for rows in self._states_in(part, span, gap, inner, before):
                 yield part.recording.id, rows

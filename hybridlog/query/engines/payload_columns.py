@@ -211,7 +211,7 @@ def _are_known(part: Part, fields: Collection[str] | None) -> bool:
     if types is None:
         return False
     predicate = part.predicate
-    if predicate is not None and (predicate.needs_index or any(map(is_meta, predicate.fields()))):
+    if predicate is not None and any(map(is_meta, predicate.fields())):
         return False
     return all(
         any(name == path or name.startswith((f"{path}.", f"{path}[")) for name in types)

@@ -38,10 +38,8 @@ class PayloadScan:
         self._session = session
         self._counters = counters
 
-    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
-        """By chunks, bytes and messages; None if only MongoDB understands the predicate."""
-        if part.needs_index:
-            return None
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float:
+        """By chunks, bytes and messages."""
         size = sum(stats.payload_bytes for stats in part.stats)
         encodings = {channel.channel.message_encoding for channel in part.channels}
         message_s = _ROW_S if encodings <= _BY_COLUMNS else _OBJECT_S

@@ -83,8 +83,6 @@ class TablesEngine:
         is_known = part.predicate is None and need not in {Need.OUTCOMES, Need.VALUES}
         if is_known or not part.is_by_log_time:
             return None  # known from the catalog and the chunk index
-        if part.needs_index:
-            return None
         asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
         if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
             return None  # the table does not say which messages have one

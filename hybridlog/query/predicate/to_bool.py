@@ -452,18 +452,28 @@ def _test_of(node: Condition) -> _Leaf:
     """The test of a condition; of a negated one, the test that must fail."""
     match node:
         case Compare(order="==" | "!=", value=value):
-            return partial(_is_one_of, (value,))
+            return partial(_is_one_of, frozenset(), (value,))
         case Compare(order=order, value=value):
             return partial(_is_ordered, order, value)
         case Member(values=values):
-            return partial(_is_one_of, values)
+            integers = frozenset(value for value in values if type(value) is int)
+            others = tuple(value for value in values if type(value) is not int)
+            return partial(_is_one_of, integers, others)
         case Match(pattern=pattern):
             return partial(_matches, compile_regex(pattern).search)
         case Exists():
             raise AssertionError(node)
 
 
-def _is_one_of(values: tuple[Value, ...], found: object, _element: bool) -> Truth:  # noqa: FBT001
+def _is_one_of(
+    integers: frozenset[int],
+    values: tuple[Value, ...],
+    found: object,
+    _element: bool,  # noqa: FBT001
+) -> Truth:
+    if type(found) is int and found in integers:
+        return True
+    values = values if type(found) is int else (*integers, *values)
     if isinstance(found, _Hidden):
         return None if any(map(found.may_equal, values)) else False
     if isinstance(found, str):

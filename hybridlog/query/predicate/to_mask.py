@@ -17,6 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.query.predicate.numbers import (
+    HIGH,
+    LOW,
     for_doubles,
     for_integers,
     is_nan,
@@ -493,6 +495,9 @@ def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) 
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> _Pair:
+    if len(values) > 1 and pa.types.is_int64(leaves.values.type) and _are_int64(values):
+        found = _numpy(pc.is_in(leaves.values, pa.array(values, pa.int64())))
+        return _Pair(found, found)
     found = np.zeros(len(leaves.values), np.bool_)
     for value in values:
         if value is not None:
@@ -501,6 +506,10 @@ def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> _Pair:
         return _Pair(found, found)
     possible = found | ~_valid(leaves.values)
     return _Pair(possible, possible if leaves.is_element else found)
+
+
+def _are_int64(values: Sequence[Value]) -> bool:
+    return all(type(value) is int and LOW <= value <= HIGH for value in values)
 
 
 def _matching(values: pa.Array, pattern: str) -> Mask:

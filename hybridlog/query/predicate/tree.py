@@ -235,9 +235,7 @@ class Predicate:
     @property
     def needs_index(self) -> bool:
         """True if messages alone cannot decide it, without MongoDB."""
-        names = [path.split(".") for path in self.fields() if is_meta(path)]
-        only_there = any(len(name) < 2 or name[1] in _ONLY_INDEXED for name in names)
-        return only_there or self.is_opaque
+        return needs_index(self.root)
 
 
 _ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
@@ -247,6 +245,19 @@ _ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
 def is_meta(path: str) -> bool:
     """True if a path leads into `_meta`, which hybridlog adds to a message."""
     return path == "_meta" or path.startswith("_meta.")
+
+
+def needs_index(node: Node) -> bool:
+    """True if only index documents can answer a part of a tree."""
+    return any(
+        isinstance(each, Opaque) or (isinstance(each, Condition) and _is_of_index(each.field))
+        for each in nodes(node)
+    )
+
+
+def _is_of_index(asked: Field) -> bool:
+    name = asked.path.split(".")
+    return name[0] == "_meta" and (len(name) < 2 or name[1] in _ONLY_INDEXED)
 
 
 def root_of(node: Predicate | Node) -> Node:

@@ -9,7 +9,6 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.regex import RegexError, compile_regex, is_literal
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.to_mask import to_mask
-from hybridlog.query.predicate.to_mongo import to_mongo
 
 JOINTS = "joint_{0}: pos=-1.503 vel=0.204 temp=9{0} state=ok;"
 
@@ -39,7 +38,6 @@ def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) ->
         mask = to_mask(predicate, None, pa.table({"s": lines}))
         assert mask is not None
         assert mask.tolist() == expected
-        assert not to_mongo(predicate, {"s": "string"}).is_exact
 
 
 @pytest.mark.parametrize(
@@ -60,7 +58,6 @@ def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) ->
 )
 def test_mongodb_matches_plain_text_only(pattern: str, *, is_exact: bool) -> None:
     assert is_literal(pattern) is is_exact
-    assert to_mongo(parse(f"s ~ '{pattern}'"), {"s": "string"}).is_exact is is_exact
 
 
 @pytest.mark.parametrize(

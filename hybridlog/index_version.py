@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 from hybridlog_storage.errors import IndexChangedError
 from hybridlog_storage.index_state import IndexState
@@ -21,11 +21,10 @@ if TYPE_CHECKING:
     from hybridlog_storage.index_state import Progressed
 
 _Filter = Mapping[str, object]
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
-class Belief:
+class IndexVersion:
     """State of the index at some time.
 
     Attributes:
@@ -38,7 +37,9 @@ class Belief:
     recordings: Mapping[str, Progressed | None]
 
     @classmethod
-    def of(cls, database: Database, keys: Collection[str], before: Belief | None) -> Belief:
+    def of(
+        cls, database: Database, keys: Collection[str], before: IndexVersion | None
+    ) -> IndexVersion:
         """The current state for some recordings, and for those in an earlier state."""
         state = IndexState(database)
         if before is not None and before.recordings.keys() >= set(keys):
@@ -64,10 +65,12 @@ class Belief:
         )
 
 
-class Believe(Protocol):
+class ReadVersion(Protocol):
     """Reads the state of the index of some recordings."""
 
-    def __call__(self, database: Database, keys: Collection[str], *, anew: bool = False) -> Belief:
+    def __call__(
+        self, database: Database, keys: Collection[str], *, anew: bool = False
+    ) -> IndexVersion:
         """Read it."""
 
 
@@ -79,7 +82,7 @@ class GuardedIndex:
     Args:
         database: The index.
         entries: The recordings.
-        believe: Reads the state of the index of recordings, given by key; with `anew`, from
+        read: Reads the state of the index of recordings, given by key; with `anew`, from
             the database.
         on_change: Called when another process has changed the index.
 
@@ -91,34 +94,22 @@ class GuardedIndex:
         self,
         database: Database,
         entries: Sequence[RecordingEntry],
-        believe: Believe,
+        read: ReadVersion,
         on_change: Callable[[], None],
     ) -> None:
         self.database = database
-        self._believe = believe
+        self._read = read
         self._on_change = on_change
         self._entries = entries
         self._keys = {entry.key for entry in entries}
-        self._belief = believe(database, self._keys)
-        self._refuse(self._belief)
-
-    def count(self, collection: str, asked: _Filter | None = None, *, by_key: bool = False) -> int:
-        """Number of documents that match."""
-        return self._once(lambda: self.database.count(collection, asked, by_key=by_key))
+        self._version = read(database, self._keys)
+        self._refuse(self._version)
 
     def count_each(self, questions: Sequence[tuple[str, _Filter]]) -> list[int]:
         """Numbers of documents that match each of many questions."""
-        return self._once(lambda: self.database.count_each(questions))
-
-    def count_by(
-        self, questions: Sequence[tuple[str, _Filter]], field: str
-    ) -> Mapping[object, int]:
-        """Numbers of documents that match any of many questions, by the value of a field."""
-        return self._once(lambda: self.database.count_by(questions, field))
-
-    def find_one(self, collection: str, *args: Any, **options: Any) -> dict[str, Any] | None:
-        """The first document; None if none matches."""
-        return self._once(lambda: self.database.find_one(collection, *args, **options))
+        found = self.database.count_each(questions)
+        self._check()
+        return found
 
     def find_raw(self, collection: str, *args: Any, **options: Any) -> Iterator[bytes]:
         """Documents as bytes, many in one item."""
@@ -129,11 +120,6 @@ class GuardedIndex:
     ) -> Iterator[bytes]:
         """Documents of many questions, one after the other, in the form of `find_raw`."""
         return self._each(self.database.find_each(collection, filters, projection))
-
-    def _once(self, ask: Callable[[], _T]) -> _T:
-        found = ask()
-        self._check()
-        return found
 
     def _each(self, found: Iterator[bytes]) -> Iterator[bytes]:
         """Verified items: each is yielded once the next item or the end has been received."""
@@ -153,13 +139,13 @@ class GuardedIndex:
         Raises:
             IndexChangedError: it may have changed; the store's knowledge of it is refreshed.
         """
-        if IndexState(self.database).turn() == self._belief.turn:
+        if IndexState(self.database).turn() == self._version.turn:
             return
-        before = self._belief
-        self._belief = self._believe(self.database, self._keys, anew=True)
-        self._refuse(self._belief)
+        before = self._version
+        self._version = self._read(self.database, self._keys, anew=True)
+        self._refuse(self._version)
         for entry in self._entries:
-            then, now = before.recordings[entry.key], self._belief.recordings[entry.key]
+            then, now = before.recordings[entry.key], self._version.recordings[entry.key]
             if then is not None and (now is None or now.turn != then.turn):
                 self._on_change()
                 raise IndexChangedError(
@@ -167,9 +153,9 @@ class GuardedIndex:
                     "while it was asked. Ask again."
                 )
 
-    def _refuse(self, belief: Belief) -> None:
+    def _refuse(self, version: IndexVersion) -> None:
         for entry in self._entries:
-            problem = belief.problem(entry)
+            problem = version.problem(entry)
             if problem is not None:
                 self._on_change()
                 raise IndexChangedError(problem)
