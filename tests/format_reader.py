@@ -371,9 +371,16 @@ class Segment:
         messages = list(records(content))
         *indexes, (_, opcode, arrivals) = records(trailer)
         demand(opcode == 0x90, "no arrival record")
-        (owner,) = struct.unpack_from("<Q", arrivals)
+        owner, size, *checksums, own = struct.unpack_from("<QQIIIII", arrivals)
         demand(owner == place.offset, "the arrival record of another chunk")
-        steps = struct.unpack(f"<{len(messages)}q", unpacked(arrivals[8:], 8 * len(messages)))
+        demand(zlib.crc32(arrivals[36:], zlib.crc32(arrivals[:32])) == own, "an arrival record")
+        proven = [self.data[owner - size : owner], record[: self._head(record)], record]
+        proven.append(trailer[: len(trailer) - len(arrivals) - 9] if is_indexed else b"")
+        demand(
+            all(zlib.crc32(d) == crc for d, crc in zip(proven, checksums, strict=True) if d),
+            "the checksums of an arrival record",
+        )
+        steps = struct.unpack(f"<{len(messages)}q", unpacked(arrivals[36:], 8 * len(messages)))
         seq = 0
         heads = []
         for step, (at, opcode, message) in zip(steps, messages, strict=True):
@@ -391,6 +398,13 @@ class Segment:
             listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
             demand(sorted(heads) == sorted(listed), "the message indexes")
         self._compare(number, messages)
+
+    @staticmethod
+    def _head(record: bytes) -> int:
+        if record[0] == 0x93:
+            return len(record)
+        body = Content(record[37:])
+        return 37 + 4 + len(body.text()) + 8
 
     def _moved(self, number: int, body: Content, place: Chunk) -> bytes:
         times = body.take("<Q"), body.take("<Q")
@@ -500,7 +514,7 @@ class Recording:
 
     def _is_believed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
         about = segment.about
-        if about["format"] != 2 or (about["id"], about["segment"]) != (self.id, number):
+        if about["format"] != 3 or (about["id"], about["segment"]) != (self.id, number):
             return False
         if listed is None:
             return True
@@ -658,7 +672,7 @@ class FormatReader:
     def __init__(self, store: Path) -> None:
         self.store = store
         settings = tomllib.loads((store / "hybridlog.toml").read_text())
-        demand(settings["format"] == 2, "another format")
+        demand(settings["format"] == 3, "another format")
         demand(not settings.get("requires", []), "a feature that is unknown")
         self.store_id: str = settings["store_id"]
 

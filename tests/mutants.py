@@ -486,7 +486,7 @@ FORMAT_2 = [
         "storage/hybridlog_storage/segment_reader.py",
         (
             "stored-bytes-are-believed",
-            "            if place.crc not in {None, crc32(record)}:\n",
+            "            if crc32(record) != place.crc:\n",
             "            if False:\n",
             SEGMENTS,
         ),
@@ -780,15 +780,21 @@ SILENT = [
             OPEN,
         ),
         (
-            "indexes-that-contradict-their-chunk-are-believed",
-            '    if (int(parts["first"].min()), int(parts["last"].max())) != span:\n        return None\n',
-            "",
+            "flushed-indexes-are-believed",
+            "        if crc32(trailer) == trailer_crc:\n",
+            "        if True:\n",
             OPEN,
         ),
         (
             "unreadable-flushed-chunks-are-no-damage",
-            "                self.damaged.append(Damage(offset, length, str(error)))\n",
-            "",
+            "            self.damaged.append(Damage(offset, length, str(error)))\n",
+            "            pass\n",
+            OPEN,
+        ),
+        (
+            "flushed-definitions-are-believed",
+            "            if start < 0 or self.reader.checksum(start, proof.length) != proof.before:\n",
+            "            if start < 0:\n",
             OPEN,
         ),
         (

@@ -16,6 +16,7 @@ import sys
 import termios
 import threading
 import typing
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ from hybridlog_storage import errors
 from hybridlog_storage.errors import HybridlogError
 from tests.format_reader import (
     Content,
+    Damaged,
     FormatReader,
     Recording,
     Told,
@@ -940,6 +942,57 @@ def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path
     assert message.seq == seqs[-1]
 
 
+def test_what_is_reserved_is_ignored_or_refused(recorded: hl.Store, tmp_path: Path) -> None:
+    robot = copied(recorded, tmp_path / "store") / "robot"
+    before = FormatReader(tmp_path / "store").recording("robot")
+    assert before.journal is not None
+    with hl.open(tmp_path / "store") as store:
+        marked = store.mark("robot", "+2s", "bump", {"how": "hard"})
+    *lines, line = (robot / "journal").read_bytes().splitlines()
+    last = json.loads(line[9:])
+    assert last["event"] in {"marked", "sealed"}
+    lines += [line]
+    for number, one in enumerate(lines):
+        value = json.loads(one[9:])
+        if value["event"] == "marked":
+            value["end"] = value["time"] + 10**9
+            lines[number] = journal_line(value)
+    lines += [
+        journal_line({"event": "pinned", "at": 1, "id": "a", "from": 0, "topics": ["/tf"]}),
+        journal_line({"event": "unpinned", "at": 2, "id": "a"}),
+        journal_line({"event": "expired", "at": 3, "segments": [], "files": []}),
+        journal_line({"event": "signature", "at": 4}),
+    ]
+    (robot / "journal").write_bytes(b"\n".join(lines) + b"\n")
+    named = robot.with_name(before.id)
+    robot.rename(named)
+    second = FormatReader(tmp_path / "store").recording(before.id)
+    assert second.journal is not None
+    assert second.journal.is_proof
+    with hl.open(tmp_path / "store") as store:
+        (entry,) = store.select([before.id])
+        assert (entry.label, entry.status) == (before.id, second.status)
+        marks = [{k: m[k] for k in entry.marks[0]} for m in second.journal.marks]
+        assert marks == list(entry.marks) == list(marked.marks)
+        assert entry.messages == sum(1 for _ in second.messages())
+    settings = tmp_path / "store" / "hybridlog.toml"
+    text = settings.read_text()
+    for feature in ("expired", "journal-pieces"):
+        settings.write_text(text + f'requires = ["{feature}"]\n')
+        with pytest.raises(HybridlogError, match=f"requires '{feature}'"):
+            hl.open(tmp_path / "store")
+        with pytest.raises(Damaged, match="a feature"):
+            FormatReader(tmp_path / "store")
+    settings.write_text(text.replace("format = 3", "format = 2"))
+    with pytest.raises(HybridlogError, match="of format 2, which was never released: record"):
+        hl.open(tmp_path / "store")
+
+
+def journal_line(value: Mapping[str, Any]) -> bytes:
+    text = json.dumps(value).encode()
+    return b"%08x %s" % (zlib.crc32(text), text)
+
+
 def test_the_index_is_as_specified(recorded: hl.Store) -> None:
     from urllib.parse import quote
 
@@ -1067,7 +1120,7 @@ def test_the_specification_names_what_there_is() -> None:
     for name in ("ARRIVAL_OPCODE", "PADDING_OPCODE", "CHUNK_TABLE_OPCODE"):
         assert f"opcode, {getattr(segment_format, name):#x}" in text
     assert FORMAT == segment_format.FORMAT_VERSION
-    assert f"Format {FORMAT}, which is final:" in text
+    assert f"Format {FORMAT}. No version of hybridlog has been released yet" in text
     assert f"up to {ARRAY_LIMIT} elements" in text
     for thing in (ChannelStats, RecordingEntry, StoreSettings):
         in_files = {f.name for f in fields(thing)} - {"flushed"}

@@ -313,8 +313,8 @@ class ChunkEntry:
         offset: Byte of the chunk record in the file.
         length: Bytes of the chunk record.
         trailer: Bytes of message indexes and arrival numbers behind it.
-        crc: CRC-32 of the stored chunk record; None while the segment is open.
-        trailer_crc: CRC-32 of the trailer; None if unknown.
+        crc: CRC-32 of the stored chunk record.
+        trailer_crc: CRC-32 of the trailer.
         first: Least log time, ns.
         last: Greatest log time, ns.
         stats: By channel id.
@@ -326,8 +326,8 @@ class ChunkEntry:
     offset: int
     length: int
     trailer: int
-    crc: int | None
-    trailer_crc: int | None
+    crc: int
+    trailer_crc: int
     first: int
     last: int
     stats: Mapping[int, ChannelStats]
@@ -1123,7 +1123,7 @@ def chunk_entries(
                 int(chunk["offset"]),
                 int(chunk["length"]),
                 int(chunk["trailer"]),
-                None if table.is_flushed else int(chunk["crc"]),
+                int(chunk["crc"]),
                 int(chunk["trailer_crc"]),
                 int(chunk["first"]),
                 int(chunk["last"]),

@@ -36,6 +36,7 @@ class PackedChunk:
         compression: MCAP name of the codec.
         head: The chunk record up to the compressed content.
         data: The compressed content.
+        head_crc: CRC-32 of the head.
         crc: CRC-32 of head and data.
         indexes: Message index record of each channel, by channel id.
         indexes_crc: CRC-32 of all of them, concatenated.
@@ -51,6 +52,7 @@ class PackedChunk:
     compression: str
     head: bytes
     data: Buffer
+    head_crc: int
     crc: int
     indexes: dict[int, bytes]
     indexes_crc: int
@@ -79,10 +81,10 @@ def pack(
         compression=compression,
         compressed_size=len(data),
     )
+    head_crc, content = crc32(head), content_crc
     if compression:
-        crc = crc32(data, crc32(head))
-    else:
-        crc = crc32_combine(crc32(head), content_crc, len(data))
+        content = crc32(data)
+    crc = crc32_combine(head_crc, content, len(data))
     starts = batch.offset - MESSAGE_HEAD.itemsize
     indexes = message_indexes(batch.channel, batch.log_time, starts, order)
     indexes_crc = 0
@@ -97,6 +99,7 @@ def pack(
         compression=compression,
         head=head,
         data=data,
+        head_crc=head_crc,
         crc=crc,
         indexes=indexes,
         indexes_crc=indexes_crc,

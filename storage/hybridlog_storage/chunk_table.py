@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog_storage.checksum import crc32
+from hybridlog_storage.checksum import crc32, crc32_combine
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.runs import run_starts
@@ -78,8 +78,8 @@ class ChunkTable:
         chunks: `CHUNK`[n], in file order; the row is the chunk's number.
         parts: `PART`[m], chunk by chunk, by channel id within one.
         others: `OTHER`[k], in file order.
-        is_flushed: The segment is not sealed yet: CRC-32 of chunks are 0, publish times are
-            unknown, and the table covers chunks and indexed records only.
+        is_flushed: The segment is not sealed yet: publish times are unknown, and the table covers
+            chunks and indexed records only.
     """
 
     chunks: NDArray[np.void]
@@ -257,6 +257,8 @@ class TableBuilder:
         """Rows of parts so far."""
         self.end = 0
         """Byte up to which the file is covered."""
+        self.unproven = 0, 0
+        """Bytes since the last arrival record, which the next one proves; their CRC-32."""
         self._chunks = bytearray()
         self._parts = bytearray()
         self._others = bytearray()
@@ -294,6 +296,7 @@ class TableBuilder:
         self._parts += parts.tobytes()
         self.chunks += 1
         self.parts += len(parts)
+        self.unproven = 0, 0
         self.end = offset + length + trailer
 
     def other(self, content: Buffer, *, alone: bool = False) -> None:
@@ -318,7 +321,14 @@ class TableBuilder:
             self._last = last
             self._finish_stretch()
             self._last = self.end, len(content), crc32(content)
+        size, crc = self.unproven
+        self.unproven = size + len(content), crc32(content, crc)
         self.end += len(content)
+
+    def proof(self, record: Buffer) -> None:
+        """Add an arrival record that follows no chunk."""
+        self.other(record)
+        self.unproven = 0, 0
 
     def stretch(self, length: int, crc: int) -> None:
         """Add bytes outside of chunks, in a row of their own.
@@ -330,16 +340,18 @@ class TableBuilder:
         self._finish_stretch()
         if length:
             self._others += _OTHER_ROW.pack(self.end, length, crc)
+            size, before = self.unproven
+            self.unproven = size + length, crc32_combine(before, crc, length)
             self.end += length
 
     def build(self, record: Buffer = b"") -> ChunkTable:
         """The table of all added pieces, and of a record that is about to follow."""
-        before = self.end, self._last, len(self._others)
+        before = self.end, self._last, self.unproven, len(self._others)
         self.other(record)
         others = bytes(self._others)
         if self._last is not None:
             others += _OTHER_ROW.pack(*self._last)
-        self.end, self._last, length = before
+        self.end, self._last, self.unproven, length = before
         del self._others[length:]
         return ChunkTable(
             np.frombuffer(bytes(self._chunks), CHUNK),

@@ -45,7 +45,7 @@ ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
 COMPACTED: Final = "compacted"
-RESERVED: Final = ("expired", "signature")
+RESERVED: Final = ("pinned", "unpinned", "expired", "signature")
 """Events of later versions; this version preserves and ignores them."""
 
 Event = Mapping[str, Any]

@@ -1,8 +1,9 @@
 """Reads a segment while another process writes it.
 
-Its chunks follow one another, each with its message indexes and arrival numbers behind it. A
-chunk counts once its arrival numbers are in the file; what the writer has not finished yet is
-left out. The chunks become rows of a `ChunkTable`, as those of a sealed segment are.
+Its chunks follow one another, each with its message indexes and its arrival record behind it. A
+chunk counts once its arrival record is in the file, and other records once an arrival record
+proves them; what the writer has not finished yet is left out. The chunks become rows of a
+`ChunkTable`, as those of a sealed segment are.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable, parts_of
 from hybridlog_storage.compression import FilePart
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, Record, read_record
+from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, read_record
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segment_format import (
@@ -35,10 +36,14 @@ from hybridlog_storage.segment_format import (
     MAGIC,
     OUR_NAMES,
     PADDING_OPCODE,
+    PROOF,
+    Proof,
     channel_of,
     compression_of,
+    head_length,
     index_order,
     json_of,
+    proof_of,
     split_trailer,
 )
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader, loss_rows
@@ -52,11 +57,13 @@ _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 _MAX_TORN: Final = 1 << 20  # bytes looked at of a record that is not whole
 _WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
+_ARRIVALS_SIZE: Final = 96 + PROOF.size  # bytes of an arrival record without its numbers, at most
 _CHUNK_HEAD_SIZE: Final = CHUNK_HEAD.size + 16  # with the longest name of a compression
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 _TORN: Final = frozenset(
     {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT}
 )
+_HELD: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT})
 _PASSED: Final = frozenset({Opcode.HEADER, Opcode.METADATA_INDEX, PADDING_OPCODE})
 
 
@@ -129,16 +136,17 @@ class OpenSegment:
         self._chunk: tuple[int, int] | None = None  # offset and length of the last chunk record
         self._chunks: list[tuple[int, ...]] = []
         self._head = self._last = b""  # heads of the last chunk record and of the last of them
-        self._parts: list[NDArray[np.void]] = []
+        self._parts_so_far: list[NDArray[np.void]] = []
         self._others: list[tuple[int, int, int]] = []
+        self._unproven: list[tuple[int, int, int]] = []  # opcode, start and length of records
         self._flushed: Flushed | None = None
 
     @property
     def flushed(self) -> Flushed:
         """What it has so far."""
         if self._flushed is None:
-            parts = np.concatenate([np.empty(0, PART), *self._parts])
-            self._parts = [parts]
+            parts = np.concatenate([np.empty(0, PART), *self._parts_so_far])
+            self._parts_so_far = [parts]
             chunks, others = np.array(self._chunks, CHUNK), np.array(self._others, OTHER)
             table = ChunkTable(chunks, parts, others, is_flushed=True)
             self._flushed = Flushed(table, tuple(self._attachments), tuple(self._metadata))
@@ -226,9 +234,10 @@ class OpenSegment:
         return opcode in _TORN and is_possible and not is_whole
 
     def _may_be_arrivals(self, at: int, length: int) -> bool:
-        """True if a record of arrival numbers is not longer than message indexes allow."""
+        """True if an arrival record is not longer than message indexes allow."""
         assert self._chunk is not None
-        return length < 96 + (at - sum(self._chunk)) // 2  # they take half for each message
+        indexes = at - sum(self._chunk)  # they have twice as many bytes for each message
+        return length < _ARRIVALS_SIZE + indexes // 2
 
     def _check(self, opcode: int, at: int, length: int) -> None:
         """Check that a record fits what comes before it, and its own fields.
@@ -253,74 +262,112 @@ class OpenSegment:
             self._chunk = at, length
         elif opcode == Opcode.MESSAGE_INDEX and self._chunk is not None:
             pass  # read with the arrival numbers
+        elif opcode == ARRIVAL_OPCODE and length > _MAX_RECORD:
+            raise SegmentError("the arrival record is too large")
         elif opcode == ARRIVAL_OPCODE and self._chunk is not None:
             (offset, size), self._chunk = self._chunk, None
-            self._add_chunk(offset, size, at + length - offset - size)
-        elif opcode == Opcode.ATTACHMENT:
-            self._add_attachment(at, length)
-        elif length > _MAX_RECORD:
-            raise SegmentError("the record is too large")
-        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            record = self._record(opcode, at, length)
-            if isinstance(record, SchemaRecord):
-                self._schemas[record.id] = record
-            elif isinstance(record, ChannelRecord):
-                self.channels[record.id] = channel_of(record, self._schemas)
-        elif opcode == Opcode.METADATA:
-            self._add_metadata(at, length)
+            self._add_chunk(offset, size, at, length)
+        elif opcode == ARRIVAL_OPCODE:
+            self._prove(proof_of(self._content(at, length)), at)
+        elif opcode in _HELD:
+            self._unproven.append((opcode, at, length))
         else:
             return opcode in _PASSED
         return True
 
-    def _record(self, opcode: int, at: int, length: int) -> Record | None:
+    def _prove(self, proof: Proof, end: int) -> None:
+        """Compare the bytes before a chunk or an arrival record, and take the records in them."""
+        start = end - proof.length
+        records, self._unproven = self._unproven, []
+        try:
+            if start < 0 or self.reader.checksum(start, proof.length) != proof.before:
+                raise SegmentError("definitions or metadata changed: their checksum differs")
+        except SegmentError as error:
+            self.damaged.append(Damage(max(start, 0), end - max(start, 0), str(error)))
+            return
+        for opcode, at, length in records:
+            if at >= start:
+                try:
+                    self._take_record(opcode, at, length)
+                except SegmentError as error:
+                    self.damaged.append(Damage(at, length, str(error)))
+
+    def _take_record(self, opcode: int, at: int, length: int) -> None:
+        if opcode == Opcode.ATTACHMENT:
+            self._add_attachment(at, length)
+            return
+        if length > _MAX_RECORD:
+            raise SegmentError("the record is too large")
         record, size = read_record(opcode, self._content(at, length))
         if size != length - RECORD_HEAD.size:
             raise SegmentError("the record is longer than its fields")
-        return record
+        if isinstance(record, SchemaRecord):
+            self._schemas[record.id] = record
+        elif isinstance(record, ChannelRecord):
+            self.channels[record.id] = channel_of(record, self._schemas)
+        elif isinstance(record, Metadata):
+            self._add_metadata(record, at, length)
 
     def _content(self, at: int, length: int) -> memoryview:
         return self.reader.read(at + RECORD_HEAD.size, length - RECORD_HEAD.size)
 
-    def _add_chunk(self, offset: int, length: int, trailer: int) -> None:
-        """Add a chunk, by its message indexes; if they are damaged, by its messages."""
-        if trailer > _MAX_RECORD:
-            raise SegmentError("the message indexes are too large")
-        head = CHUNK_HEAD.unpack_from(self._head)
-        behind = self.reader.read(offset + length, trailer)
-        if not any(behind[-4:]):  # the checksum of the arrival numbers
-            raise SegmentError("the arrival numbers are too long")
-        first, last, size = int(head[2]), int(head[3]), int(head[4])
-        parts = _parts_by_index(behind, (first, last), size)
-        if parts is None:
-            place = ChunkPlace(
-                number=len(self._chunks),
-                offset=offset,
-                length=length,
-                trailer=trailer,
-                first=first,
-                last=last,
-                channels=(),
-            )
-            try:
-                batch = self.reader.read_chunk(place).batch
-                order = index_order(batch.channel, batch.log_time)
-                parts, first, last = parts_of(batch, order)
-            except SegmentError as error:
-                self.damaged.append(Damage(offset, length, str(error)))
-                parts, first, last = np.empty(0, PART), 0, 0
+    def _add_chunk(self, offset: int, length: int, arrivals: int, size: int) -> None:
+        """Add a chunk; without messages, if its head or its arrival record is damaged.
+
+        Args:
+            offset: Byte of the chunk record.
+            length: Its bytes.
+            arrivals: Byte of the arrival record behind its message indexes.
+            size: Bytes of the arrival record.
+        """
+        trailer = arrivals + size - offset - length
+        parts, crc, trailer_crc = np.empty(0, PART), 0, 0
+        try:
+            if trailer > _MAX_RECORD:
+                raise SegmentError("the message indexes are too large")
+            behind = self.reader.read(offset + length, trailer)
+            proof = proof_of(behind[trailer - size + RECORD_HEAD.size :])
+            if proof.chunk != offset:
+                raise SegmentError("its arrival record belongs to another chunk")
+            self._prove(proof, offset)
+            if crc32(self._head[: head_length(self._head)]) != proof.head:
+                raise SegmentError("its head changed: its checksum differs")
+            crc, trailer_crc = proof.record, crc32(behind[trailer - size :], proof.indexes)
+            parts = self._parts(offset, length, behind, crc, trailer_crc)
+        except SegmentError as error:
+            self.damaged.append(Damage(offset, length, str(error)))
         is_known = np.isin(parts["channel"], list(self.channels))
         if not is_known.all():
             parts = parts[is_known]
             self.damaged.append(Damage(offset, length, "a channel is not defined"))
-        row = (offset, length, trailer, 0, crc32(behind), first, last, len(parts))
+        first, last = (parts["first"].min(), parts["last"].max()) if len(parts) else (0, 0)
+        row = (offset, length, trailer, crc, trailer_crc, first, last, len(parts))
         self._chunks.append(row)
-        self._parts.append(parts)
+        self._parts_so_far.append(parts)
         self._last = self._head[: CHUNK_HEAD.size]
         self._flushed = None
 
-    def _add_metadata(self, at: int, length: int) -> None:
-        record = self._record(Opcode.METADATA, at, length)
-        assert isinstance(record, Metadata)
+    def _parts(
+        self, offset: int, length: int, trailer: memoryview, crc: int, trailer_crc: int
+    ) -> NDArray[np.void]:
+        """Statistics of each channel in a chunk; by its messages if its indexes are damaged."""
+        if crc32(trailer) == trailer_crc:
+            return _parts_by_index(trailer, CHUNK_HEAD.unpack_from(self._head)[4])
+        place = ChunkPlace(
+            number=len(self._chunks),
+            offset=offset,
+            length=length,
+            trailer=len(trailer),
+            first=0,
+            last=0,
+            channels=(),
+            crc=crc,
+            trailer_crc=trailer_crc,
+        )
+        batch = self.reader.read_chunk(place).batch
+        return parts_of(batch, index_order(batch.channel, batch.log_time))[0]
+
+    def _add_metadata(self, record: Metadata, at: int, length: int) -> None:
         if record.name == LOSSES_METADATA:
             self.losses += loss_rows(json_of(record))
         elif not record.name.startswith(OUR_NAMES):
@@ -331,7 +378,7 @@ class OpenSegment:
         head = self._content(at, min(length, MAX_HEAD))
         start, size = at + RECORD_HEAD.size, length - RECORD_HEAD.size
         with self.reader.stream() as file:
-            found, _ = parse_attachment(head, FilePart(file, start, size))
+            found, _ = parse_attachment(head, FilePart(file, start, size), check_crc=False)
         self._attachments.append(found.index(at, length))
         self._add_other(at, length)
 
@@ -340,49 +387,34 @@ class OpenSegment:
         self._flushed = None
 
 
-def _parts_by_index(
-    trailer: memoryview, span: tuple[int, int], size: int
-) -> NDArray[np.void] | None:
-    """Statistics of each channel in a chunk, from its message indexes.
+def _parts_by_index(trailer: memoryview, size: int) -> NDArray[np.void]:
+    """Statistics of each channel in a chunk, from its checked message indexes.
 
     Args:
-        trailer: The message indexes and the arrival numbers.
-        span: First and last log time, ns, by the head of the chunk.
+        trailer: The message indexes and the arrival record.
         size: Bytes of its content.
 
     Returns:
-        `PART`[c], by channel id; None if the indexes contradict the head.
+        `PART`[c], by channel id.
     """
-    try:
-        indexes, _ = split_trailer(trailer)
-    except SegmentError:
-        return None
-    if not indexes or not all(len(rows) for _, rows in indexes):
-        return None
+    indexes, _ = split_trailer(trailer)
     times = [rows["log_time"].astype(np.int64) for _, rows in indexes]
     starts = np.concatenate([rows["offset"] for _, rows in indexes]).astype(np.int64)
     counts = np.array([len(rows) for _, rows in indexes])
     order = np.argsort(starts, kind="stable")
     sizes = np.empty(len(starts), np.int64)
-    sizes[order] = np.diff(starts[order], append=min(size, 1 << 62)) - MESSAGE_HEAD.itemsize
-    channels = [channel for channel, _ in indexes]
-    is_whole = starts[order[0]] == 0 and (sizes >= 0).all() and channels == sorted(set(channels))
-    if not is_whole or not all((t[1:] >= t[:-1]).all() for t in times):
-        return None
+    sizes[order] = np.diff(starts[order], append=size) - MESSAGE_HEAD.itemsize
     parts = np.empty(len(indexes), PART)
-    parts["channel"], parts["messages"] = channels, counts
+    parts["channel"], parts["messages"] = [channel for channel, _ in indexes], counts
     parts["payload_bytes"] = np.add.reduceat(sizes, np.cumsum(counts) - counts)
     parts["first"], parts["last"] = [t[0] for t in times], [t[-1] for t in times]
     parts["first_publish"], parts["last_publish"] = _UNKNOWN.min, _UNKNOWN.max
-    if (int(parts["first"].min()), int(parts["last"].max())) != span:
-        return None
     return parts
 
 
 def _chunk_length(head: Buffer) -> int:
     """Bytes of a chunk record, by the length of its content; -1 if the head is damaged."""
     try:
-        name, packed = compression_of(head)
+        return head_length(head) + compression_of(head)[1]
     except struct.error:
         return -1
-    return CHUNK_HEAD.size + 12 + len(name) + packed

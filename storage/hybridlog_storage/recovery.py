@@ -1,8 +1,9 @@
 """Recovers and seals segments that a crash left open.
 
-Such a segment may end in the middle of a record. Recovery cuts the file behind its last
-whole record, rebuilds missing indexes of the last chunk from its content, and seals the
-segment. A complete segment without its final name only gets that name.
+Such a segment may end in the middle of a record. Recovery cuts the file behind the last
+arrival record, which proves what stands before it. It rebuilds missing indexes of the last
+chunk from its content, and seals the segment. A complete segment without its final name only
+gets that name.
 """
 
 from __future__ import annotations
@@ -46,19 +47,21 @@ from hybridlog_storage.segment_file import (
     sealed_name,
 )
 from hybridlog_storage.segment_format import (
-    ARRIVAL_HEAD,
     ARRIVAL_OPCODE,
     END_METADATA,
     LOSSES_METADATA,
     MAGIC,
+    PROOF,
     RECORDING_METADATA,
     ChunkSummary,
+    Proof,
     arrival_record,
     channel_of,
     index_order,
     json_metadata,
     json_of,
     pack_arrivals,
+    proof_of,
 )
 from hybridlog_storage.segment_reader import (
     SegmentReader,
@@ -146,6 +149,9 @@ class _Rebuilder:
         self._next_seq = 0
         self._torn: _Whole | None = None  # the last chunk, while only its trailer may be incomplete
         self._why_torn = ""
+        self._last_chunk = 0  # its start
+        self._unproven: list[tuple[int, Item, int]] = []  # start and end of records
+        self._proven = 0  # byte up to which records outside of chunks were checked
         self._fd = fd
         self._size = segment.position
         self._schemas: dict[int, SchemaRecord] = {}
@@ -164,7 +170,10 @@ class _Rebuilder:
 
     def take(self, offset: int, item: Item) -> None:
         """Process the next item of a scan."""
-        if offset < self.segment.table.end:
+        behind = offset + 1
+        if isinstance(item, ScanDamage):
+            behind = self._size if item.length is None else offset + item.length
+        if behind <= self.segment.table.end:
             return  # it lies in the trailer of a chunk, which was checked as a whole
         if isinstance(item, ScanDamage):
             self._damage.append(f"byte {item.offset}: {item.reason}")
@@ -172,23 +181,64 @@ class _Rebuilder:
             self._forget_torn()
             self.is_empty = False
             self.good_end = offset + item.length
+            self._last_chunk = offset
             self._take_chunk(item)
         elif isinstance(item, _RECORDS):
             end = _record_end(self._fd, offset)
-            if self._torn is None or not _is_of_chunk(item):
-                self._forget_torn()
-                try:
-                    self._take_record(offset, item, end)
-                except _DamagedError as error:
-                    self._damage.append(f"byte {offset}: {error}")
-                    return
-            self.good_end = end
+            if self._torn is not None and _is_of_chunk(item):
+                self.good_end = end
+                return
+            self._forget_torn()
+            if isinstance(item, PrivateRecord) and item.opcode == ARRIVAL_OPCODE:
+                self._take_proof(offset, end)
+            else:
+                self._unproven.append((offset, item, end))
+
+    def _take_proof(self, offset: int, end: int) -> None:
+        """Take an arrival record that follows no listed chunk."""
+        self.good_end = end
+        try:
+            proof = proof_of(os.pread(self._fd, end - offset, offset)[RECORD_HEAD.size :])
+        except SegmentError as error:
+            self._damage.append(f"byte {offset}: {error}")
+            return
+        if proof.chunk not in {0, self._last_chunk}:
+            self._damage.append(f"chunk at byte {proof.chunk}: its head is damaged")
+        self._prove(proof, proof.chunk or offset)
+        if not proof.chunk:
+            self._cover(offset)
+            self.segment.table.proof(os.pread(self._fd, end - offset, offset))
+
+    def _prove(self, proof: Proof, end: int) -> None:
+        """Check the bytes before a chunk or an arrival record, and take the records in them."""
+        start = end - proof.length
+        if end <= self._proven:
+            return  # the chunk was taken, and not listed
+        self._proven = end
+        if start >= 0 and _crc_of(self._fd, start, proof.length) == proof.before:
+            self._take_records(start)
+            return
+        self._unproven = []
+        self._damage.append(f"byte {start}: {proof.length} bytes before byte {end} changed")
+
+    def _take_records(self, start: int = 0) -> None:
+        """Take the records since a byte; those before it cannot be checked."""
+        records, self._unproven = self._unproven, []
+        for offset, item, end in records:
+            try:
+                if offset < start and not _is_of_chunk(item):
+                    raise _DamagedError("its checksum is lost")
+                self._take_record(offset, item, end)
+            except _DamagedError as error:
+                self._damage.append(f"byte {offset}: {error}")
 
     def _forget_torn(self) -> None:
         """Drop a chunk without arrival numbers that is followed by a whole record."""
         if self._torn is not None:
-            self._damage.append(f"{self._torn.place}: {self._why_torn}")
+            reason = self._why_torn or "its arrival numbers are missing"
+            self._damage.append(f"{self._torn.place}: {reason}")
             self._torn = None
+            self._take_records()
 
     def _take_record(self, offset: int, item: Item, end: int) -> None:
         length = end - offset
@@ -248,13 +298,50 @@ class _Rebuilder:
         try:
             seq = check_arrivals(indexes + trailer[len(indexes) :], item.offset, len(chunk.batch))
         except SegmentError as error:
-            self._torn, self._why_torn = chunk, str(error)
+            self._torn, self._why_torn = chunk, str(error) if trailer else ""
+            return
+        proof: Proof | None = None
+        try:
+            proof = proof_of(trailer[len(indexes) + RECORD_HEAD.size :])
+            self._prove(proof, item.offset)
+        except SegmentError:  # it is mended below
+            self._take_records()
+        if not self._is_defined(chunk):
             return
         self._mend_head(chunk)
         if trailer[: len(indexes)] != indexes:
             self._damage.append(f"{chunk.place}: its message indexes were damaged, and are mended")
             self.segment.rewrite(chunk.end, indexes)
+        record = trailer[len(indexes) :]
+        right = self._arrivals(chunk, record[RECORD_HEAD.size + PROOF.size :], proof)
+        if right != record:
+            self._damage.append(f"{chunk.place}: its checksums were damaged, and are mended")
+            self.segment.rewrite(chunk.end + len(indexes), right)
         self._note(chunk, len(trailer), int(seq.max()))
+
+    def _is_defined(self, chunk: _Whole) -> bool:
+        lost = set(chunk.batch.channel.tolist()) - self.segment.channels.keys()
+        if lost:
+            self._damage.append(f"{chunk.place}: the definition of its channel {min(lost)} is lost")
+        return not lost
+
+    def _arrivals(self, chunk: _Whole, packed: bytes, proof: Proof | None = None) -> bytes:
+        """The arrival record of a chunk whose head is right.
+
+        Args:
+            chunk: The chunk.
+            packed: Its arrival numbers.
+            proof: What its arrival record says of the bytes before it; None if it is damaged.
+        """
+        offset, length = chunk.scanned.offset, chunk.scanned.length
+        self._cover(offset)
+        proof = proof or Proof(offset, *self.segment.table.unproven)
+        right = proof._replace(
+            head=crc32(chunk.head),
+            record=_crc_of(self._fd, offset, length),
+            indexes=crc32(b"".join(chunk.indexes.values())),
+        )
+        return arrival_record(right, packed)
 
     def _whole(self, item: ScannedChunk) -> _Whole:
         content = item.content_bytes(check_crc=False)
@@ -263,9 +350,6 @@ class _Rebuilder:
         batch = parse_content(content).batch
         if not len(batch):
             raise SegmentError("it holds no message")
-        lost = set(batch.channel.tolist()) - self.segment.channels.keys()
-        if lost:
-            raise SegmentError(f"the definition of its channel {min(lost)} is lost")
         head = right_head(
             batch, len(content), item.uncompressed_crc, item.compression, len(item.part)
         )
@@ -280,8 +364,8 @@ class _Rebuilder:
 
     def _trailer(self, start: int, indexes: int) -> bytes:
         """Bytes at the position of a chunk's trailer; empty if it cannot be complete."""
-        head = os.pread(self._fd, ARRIVAL_HEAD.size, start + indexes)
-        if len(head) < ARRIVAL_HEAD.size:
+        head = os.pread(self._fd, RECORD_HEAD.size, start + indexes)
+        if len(head) < RECORD_HEAD.size:
             return b""
         opcode, length = RECORD_HEAD.unpack_from(head)
         size = indexes + RECORD_HEAD.size + length
@@ -292,16 +376,20 @@ class _Rebuilder:
     def finish(self) -> None:
         """Cut incomplete records; rebuild the last chunk's trailer if only that is incomplete."""
         chunk, self._torn = self._torn, None
-        if chunk is None:
+        if chunk is not None:
+            if self._why_torn:
+                self._damage.append(f"{chunk.place}: {self._why_torn}, and are made anew")
+            self._take_records()
+        if chunk is None or not self._is_defined(chunk):
             self.segment.cut(self.good_end)
             self._cover(self.good_end)
             return
         count = len(chunk.batch)
         seq = np.arange(self._next_seq, self._next_seq + count, dtype=np.int64)
-        arrivals = arrival_record(chunk.scanned.offset, pack_arrivals(seq))
-        trailer = b"".join((*chunk.indexes.values(), arrivals))
         self.segment.cut(chunk.end)
         self._mend_head(chunk)
+        arrivals = self._arrivals(chunk, pack_arrivals(seq))
+        trailer = b"".join((*chunk.indexes.values(), arrivals))
         self.segment.append_trailer(trailer)
         self._note(chunk, len(trailer), int(seq.max()))
 

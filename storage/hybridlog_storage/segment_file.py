@@ -39,14 +39,18 @@ from hybridlog_storage.segment_format import (
     MAGIC,
     MOVED_OPCODE,
     PROFILE,
+    PROOF,
     RECORDING_METADATA,
     ChunkSummary,
+    Proof,
     arrival_record,
     channel_record,
     chunk_index_record,
     compression_of,
+    head_length,
     json_metadata,
     padding_record,
+    proof_of,
     record_bytes,
     schema_record,
     split_trailer,
@@ -242,8 +246,11 @@ class SegmentFile:
         """Append a metadata record."""
         data = record_bytes(record)
         offset = self.position
-        self._append([data])
+        size, crc = self.table.unproven
+        proof = arrival_record(Proof(0, size + len(data), crc32(data, crc)))
+        self._append([data, proof])
         self.table.other(data, alone=True)
+        self.table.proof(proof)
         self.note_metadata(record.name, offset, len(data))
 
     def note_metadata(self, name: str, offset: int, length: int) -> None:
@@ -260,6 +267,15 @@ class SegmentFile:
         length = self.position - offset
         self.table.stretch(length, crc)
         self.note_attachment(attachment, offset, length)
+        self._prove()
+
+    def _prove(self) -> None:
+        """Append checksums of the records since the last chunk."""
+        size, crc = self.table.unproven
+        if size:
+            proof = arrival_record(Proof(0, size, crc))
+            self._append([proof])
+            self.table.proof(proof)
 
     def note_attachment(self, attachment: Attachment, offset: int, length: int) -> None:
         """Note an attachment that is in the file already."""
@@ -283,13 +299,17 @@ class SegmentFile:
         stored: list[StoredChunk] = []
         paddings: list[bytes] = []
         at = self.position
+        size, crc = self.table.unproven
         for chunk in chunks:
             if stored and at >= end:
                 break
             padding = self._padding(chunk.data, at, len(chunk.head))
             offset = at + len(padding)
             length = len(chunk.head) + len(chunk.data)
-            arrivals = arrival_record(offset, chunk.arrivals)
+            before = size + len(padding), crc32(padding, crc)
+            size = crc = 0
+            proof = Proof(offset, *before, chunk.head_crc, chunk.crc, chunk.indexes_crc)
+            arrivals = arrival_record(proof, chunk.arrivals)
             trailer_length = sum(map(len, chunk.indexes.values())) + len(arrivals)
             parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
             at = offset + length + trailer_length
@@ -349,12 +369,14 @@ class SegmentFile:
             SegmentError: It is damaged.
         """
         indexes, body = split_trailer(trailer)
-        arrivals = arrival_record(self.position, bytes(body[8:]))
+        offset = self.position
+        head = crc32(record[: head_length(record)])
+        proof = proof_of(body)._replace(chunk=offset, head=head, record=crc32(record))
+        arrivals = arrival_record(proof, body[PROOF.size :])
         own = bytes(trailer[: len(trailer) - len(arrivals)]) + arrivals
         _, _, first, last, size, _ = CHUNK_HEAD.unpack_from(record)
-        offset = self.position
         self._append([record, own])
-        checksums = {"crc": crc32(record), "trailer_crc": crc32(own)}
+        checksums = {"crc": proof.record, "trailer_crc": crc32(own)}
         if record[0] == MOVED_OPCODE:
             self.table.chunk(
                 offset=offset,
@@ -471,6 +493,7 @@ class SegmentFile:
 
     def complete(self) -> Sealed:
         """Write the summary, without renaming the file or forcing it to the disk."""
+        self._prove()
         # In one write: without room the file is unchanged, and can be sealed again.
         end = record_bytes(DataEnd(data_section_crc=0))
         table = self.table.build(end)

@@ -24,6 +24,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
 
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.compression import decompress
 from hybridlog_storage.copying import windows
 from hybridlog_storage.errors import SegmentError
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 MAGIC: Final = b"\x89MCAP0\r\n"
 PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
-FORMAT_VERSION: Final = 2
+FORMAT_VERSION: Final = 3
 
 OUR_NAMES: Final = "hybridlog."
 """Beginning of the names of the store's own metadata records and channel metadata."""
@@ -53,7 +54,8 @@ NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 NO_INDEX: Final = "hybridlog.no_index"
 
 ARRIVAL_OPCODE: Final = 0x90
-"""Record of the application range of opcodes: arrival numbers of a chunk's messages."""
+"""Record of the application range of opcodes: checksums of what stands before it, and the
+arrival numbers of a chunk's messages when it follows one."""
 PADDING_OPCODE: Final = 0x91
 """Record of zeros, so that the content of the chunk behind it starts at a block."""
 
@@ -70,7 +72,8 @@ CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
 MOVED_SIZE: Final = CHUNK_HEAD.size
 """Bytes of the record of a moved chunk; every chunk record has more."""
 INDEX_HEAD: Final = struct.Struct("<BQHI")
-ARRIVAL_HEAD: Final = struct.Struct("<BQQ")
+PROOF: Final = struct.Struct("<QQIIIII")
+"""Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
 
 _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _MAX_ARRIVALS = 1 << 27
@@ -225,6 +228,18 @@ def compression_of(record: Buffer) -> tuple[str, int]:
     return name, int(compressed)
 
 
+def head_length(record: Buffer) -> int:
+    """Bytes of a chunk record before its content; all of the record of a moved chunk.
+
+    Args:
+        record: The record, or its beginning.
+    """
+    if record[0] == MOVED_OPCODE:
+        return MOVED_SIZE
+    (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
+    return int(CHUNK_HEAD.size + 4 + name + 8)
+
+
 def moved_record(chunk: Buffer) -> bytes:
     """The record in place of a chunk record whose content lies elsewhere.
 
@@ -309,9 +324,49 @@ def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
     return checked_frame(steps.tobytes())
 
 
-def arrival_record(chunk_offset: int, packed: bytes) -> bytes:
-    """The record with the packed arrival numbers of the chunk at an offset."""
-    return ARRIVAL_HEAD.pack(ARRIVAL_OPCODE, 8 + len(packed), chunk_offset) + packed
+class Proof(NamedTuple):
+    """Checksums of a part of a segment, in the arrival record behind it.
+
+    They prove what an open segment has so far; the chunk table repeats them for a sealed one.
+
+    Attributes:
+        chunk: Byte of the file where the chunk record starts; 0 if the record follows no chunk.
+        length: Bytes before the chunk that it covers; without a chunk, before the record.
+        before: CRC-32 of these bytes.
+        head: CRC-32 of the head of the chunk record; 0 without a chunk, as are the others.
+        record: CRC-32 of the chunk record.
+        indexes: CRC-32 of the message indexes.
+    """
+
+    chunk: int
+    length: int
+    before: int
+    head: int = 0
+    record: int = 0
+    indexes: int = 0
+
+
+def arrival_record(proof: Proof, packed: Buffer = b"") -> bytes:
+    """The record with checksums and, behind a chunk, with its packed arrival numbers."""
+    fields = PROOF.pack(*proof, 0)[:-4]
+    own = crc32(packed, crc32(fields))
+    head = RECORD_HEAD.pack(ARRIVAL_OPCODE, PROOF.size + len(packed))
+    return b"".join((head, fields, own.to_bytes(4, "little"), packed))
+
+
+def proof_of(body: Buffer) -> Proof:
+    """Parse the checksums in the body of an arrival record.
+
+    Raises:
+        SegmentError: The record is damaged.
+    """
+    if len(body) < PROOF.size:
+        raise SegmentError("the arrival record is damaged")
+    *fields, own = PROOF.unpack_from(body)
+    view = memoryview(body)
+    if crc32(view[PROOF.size :], crc32(view[: PROOF.size - 4])) != own:
+        raise SegmentError("the arrival record is damaged")
+    return Proof(*fields)
 
 
 def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
@@ -320,10 +375,10 @@ def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
     Raises:
         SegmentError: The record is damaged or does not hold `count` numbers.
     """
-    if len(body) < 8 or count > _MAX_ARRIVALS:
+    if len(body) < PROOF.size or count > _MAX_ARRIVALS:
         raise SegmentError("the record of arrival numbers is damaged")
     try:
-        raw = decompress("zstd", memoryview(body)[8:], count * 8)
+        raw = decompress("zstd", memoryview(body)[PROOF.size :], count * 8)
     except SegmentError as error:
         raise SegmentError(f"the record of arrival numbers is damaged: {error}") from error
     (chunk_offset,) = struct.unpack_from("<Q", body)
@@ -388,7 +443,7 @@ def split_trailer(trailer: Buffer) -> tuple[list[tuple[int, NDArray[np.void]]], 
         if not is_index or size % _INDEX_ENTRY.itemsize or at > len(view):
             raise SegmentError("its message indexes are damaged")
         found.append((channel, np.frombuffer(view[start:at], _INDEX_ENTRY)))
-    if at + ARRIVAL_HEAD.size > len(view):
+    if at + RECORD_HEAD.size + PROOF.size > len(view):
         raise SegmentError("its arrival numbers are missing")
     opcode, length = RECORD_HEAD.unpack_from(view, at)
     at += RECORD_HEAD.size

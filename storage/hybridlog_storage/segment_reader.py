@@ -83,8 +83,8 @@ class ChunkPlace:
         first: Smallest log time in it, ns.
         last: Largest log time in it, ns.
         channels: Ids of the channels in it.
-        crc: CRC-32 of the chunk record, including its head; None if unknown.
-        trailer_crc: CRC-32 of the trailer; None if unknown.
+        crc: CRC-32 of the chunk record, including its head.
+        trailer_crc: CRC-32 of the trailer.
     """
 
     number: int
@@ -94,8 +94,8 @@ class ChunkPlace:
     first: int
     last: int
     channels: tuple[int, ...]
-    crc: int | None = None
-    trailer_crc: int | None = None
+    crc: int
+    trailer_crc: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -404,10 +404,9 @@ class SegmentReader:
         """Read, decompress and check one chunk.
 
         Args:
-            place: Its position. Known checksums are compared before any byte of the chunk is
-                used. Without them everything is compared with the checked content. Damaged
-                message indexes are ignored: messages and arrival numbers have checksums of
-                their own.
+            place: Its position. Its checksums are compared before any byte of the chunk is
+                used. Damaged message indexes are ignored: messages and arrival numbers have
+                checksums of their own.
 
         Raises:
                 SegmentError: It is missing or damaged; the message names file and offset.
@@ -418,16 +417,13 @@ class SegmentReader:
         data = self.read(place.offset, place.length + place.trailer)
         record, trailer = data[: place.length], data[place.length :]
         try:
-            if place.crc not in {None, crc32(record)}:
+            if crc32(record) != place.crc:
                 raise SegmentError("its checksum differs")
             if len(record) == MOVED_SIZE:
                 content, compressed = self._moved_content(place, record), 0
             else:
-                content, compressed = open_chunk(record, is_checked=place.crc is not None)
-            if place.crc is None or place.trailer_crc is None:
-                batch = parse_content(content).batch
-                _check_around(record, trailer, batch)
-            elif crc32(trailer) != place.trailer_crc:
+                content, compressed = open_chunk(record)
+            if crc32(trailer) != place.trailer_crc:
                 batch = parse_content(content).batch
             else:
                 found = messages_at(content, message_starts(trailer))
@@ -443,8 +439,8 @@ class SegmentReader:
             offset=place.offset,
             length=place.length,
             trailer=place.trailer,
-            crc=crc32(record) if place.crc is None else place.crc,
-            trailer_crc=crc32(trailer) if place.trailer_crc is None else place.trailer_crc,
+            crc=place.crc,
+            trailer_crc=place.trailer_crc,
             batch=batch,
             seq=seq,
             compressed_size=compressed,
@@ -488,7 +484,7 @@ class SegmentReader:
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, from its message indexes alone.
 
-        If these are damaged, or their checksum is unknown, the chunk is read instead.
+        If these are damaged, the chunk is read instead.
 
         Returns:
             int64[n], ns, ascending, by channel id.
@@ -650,7 +646,7 @@ def places_of(table: ChunkTable) -> list[ChunkPlace]:
             first=first,
             last=last,
             channels=tuple(channels[bounds[number] : bounds[number + 1]]),
-            crc=None if table.is_flushed else crc,
+            crc=crc,
             trailer_crc=trailer_crc,
         )
         for number, (offset, length, trailer, first, last, crc, trailer_crc) in enumerate(
@@ -679,29 +675,28 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
     """Raise if a segment has another format.
 
     Raises:
-        SegmentError: Its format is newer, or no longer supported.
+        SegmentError: It has.
     """
     version = recording.get("format")
     if version == FORMAT_VERSION:
         return
     if isinstance(version, int) and version < FORMAT_VERSION:
         raise SegmentError(
-            f"{path} has segment format {version}, and this hybridlog reads format "
-            f"{FORMAT_VERSION} only. Record the log again."
+            f"{path} is of format {version}, which was never released. Record it again into a "
+            "new store."
         )
     raise SegmentError(
-        f"{path} has segment format {version}, this hybridlog knows up to "
-        f"{FORMAT_VERSION}. Install a newer hybridlog."
+        f"{path} is of format {version}, and this hybridlog knows format {FORMAT_VERSION}. "
+        "Install a newer hybridlog."
     )
 
 
-def open_chunk(record: memoryview, *, is_checked: bool = False) -> tuple[Buffer, int]:
+def open_chunk(record: memoryview) -> tuple[Buffer, int]:
     """Content and compressed size of a whole chunk record.
 
     Args:
-        record: The chunk record, including its head.
-        is_checked: Whether a checksum of the record was compared. The checksum of
-            uncompressed content is then not computed again.
+        record: The chunk record, including its head, whose checksum was compared. So that of
+            uncompressed content is not computed again.
 
     Raises:
             SegmentError: It is not a chunk record, or damaged.
@@ -723,7 +718,7 @@ def open_chunk(record: memoryview, *, is_checked: bool = False) -> tuple[Buffer,
     if compressed != len(record) - at:
         raise SegmentError("the length of its records is wrong")
     content = decompress(compression, record[at:], size)
-    if not (is_checked and not compression) and crc32(content) != crc:
+    if compression and crc32(content) != crc:
         raise SegmentError("its checksum differs")
     return content, compressed
 
@@ -753,22 +748,6 @@ def indexes_of(batch: Batch) -> dict[int, bytes]:
     order = index_order(batch.channel, batch.log_time)
     starts = batch.offset - MESSAGE_HEAD.itemsize
     return message_indexes(batch.channel, batch.log_time, starts, order)
-
-
-def _check_around(record: memoryview, trailer: memoryview, batch: Batch) -> None:
-    """Compare the head of a chunk and its message indexes with its content.
-
-    Raises:
-        SegmentError: They differ.
-    """
-    if not len(batch):
-        raise SegmentError("it holds no message")
-    _, _, first, last, _, _ = CHUNK_HEAD.unpack_from(record)
-    if (first, last) != (int(batch.log_time.min()), int(batch.log_time.max())):
-        raise SegmentError("its head names other times than those of its messages")
-    want = b"".join(indexes_of(batch).values())
-    if trailer[: len(want)] != want:
-        raise SegmentError("its message indexes are damaged")
 
 
 def check_arrivals(trailer: Buffer, chunk_offset: int, count: int) -> NDArray[np.int64]:

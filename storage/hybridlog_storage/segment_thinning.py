@@ -113,9 +113,7 @@ def _copy(
             continue
         place = places[piece.chunk]
         record: Buffer = _checked(reader, place.offset, place.length, piece.crc)
-        trailer = _checked(
-            reader, place.offset + place.length, place.trailer, place.trailer_crc or 0
-        )
+        trailer = _checked(reader, place.offset + place.length, place.trailer, place.trailer_crc)
         if piece.chunk in moved:
             record = moved_record(record)
         parts = summary.table.parts[bounds[piece.chunk] : bounds[piece.chunk + 1]]
@@ -138,7 +136,7 @@ def _copy(
 
 def _pieces(summary: SegmentSummary) -> list[_Piece]:
     """All stretches in the order of the file; the last one holds the end of the data."""
-    found = [_Piece(c.offset, c.length, c.crc or 0, c.number) for c in summary.chunks]
+    found = [_Piece(c.offset, c.length, c.crc, c.number) for c in summary.chunks]
     found += [
         _Piece(offset, length, crc, None) for offset, length, crc in summary.table.others.tolist()
     ]

@@ -20,7 +20,7 @@ from urllib.parse import quote
 from hybridlog_storage import files
 from hybridlog_storage.errors import StoreError, UsageError, unreadable
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 """Store format of this version."""
 NAME: Final = "hybridlog.toml"
 EMBEDDED: Final = "embedded"
@@ -82,14 +82,14 @@ def read_settings(path: Path) -> StoreSettings:
         raise StoreError(f"{file} names no format version; it should say `format = {FORMAT}`.")
     if version > FORMAT:
         raise StoreError(
-            f"The store {path} has format {version}, this hybridlog knows format {FORMAT}. "
+            f"The store {path} is of format {version}, and this hybridlog knows format {FORMAT}. "
             "Install a newer hybridlog."
         )
     if version < FORMAT:
         raise StoreError(
-            f"The store {path} has format {version}, which is no longer read; this hybridlog "
-            f"knows format {FORMAT}. Record the logs again into a new store, or use the "
-            "hybridlog that made it."
+            f"The store {path} is of format {version}, which was never released: record its "
+            f"*.mcap files again into a new store, as in `hybridlog record --store NEW "
+            f"{path}/recordings/*/*.mcap`."
         )
     requires = _names(file, values, "requires")
     unknown = [name for name in requires if name not in FEATURES]

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import random
-import struct
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from mcap.opcode import Opcode
 
 import hybridlog as hl
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.mcap_content import RECORD_HEAD
 from hybridlog_storage.open_segment import OpenSegment
-from hybridlog_storage.segment_format import ARRIVAL_OPCODE, MAGIC
+from hybridlog_storage.segment_format import ARRIVAL_OPCODE, MAGIC, PROOF, arrival_record, proof_of
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import Running, begun
 from tests.running.sequence import Known
@@ -76,15 +74,7 @@ def check_flips(running: Running, copied: Path, count: int, seed: int) -> Counte
     data = path.read_bytes()
     rng = random.Random(seed)
     heads = [at + n for at in record_starts(data) for n in range(RECORD_HEAD.size)]
-    # These have no checksum of their own before the segment is sealed.
-    unchecked = {
-        at + n
-        for at in record_starts(data)
-        if data[at] in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE_INDEX, Opcode.METADATA}
-        for n in range(RECORD_HEAD.size, RECORD_HEAD.size + RECORD_HEAD.unpack_from(data, at)[1])
-    }
-    others = [at for at in range(len(data)) if at not in unchecked]
-    places = [(rng.choice(others), rng.randrange(8)) for _ in range(count)]
+    places = [(rng.randrange(len(data)), rng.randrange(8)) for _ in range(count)]
     places += [(rng.choice(heads), rng.randrange(8)) for _ in range(count)]
     found: Counter[str] = Counter()
     for at, bit in flip(path, data, places):
@@ -112,9 +102,13 @@ def without(data: bytes, chunk: int) -> bytes:
     end = last + RECORD_HEAD.size + RECORD_HEAD.unpack_from(data, last)[1]
     changed = bytearray(data)
     for at in arrivals:
-        (place,) = struct.unpack_from("<Q", data, at + RECORD_HEAD.size)
-        if place > chunk:
-            struct.pack_into("<Q", changed, at + RECORD_HEAD.size, place - end + chunk)
+        size = RECORD_HEAD.unpack_from(data, at)[1]
+        body = data[at + RECORD_HEAD.size : at + RECORD_HEAD.size + size]
+        proof = proof_of(body)
+        if proof.chunk > chunk:
+            moved = proof._replace(chunk=proof.chunk - end + chunk)
+            record = arrival_record(moved, body[PROOF.size :])
+            changed[at : at + len(record)] = record
     return bytes(changed[:chunk] + changed[end:])
 
 

@@ -38,7 +38,7 @@ def test_what_is_written_is_read(tmp_path: Path, settings: StoreSettings) -> Non
     write_settings(tmp_path, settings)
     assert read_settings(tmp_path) == settings
     values = tomllib.loads((tmp_path / "hybridlog.toml").read_text("utf-8"))
-    assert values["format"] == FORMAT == 2
+    assert values["format"] == FORMAT == 3
     assert [p.name for p in tmp_path.iterdir()] == ["hybridlog.toml"]
 
 
@@ -59,17 +59,17 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = 'one'", "format"),
         (b"format = true\nstore_id = 'x'", "format"),
         (b"format = 0", "format"),
-        (b"format = 1\nstore_id = 'x'", "no longer read"),
-        (b"format = 3\nstore_id = 'x'", "format 3.*newer"),
-        (b"format = 2", "store_id"),
-        (b"format = 2\nstore_id = ''", "store_id"),
-        (b"format = 2\nstore_id = 5", "store_id"),
-        (b"format = 2\nstore_id = 'x'\nmongo = 1", "mongo"),
-        (b"format = 2\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
-        (b"format = 2\nstore_id = 'x'\nshared = 1", "shared"),
-        (b"format = 2\nstore_id = 'x'\nrequires = 'a'", "requires"),
-        (b"format = 2\nstore_id = 'x'\noptional = [1]", "optional"),
-        (b"format = 2\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
+        (b"format = 2\nstore_id = 'x'", "format 2, which was never released"),
+        (b"format = 4\nstore_id = 'x'", "format 4.*newer"),
+        (b"format = 3", "store_id"),
+        (b"format = 3\nstore_id = ''", "store_id"),
+        (b"format = 3\nstore_id = 5", "store_id"),
+        (b"format = 3\nstore_id = 'x'\nmongo = 1", "mongo"),
+        (b"format = 3\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
+        (b"format = 3\nstore_id = 'x'\nshared = 1", "shared"),
+        (b"format = 3\nstore_id = 'x'\nrequires = 'a'", "requires"),
+        (b"format = 3\nstore_id = 'x'\noptional = [1]", "optional"),
+        (b"format = 3\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
         (b"format = [", "damaged"),
         (b"\xff\xfe", "damaged"),
         (b"format = " + b"[" * 100_000, "damaged"),
