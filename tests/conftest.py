@@ -63,6 +63,16 @@ for number, handler in (
         signal.signal(number, handler)
 
 
+@pytest.fixture(autouse=True)
+def signals_as_before() -> Iterator[None]:
+    """Handlers that a test or a command has installed in this process go with the test."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 SLOW = frozenset(
     (
         "across/test_align.py",

@@ -496,9 +496,15 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
     return base / "store", *ids
 
 
+SOME_OR_EACH = [3, pytest.param(1, marks=pytest.mark.exhaustive)]
+"""Steps from one that is tried to the next."""
+
+
+@pytest.mark.parametrize("stride", SOME_OR_EACH)
 @pytest.mark.parametrize("command", CHANGES)
 def test_a_command_changes_the_recording_that_was_chosen(
     command: str,
+    stride: int,
     two: tuple[Path, str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -507,8 +513,9 @@ def test_a_command_changes_the_recording_that_was_chosen(
     others = content_of(base, other)
     monkeypatch.setattr(files.System, "sync", lambda *_: None)
     monkeypatch.setattr(Session, "database", None)
-    for change, after in [(swap, False), (swap, True), (replace, False), (remove, True)]:
-        for step in count():
+    changes = [(swap, False), (swap, True), (replace, False), (remove, True)]
+    for first, (change, after) in enumerate(changes):
+        for step in count(first % stride, stride):
             place = tmp_path / "store"
             shutil.rmtree(place, ignore_errors=True)
             shutil.copytree(base, place)
@@ -535,14 +542,15 @@ def test_a_command_changes_the_recording_that_was_chosen(
                 break
 
 
+@pytest.mark.parametrize("stride", SOME_OR_EACH)
 def test_a_command_finds_a_recording_whose_label_goes_around(
-    two: tuple[Path, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stride: int, two: tuple[Path, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     base, one, other = two
     others = content_of(base, other)
     monkeypatch.setattr(files.System, "sync", lambda *_: None)
-    for step in range(0, 12, 2):
-        for again in count(step + 1):
+    for step in range(0, 12, 2 * stride):
+        for again in count(step + 1, stride):
             place = tmp_path / "store"
             shutil.rmtree(place, ignore_errors=True)
             shutil.copytree(base, place)
@@ -604,16 +612,18 @@ def test_twenty_commands_at_once_wait_for_each_other(
         assert not store.verify().findings
 
 
+@pytest.mark.parametrize("stride", SOME_OR_EACH)
 @pytest.mark.parametrize("change", [swap, replace, remove])
 def test_an_import_takes_the_recording_that_was_chosen(
     change: Callable[[Path], None],
+    stride: int,
     two: tuple[Path, str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     base, one, _ = two
     monkeypatch.setattr(files.System, "sync", lambda *_: None)
-    for step in count():
+    for step in count(0, stride):
         place, target = tmp_path / "store", tmp_path / "target"
         shutil.rmtree(place, ignore_errors=True)
         shutil.rmtree(target, ignore_errors=True)

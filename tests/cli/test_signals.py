@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -12,14 +11,6 @@ import pytest
 from hybridlog.cli import signals
 from hybridlog_storage.stopping import at_safe_points, safe_point
 from hybridlog_storage.unfinished import beside
-
-
-@pytest.fixture(autouse=True)
-def as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in signals.SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 def test_a_background_job_is_stopped_by_sigint_and_nohup_still_holds() -> None:
