@@ -16,7 +16,7 @@ from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.entries import new_id, recording_metadata, sealed_event, text
-from hybridlog.index_writer import IndexWriter, Lag
+from hybridlog.index_writer import IndexTarget, IndexWriter, Lag
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import finish
@@ -55,7 +55,6 @@ class Backpressure:
             and tables.
         on_written: Called on another thread when less content waits for the disk. `append`
             then never waits; its caller watches `writer.waiting`.
-        renew: Returns a new connection to the index after one has failed.
     """
 
     hurry: Callable[[], bool]
@@ -64,7 +63,6 @@ class Backpressure:
     next_chunk_size: Callable[[], int]
     spare: BoundedSemaphore
     on_written: Callable[[], None]
-    renew: Callable[[], Database]
 
 
 class Capture:
@@ -73,7 +71,7 @@ class Capture:
     Args:
         directory: The store.
         catalog: Its catalog.
-        database: The index.
+        target: Where its index documents go.
         name: Name of the recording.
         tags: Tags of the recording.
         source: Origin of its messages, for the catalog.
@@ -94,7 +92,7 @@ class Capture:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        database: Database,
+        target: IndexTarget,
         *,
         name: str,
         tags: Mapping[str, str],
@@ -115,15 +113,16 @@ class Capture:
             # Of two processes that record the same content now, one is refused.
             if check is not None:
                 check(self.catalog)
-            self.entry = self._begin(name, tags, source, IndexState(database))
+            self.entry = self._begin(name, tags, source, target.database)
             self._held = self._held.pop_all()
-        self.indexer = ChunkIndexer(self.entry.id)
+        self._target = target
+        self.indexer = ChunkIndexer(self.entry.id, has_documents=target.is_wanted)
         recording = directory.recording(self.entry.label)
         lag = None
         if pressure:
-            lag = Lag(recording, pressure.behind, pressure.has_room, pressure.renew, pressure.spare)
+            lag = Lag(recording, pressure.behind, pressure.has_room, pressure.spare)
         self._tables = TableWriter(directory.path, self.entry.id)
-        self.index = IndexWriter(self.indexer, database, lag=lag, tables=self._tables)
+        self.index = IndexWriter(self.entry, self.indexer, target, lag=lag, tables=self._tables)
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,
@@ -142,6 +141,12 @@ class Capture:
     def indexed(self) -> int:
         """Number of messages in the index, after the end."""
         return max(0, self.index.indexed - (self.entry.messages - self.entry.documents))
+
+    @property
+    def lag(self) -> int:
+        """Messages that are to be in the index, and are not yet."""
+        lag = self.writer.totals.messages - self.index.indexed
+        return max(lag, 0) if self._target.is_wanted else 0
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
@@ -203,8 +208,14 @@ class Capture:
         label = self.entry.label
         try:
             if failure is None:
-                database = self.index.database
-                self.entry = finish(self._directory, self.catalog, database, label, turn=self._turn)
+                self.entry = finish(
+                    self._directory,
+                    self.catalog,
+                    self.index.database,
+                    label,
+                    turn=self._turn,
+                    decoded=self.index.decoded,
+                )
                 self._tables.close(self.entry)
         except DatabaseError as error:
             failure = error
@@ -236,15 +247,21 @@ class Capture:
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.
+        database = self.index.database
         with suppress(HybridlogError):
-            state = IndexState(self.index.database)
-            topics = {channel.topic for channel in self.writer.channels.values()}
-            state.clear(entry.key, TopicPlaces(self.index.database).of(topics).values())
-            state.remove(entry.key)
+            if database is not None:
+                state = IndexState(database)
+                topics = {channel.topic for channel in self.writer.channels.values()}
+                state.clear(entry.key, TopicPlaces(database).of(topics).values())
+                state.remove(entry.key)
         self._held.close()
 
     def _begin(
-        self, name: str, tags: Mapping[str, str], source: Mapping[str, Any], state: IndexState
+        self,
+        name: str,
+        tags: Mapping[str, str],
+        source: Mapping[str, Any],
+        database: Database | None,
     ) -> RecordingEntry:
         """Create and lock the recording's directory, its journal and its index entry."""
         name = text(name)
@@ -276,7 +293,8 @@ class Capture:
                 )
             )
             put_entry(self._directory, self.catalog, label, is_open=True)
-            state.put(entry, "open", turn=self._turn)
+            if database is not None:
+                IndexState(database).put(entry, "open", turn=self._turn)
         except BaseException:
             self._directory.sweep(self._directory.hide(label))
             raise

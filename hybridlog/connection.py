@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.errors import ConnectionLostError, DatabaseError, StoreError
-from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, with_password
+from hybridlog_storage.errors import (
+    ConnectionLostError,
+    DatabaseError,
+    DiskFullError,
+    HybridlogError,
+    MissingDependencyError,
+    ResourceError,
+    StoreError,
+    WithoutMongoError,
+)
+from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, NAME, NONE, with_password
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
@@ -23,7 +33,8 @@ class Connection:
 
     Args:
         directory: The store.
-        mongo: URI of the MongoDB, or `embedded`; None for the one in the store's settings.
+        mongo: URI of the MongoDB, `embedded`, or `none`; None for the one in the store's
+            settings.
         cache_mb: Size of the embedded MongoDB's cache in MiB, if this process starts it; None
             for the one in the store's settings.
 
@@ -57,7 +68,7 @@ class Connection:
         """Connect, and check that the database belongs to this store.
 
         Raises:
-            DatabaseError: MongoDB does not answer.
+            DatabaseError: MongoDB does not answer, or the store does without.
             StoreError: it holds the index of another store, or this store is a copy.
         """
         from hybridlog.maintenance import lease
@@ -85,16 +96,23 @@ class Connection:
         """An additional connection; starts the embedded MongoDB if it is not running.
 
         Raises:
-            DatabaseError: MongoDB does not answer.
+            DatabaseError: MongoDB does not answer, or the store does without.
         """
         from hybridlog import consent
-        from hybridlog_storage.database import Database
 
         if self._uri is None:
             self._uri = self.wanted or consent.trusted_uri(
                 self._directory.settings, self._directory.path
             )
         uri = self._uri
+        if uri == NONE:
+            told = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
+            raise WithoutMongoError(
+                f"The store is used without MongoDB ({told}). With --mongo embedded, or --mongo "
+                "URI, a command uses one, and brings its index up to date first."
+            )
+        from hybridlog_storage.database import Database
+
         timeout_s = _TIMEOUT_S
         if uri == EMBEDDED:
             from hybridlog_storage.mongod import EmbeddedMongod
@@ -102,11 +120,7 @@ class Connection:
             if self._mongod is None:
                 cache_mb = self._cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
                 self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
-            try:
-                uri = self._mongod.start()
-            except StoreError as error:
-                # A read-only store has no embedded MongoDB, but its segments can be read.
-                raise DatabaseError(str(error)) from error
+            uri = _started(self._mongod)
             timeout_s = _EMBEDDED_TIMEOUT_S
             if self._mongod.damage is not None:
                 self.damage.append(self._mongod.damage)
@@ -118,6 +132,12 @@ class Connection:
             shortage = None if self._mongod is None else self._mongod.shortage()
             raise (shortage or error) from error
 
+    def may_record_without(self, error: HybridlogError) -> bool:
+        """True if there is no MongoDB to record with: none is wanted, or ours does not start."""
+        if self._uri == EMBEDDED and not isinstance(error, DiskFullError):
+            return isinstance(error, DatabaseError | MissingDependencyError | ResourceError)
+        return isinstance(error, WithoutMongoError)
+
     @property
     def place(self) -> str:
         """Description of the index's location; does not contact MongoDB."""
@@ -126,6 +146,8 @@ class Connection:
         uri = self.wanted or self._directory.settings.mongo or EMBEDDED
         if uri == EMBEDDED:
             return "the MongoDB that comes with hybridlog"
+        if uri == NONE:
+            return "none"
         from hybridlog_storage.database import without_secrets
 
         return without_secrets(uri)
@@ -156,6 +178,23 @@ class Connection:
             place = lease.place_of(self._directory)
             lease.check(state.mark(), place, database, embedded=True)
             state.claim(place)
+
+
+def _started(mongod: EmbeddedMongod) -> str:
+    """URI of the embedded MongoDB; it may end once while it starts.
+
+    Raises:
+        DatabaseError: It does not start.
+        MissingDependencyError: No mongod is installed.
+        ResourceError: It lacks memory, file handles or disk.
+    """
+    try:
+        with suppress(DatabaseError):
+            return mongod.start()
+        return mongod.start()
+    except StoreError as error:
+        # A read-only store has no embedded MongoDB, but its segments can be read.
+        raise DatabaseError(str(error)) from error
 
 
 def _bounded_cache_mb(stored: int | None) -> int:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.user_directories import user_directory
 from hybridlog_storage import durability, files
 from hybridlog_storage.errors import DatabaseError, StoreError
-from hybridlog_storage.settings import EMBEDDED, without_password
+from hybridlog_storage.settings import EMBEDDED, NONE, without_password
 
 if TYPE_CHECKING:
     from hybridlog_storage.settings import StoreSettings
@@ -30,7 +30,7 @@ _STORES: Final = "stores"
 
 
 def trusted_uri(settings: StoreSettings, store: Path | None = None) -> str:
-    """The URI that a store may use, or `embedded`.
+    """The URI that a store may use, `embedded`, or `none`.
 
     Args:
         settings: The store's settings.
@@ -41,6 +41,8 @@ def trusted_uri(settings: StoreSettings, store: Path | None = None) -> str:
     """
     if settings.mongo is None:
         return EMBEDDED
+    if settings.mongo == NONE:
+        return NONE
     if is_trusted(settings.store_id, settings.mongo):
         return settings.mongo
     from hybridlog_storage.database import without_secrets  # loads numpy

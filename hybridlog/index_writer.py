@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
     from hybridlog.indexing import ChunkIndexer, Documents
     from hybridlog.tables.writer import TableWriter
+    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
     from hybridlog_storage.database import Database
+    from hybridlog_storage.topic_places import TopicPlace
 
 _SENDERS = 2
 _LAG_PAUSE_S = 0.002
@@ -172,8 +174,6 @@ class Lag:
         has_room: Says whether so many bytes of chunks may wait in memory, where they are more
             than a few.
         spare: Processors for what can wait. One is held while documents or tables are made.
-        renew: Another connection to the index, after one has failed; starts the embedded
-            MongoDB again if that has ended. Raises `DatabaseError`.
     """
 
     def __init__(
@@ -181,11 +181,9 @@ class Lag:
         recording: Path,
         behind: Callable[[], bool],
         has_room: Callable[[int], bool],
-        renew: Callable[[], Database],
         spare: threading.BoundedSemaphore,
     ) -> None:
         self.has_room = has_room
-        self.renew = renew
         self.spare = spare
         self._recording = recording
         self._behind = behind
@@ -252,6 +250,27 @@ class _Forgotten(NamedTuple):
     is_in_tables: bool
 
 
+@dataclass(frozen=True, slots=True)
+class IndexTarget:
+    """Where the index documents of a new recording go.
+
+    Attributes:
+        database: The index; None if it is unavailable now, or the recording gets none.
+        failure: Why it is unavailable now; None if it is not, or the recording gets none.
+        renew: Another connection to the index, after one has failed; starts the embedded
+            MongoDB again if that has ended. Raises `DatabaseError`.
+    """
+
+    database: Database | None = None
+    failure: DatabaseError | None = None
+    renew: Callable[[], Database] | None = None
+
+    @property
+    def is_wanted(self) -> bool:
+        """True if the recording gets documents, now or later."""
+        return self.database is not None or self.failure is not None
+
+
 class IndexWriter:
     """Indexes chunks in the background, so that recording need not wait.
 
@@ -262,34 +281,40 @@ class IndexWriter:
     the index.
 
     Args:
+        entry: The recording.
         indexer: Makes the documents.
-        database: Where they go.
+        target: Where they go.
         lag: With it `submit` never waits: chunks that find no room in memory are read back.
         tables: Gets each chunk of which documents are made, once.
     """
 
     def __init__(
         self,
+        entry: RecordingEntry,
         indexer: ChunkIndexer,
-        database: Database,
+        target: IndexTarget,
         *,
         lag: Lag | None = None,
         tables: TableWriter | None = None,
     ) -> None:
-        self.failure: DatabaseError | None = None
+        self.failure = target.failure
+        self.decoded: dict[int, dict[int, Mapping[int, ChannelStats]]] = {}
+        """Statistics of the decoded chunks: by segment, chunk and channel."""
         self.indexed = 0
         """Number of indexed messages."""
         self.missed = 0
         """Number of messages skipped after a failure of the database."""
         self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
+        self._entry = entry
         self._indexer = indexer
+        self._target = target
         self._lag = lag
         self._tables = tables
         self._spare = lag.spare if lag else nullcontext()
         self._forgotten: deque[_Forgotten] = deque()
-        self._database = database
-        self._state = IndexState(database)
-        self._places = TopicPlaces(database)
+        self.database = target.database
+        """The present connection to the index; None without one."""
+        self._places: TopicPlaces | None = None
         self._lock = threading.Lock()
         self._room = threading.BoundedSemaphore(_BACKLOG if lag is None else _MOST_BACKLOG)
         self._in_memory = 0  # chunks waiting or in work
@@ -306,11 +331,6 @@ class IndexWriter:
         self._retry_at = 0.0
         self._is_away = False
         self._renewed: list[Database] = []
-
-    @property
-    def database(self) -> Database:
-        """The present connection to the index."""
-        return self._database
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Index a chunk that is in its segment; wait while the backlog is full."""
@@ -349,14 +369,14 @@ class IndexWriter:
             with_place: Whether to assign a place in MongoDB to its topic.
         """
         self._indexer.prepare(channel)
-        if with_place:
+        if with_place and self._target.is_wanted:
             self._maker.submit(self._prepare, channel).add_done_callback(self._done)
 
     def _prepare(self, channel: Channel) -> None:
-        if self._is_away:
+        if self._is_away or self.failure is not None:
             return
         try:
-            self._places.assigned([channel.topic])
+            self._assigned([channel.topic])
         except DatabaseError:
             # It fails again with the first documents, and is reported then. A timeout takes
             # seconds, and other channels wait.
@@ -449,20 +469,21 @@ class IndexWriter:
 
     def _retry(self) -> None:
         """Continue after a failure of the database, if it can be reconnected."""
-        if self._lag is None:
+        if self._lag is None or self._target.renew is None:
             return
         try:
-            database = self._lag.renew()
+            database = self._target.renew()
             self._renewed.append(database)
             state = IndexState(database)
-            there = state.places(self._indexer.recording[:16])
+            if state.one(self._entry.key) is None:  # it was away when the recording began
+                state.put(self._entry, "open", turn=1)
+            there = state.places(self._entry.key)
         except DatabaseError as error:
             self.failure = error
             self._retry_at = time.monotonic() + _RETRY_S
             return
         with self._lock:
-            self._database, self._state = database, state
-            self._places = TopicPlaces(database)
+            self.database, self._places = database, None
             # A killed server has lost documents that were not in its journal yet.
             latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
             for entry in latest:
@@ -535,7 +556,10 @@ class IndexWriter:
 
     def _index(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
         with self._spare:
-            self._parcel.add(*self._indexer.documents_of(chunks, channels))
+            documents, entries = self._indexer.documents_of(chunks, channels)
+        for entry in entries:
+            self.decoded.setdefault(entry.segment, {})[entry.number] = entry.stats
+        self._parcel.add(documents, entries)
         parcel = self._parcel
         if len(parcel.entries) >= _PARCEL_CHUNKS or parcel.size >= _PARCEL_BYTES // 4:
             self._dispatch(wait=parcel.size >= _PARCEL_BYTES)
@@ -550,19 +574,19 @@ class IndexWriter:
     def _send(self, parcel: _Parcel) -> None:
         failure = self.failure
         try:
-            if failure is None:
+            if failure is None and self.database is not None:
                 for collection, tables in self._placed(parcel.documents).items():
                     lengths = np.concatenate(
                         [np.full(len(table), table.shape[1], np.int64) for table in tables]
                     )
                     data = b"".join(table.data for table in tables)
-                    self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
-                self._state.put_chunks(parcel.entries)
+                    self.database.insert_raw(collection, data, len(lengths), lengths=lengths)
+                IndexState(self.database).put_chunks(parcel.entries)
         except DatabaseError as error:
             failure = error
         with self._lock:
             if failure is None:
-                self.indexed += parcel.messages
+                self.indexed += parcel.messages if self._target.is_wanted else 0
                 self._latest.extend(parcel.entries)
                 return
             self.failure = failure
@@ -587,13 +611,19 @@ class IndexWriter:
         Raises:
             DatabaseError: MongoDB fails.
         """
-        places = self._places.assigned(documents.keys())
+        places = self._assigned(documents.keys())
         found: dict[str, list[NDArray[np.uint8]]] = {}
         for topic, tables in documents.items():
             place = places[topic]
             own = [with_prefix(table, place.prefix) for table in tables]
             found.setdefault(place.collection, []).extend(own)
         return found
+
+    def _assigned(self, topics: Collection[str]) -> dict[str, TopicPlace]:
+        if self._places is None:
+            assert self.database is not None
+            self._places = TopicPlaces(self.database)
+        return self._places.assigned(topics)
 
     def _made(self, size: int, future: Future[None]) -> None:
         self._room.release()

@@ -51,12 +51,16 @@ class ChunkIndexer:
     Args:
         recording: Id or key of the recording.
         array_limit: Longest array that is indexed whole.
+        has_documents: False to make only the chunks' catalog entries.
     """
 
-    def __init__(self, recording: str, *, array_limit: int = ARRAY_LIMIT) -> None:
+    def __init__(
+        self, recording: str, *, array_limit: int = ARRAY_LIMIT, has_documents: bool = True
+    ) -> None:
         self.recording = recording
         self._key = recording[:16]
         self._array_limit = array_limit
+        self._has_documents = has_documents
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
         self._lock = threading.Lock()
 
@@ -74,6 +78,7 @@ class ChunkIndexer:
         for channel_id, rows in rows_by_channel(placed.batch.channel):
             channel = channels[channel_id]
             codec, assembler, stamped = self._part(channel_id, channel)
+            is_indexed = channel.is_indexed and self._has_documents
             batch = placed.batch.take(rows)
             found = _StatsByChunk(
                 batch, placed.number[rows], has_publish_time=channel.has_publish_time
@@ -86,12 +91,12 @@ class ChunkIndexer:
                     found.unreadable(group.rows)
                 if len(group.surplus):
                     found.surplus(group.surplus)
-                if channel.is_indexed:
+                if is_indexed:
                     row = rows[group.rows]
                     tables.append(assembler.assemble(placed, row, group.body, group.error))
             if stamped:
                 _read_stamps(codec, batch, found)
-            if channel.is_indexed:
+            if is_indexed:
                 documents.append(Documents(channel.topic, tables))
             for number, of_chunk in found.by_chunk():
                 stats[number][channel_id] = of_chunk

@@ -38,11 +38,11 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.sources.base import Damage, Source
     from hybridlog.sources.fingerprint import Fingerprint
     from hybridlog_storage.catalog import Catalog
-    from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
 
 _MOST_PARTS = 1000  # of a log, whose fingerprints the recording has
@@ -109,7 +109,7 @@ def record(
     source: Source,
     directory: StoreDirectory,
     catalog: Catalog,
-    database: Database,
+    target: IndexTarget,
     *,
     fingerprint: Fingerprint,
     options: RecordOptions,
@@ -121,7 +121,7 @@ def record(
         source: The source, open and not yet read.
         directory: The store.
         catalog: Its catalog.
-        database: The index.
+        target: Where its index documents go.
         fingerprint: Fingerprint of the source's content.
         options: Options of the recording.
         progress: Called periodically with bytes read and messages stored.
@@ -140,7 +140,7 @@ def record(
     capture = Capture(
         directory,
         catalog,
-        database,
+        target,
         name=options.name or _name_of(source.path),
         tags=options.tags,
         source={

@@ -45,6 +45,8 @@ from hybridlog_storage.errors import (
     DiskFullError,
     HybridlogError,
     IndexChangedError,
+    MissingDependencyError,
+    ResourceError,
     SegmentError,
     StoreError,
     TopicError,
@@ -60,6 +62,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.index_version import GuardedIndex, IndexVersion
+    from hybridlog.index_writer import IndexTarget
     from hybridlog.payloads.reader import PayloadReader
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
@@ -145,8 +148,8 @@ class Session:
 
     Args:
         directory: The store's directory.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; None for the one in
-            the store's settings.
+        mongo: URI of the MongoDB that holds the index, `embedded`, or `none`; None for the one
+            in the store's settings.
         progress: Called while an index is brought up to date.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
             settings.
@@ -351,17 +354,39 @@ class Session:
         database = self.database
         return database if self.connection.may_write else None
 
-    def database_to_record(self, purpose: str) -> Database:
-        """The index, for a new recording; it may lack other recordings.
+    def index_to_record(self, purpose: str) -> IndexTarget:
+        """The index, for a new recording; it may lack other recordings, or be unavailable.
 
         Raises:
-            DatabaseError: as for `database_for`.
+            DatabaseError: as for `database_for`, if it was reached.
         """
+        from hybridlog.index_writer import IndexTarget
+
         if self.connected is not None and self.connection.may_write:
             if self.connected.ping():
-                return self.connected
+                return IndexTarget(self.connected, renew=self._another_database)
             self.disconnect()
-        return self.database_for(purpose, writes=True)
+        if self.database is None and self._unavailable is not None:
+            if isinstance(self._unavailable, ConnectionLostError):
+                return IndexTarget(failure=self._unavailable, renew=self._another_database)
+            if self.connection.may_record_without(self._unavailable):
+                return IndexTarget()
+        database = self.database_for(purpose, writes=True)
+        return IndexTarget(database, renew=self._another_database)
+
+    def _another_database(self) -> Database:
+        """An additional connection to the index.
+
+        Raises:
+            DatabaseError: It does not answer, or belongs to another store.
+        """
+        try:
+            if not self.connection.index:
+                with self._connecting:
+                    self.connection.open()
+            return self.connection.another()
+        except (StoreError, ResourceError, MissingDependencyError) as error:
+            raise DatabaseError(str(error)) from error
 
     def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
         """The index, for queries about some recordings.

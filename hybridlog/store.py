@@ -41,6 +41,7 @@ from hybridlog_storage.settings import (
     NAME,
     cache_mb_from_environment,
     checked_cache_mb,
+    is_uri,
 )
 
 if TYPE_CHECKING:
@@ -92,8 +93,8 @@ def open_store(
 
     Args:
         path: Its directory; by default `HYBRIDLOG_STORE` or `./hybridlog-store`.
-        mongo: URI of the MongoDB that holds the index, or `embedded`; by default
-            `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
+        mongo: URI of the MongoDB that holds the index, `embedded`, or `none` for no index; by
+            default `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
         create: Create the store if it does not exist.
         shared: Let the group write a new store.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
@@ -117,7 +118,7 @@ def open_store(
         is_new = not os.path.lexists(where / NAME)
         directory = StoreDirectory.create(where, mongo=own, shared=shared, cache_mb=cache_mb)
         directory.check_writable()
-        if is_new and own is not None:
+        if is_new and is_uri(own):
             with suppress(StoreError):  # without a home directory, each command must name it again
                 consent.remember(directory.settings.store_id, own)
     else:
@@ -617,7 +618,7 @@ class Store:
                 source,
                 self.directory,
                 self.catalog,
-                self.session.database_to_record("Recording a log"),
+                self.session.index_to_record("Recording a log"),
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
                 progress=progress,
@@ -640,10 +641,9 @@ class Store:
         return LiveRecording(
             self.directory,
             self.catalog,
-            self.session.database_to_record("Starting a recording"),
+            self.session.index_to_record("Starting a recording"),
             name,
             options or LiveOptions(**choices),
-            renew=self.session.connection.another,
             on_close=self._after,
         )
 

@@ -217,7 +217,7 @@ def _print_recording(
         *(("note", note["text"]) for note in entry.notes),
         *_cut("attachment", [f"{a.name} ({_content(a)})" for a in attachments]),
         *_cut("metadata", [f"{m.name} ({', '.join(m.values)})" for m in metadata]),
-        ("index", index or "MongoDB is unavailable"),
+        ("index", index),
     ]
     output.print_table([("recording", "left"), (entry.label, "left")], rows)
     if not entry.channels:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.cli.output import counted, note
 from hybridlog.cli.progress import LateBar
+from hybridlog_storage.errors import WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
@@ -28,6 +29,7 @@ def opened_store(
     cache_mb: int | None = None,
     quiet: bool = False,
     is_lasting: bool = False,
+    records: bool = False,
 ) -> Iterator[Store]:
     """The open store; what a command asks is of one moment.
 
@@ -41,6 +43,7 @@ def opened_store(
         quiet: No progress while the index is brought up to date.
         is_lasting: The command goes on while recordings change: each question is of its own
             moment.
+        records: The command records, also while MongoDB is unavailable.
     """
     from hybridlog.store import open_store
 
@@ -58,14 +61,18 @@ def opened_store(
     finally:
         bar.close()
     with store, nullcontext() if is_lasting else store.at_one_moment():
-        _print_repairs(store)
+        doing = "so the files answer"
+        if records:
+            target = store.session.index_to_record("Recording")
+            doing = "so the index is made later" if target.is_wanted else "so there is no index"
+        _print_repairs(store, doing)
         try:
             yield store
         finally:
-            _print_rebuilt(store)
+            _print_rebuilt(store, "" if records else doing)
 
 
-def _print_repairs(store: Store) -> None:
+def _print_repairs(store: Store, doing: str) -> None:
     repairs = store.repairs
     for recording, segments in repairs.recovered.items():
         _print_recovered(recording, segments)
@@ -91,11 +98,16 @@ def _print_repairs(store: Store) -> None:
         )
     elif not store.directory.is_writable:
         note(f"The store {store.directory.path} is read-only; its segments answer.")
-    _print_rebuilt(store)
+    _print_rebuilt(store, doing)
 
 
-def _print_rebuilt(store: Store) -> None:
-    """Report what was made again since the last report, and why MongoDB is unavailable."""
+def _print_rebuilt(store: Store, doing: str) -> None:
+    """Report what was made again since the last report, and why MongoDB is unavailable.
+
+    Args:
+        store: The store.
+        doing: The consequence; empty if that was said before.
+    """
     repairs = store.repairs
     if store.catalog.was_damaged:
         note("The catalog was damaged, and was made again.")
@@ -119,8 +131,10 @@ def _print_rebuilt(store: Store) -> None:
             note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
     for recording in repairs.removed:
         note(f"Recording {recording} has no files any more; it is out of the index.")
-    if store.without_database is not None and store.directory.is_writable:
-        note(f"MongoDB is unavailable, so the files answer: {store.without_database}")
+    reason = store.without_database
+    is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
+    if doing and is_wanted and store.directory.is_writable:
+        note(f"MongoDB is unavailable, {doing}: {reason}")
     for done in (repairs.damage, repairs.tables, repairs.indexed, repairs.removed):
         done.clear()
 

@@ -36,8 +36,8 @@ mongo = click.option(
     envvar="HYBRIDLOG_MONGO_URI",
     show_envvar=True,
     metavar="URI",
-    help="URI of the MongoDB that holds the index, or 'embedded' for our own; without, the one "
-    "that the store was made with.",
+    help="URI of the MongoDB that holds the index, 'embedded' for our own, or 'none'; without, "
+    "the one that the store was made with.",
 )
 cache_size = click.option(
     "--cache-size",

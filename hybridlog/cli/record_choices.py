@@ -168,8 +168,8 @@ def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
         choices.mongo,
         create=True,
         shared=choices.shared,
-        needs_database=True,
         cache_mb=choices.cache_size,
         quiet=choices.quiet,
         is_lasting=True,
+        records=True,
     )

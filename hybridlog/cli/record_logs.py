@@ -211,7 +211,7 @@ def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
     """Fail before a store is made, when no path can be read or the server does not answer."""
     from hybridlog.maintenance.lease import check
     from hybridlog.store import store_path
-    from hybridlog_storage.settings import EMBEDDED, NAME, with_password
+    from hybridlog_storage.settings import NAME, is_uri, with_password
 
     if os.path.lexists(store_path(choices.store) / NAME):
         return
@@ -230,7 +230,7 @@ def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
             raise first
         if first is not None:
             raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
-    if choices.mongo not in {None, EMBEDDED}:
+    if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
         from hybridlog_storage.database import Database
         from hybridlog_storage.index_state import IndexState

@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     from hybridlog.live.recorder import RecorderState
-    from hybridlog_storage.database import Database
+    from hybridlog.store import Store
 
 _EVERY_S = 1.0
 
@@ -84,12 +84,9 @@ def command(
     (name,) = choose(path, [] if recording is None else [recording])
     on_screen = not as_json and sys.stdout.isatty() and not once
     with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
-        database = None
+        opened = None
         if fields:
-            opened = held.enter_context(
-                opened_store(store, mongo, needs_database=True, is_lasting=True)
-            )
-            database = opened.database_for("top --field")
+            opened = held.enter_context(opened_store(store, mongo, is_lasting=True))
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for raw in states(path, name, _EVERY_S):
             if not raw:
@@ -97,8 +94,8 @@ def command(
             values = []
             if fields and raw.get("snapshots") is not None:
                 values = _values_of_ring(path, name, raw, fields, span)
-            elif database is not None:
-                values = _values(database, name, raw, fields, span)
+            elif opened is not None:
+                values = _values(opened, name, raw, fields, span)
             if as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
             elif table is not None:
@@ -130,35 +127,20 @@ def _field(text: str) -> _Field:
 
 
 def _values(
-    database: Database,
+    store: Store,
     recording: str,
     state: Mapping[str, Any],
     fields: Sequence[_Field],
     span: int,
 ) -> list[dict[str, Any]]:
-    """Least, mean and greatest of each field in the last seconds, from the index."""
-    from hybridlog_storage.topic_places import TopicPlaces
-
+    """Least, mean and greatest of each field in the last seconds, of what is flushed."""
     since = time.time_ns() - span
     found = []
-    asked = list(_resolved(state, fields))
-    places = TopicPlaces(database).of({topic for topic, _ in asked})
-    for topic, field in asked:
-        value = f"${field.path}"
-        group = {
-            "_id": None,
-            "n": {"$sum": 1},
-            "least": {"$min": value},
-            "mean": {"$avg": value},
-            "greatest": {"$max": value},
-        }
-        pipeline: list[Mapping[str, object]] = [
-            {"$match": {"_meta.rec": recording, **places[topic].documents(since)}},
-            {"$group": group},
-        ]
+    for topic, field in _resolved(state, fields):
         row: dict[str, Any] = {"topic": topic, "field": field.path, "n": 0}
-        for document in database.aggregate(places[topic].collection, pipeline, max_time_ms=2000):
-            row |= {key: document[key] for key in ("n", "least", "mean", "greatest")}
+        with suppress(UsageError):  # nothing has come yet
+            (one, *_) = store.query([topic], [recording]).between(since).stats(field.path)
+            row |= {"n": one.count, "least": one.min, "mean": one.mean, "greatest": one.max}
         found.append(row)
     return found
 

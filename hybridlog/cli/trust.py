@@ -20,13 +20,13 @@ def command(*, store: Path | None, forget: bool) -> None:
     """
     from hybridlog import consent
     from hybridlog.store import store_path
-    from hybridlog_storage.settings import read_settings
+    from hybridlog_storage.settings import is_uri, read_settings
 
     settings = read_settings(store_path(store))
     if forget:
         found = consent.forget(settings.store_id)
         output.say("forgotten" if found else "nothing was trusted")
-    elif settings.mongo is None:
+    elif not is_uri(settings.mongo):
         output.say("the store names no MongoDB: there is nothing to trust")
     else:
         consent.remember(settings.store_id, settings.mongo)

@@ -14,7 +14,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.query_options import recordings_of
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError
+from hybridlog_storage.errors import DatabaseError, WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.choice import Choice
@@ -55,11 +55,12 @@ def command(
         running = [one.label for one in chosen.summaries if one.status == "open"]
         if running and not quiet:
             output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
-    if not result.index and (result.findings or why is None):
+    is_wanted = not isinstance(why, WithoutMongoError)
+    if not result.index and is_wanted and (result.findings or why is None):
         output.note(f"The index was not compared: {why}")
     if result.findings:
         raise click.exceptions.Exit(1)
-    if not result.index and why is not None:
+    if not result.index and is_wanted and why is not None:
         raise DatabaseError(f"The index was not compared: {why}")
 
 

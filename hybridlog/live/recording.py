@@ -39,9 +39,9 @@ from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from hybridlog.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.catalog import Catalog
-    from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
@@ -134,10 +134,9 @@ class LiveRecording:
     Args:
         directory: The store.
         catalog: The store's catalog.
-        database: The index.
+        target: Where its index documents go.
         name: Name of the recording.
         options: Options.
-        renew: Makes a new connection to the index after a failure.
         on_close: Called with the report at the end of the recording.
     """
 
@@ -145,11 +144,10 @@ class LiveRecording:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        database: Database,
+        target: IndexTarget,
         name: str,
         options: LiveOptions,
         *,
-        renew: Callable[[], Database],
         on_close: Callable[[RecordReport], None],
     ) -> None:
         self._options = options
@@ -188,7 +186,7 @@ class LiveRecording:
             self._capture = Capture(
                 directory,
                 catalog,
-                database,
+                target,
                 name=name,
                 tags=options.tags,
                 source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
@@ -201,7 +199,6 @@ class LiveRecording:
                     next_chunk_size=self._reservation.next_chunk_size,
                     spare=threading.BoundedSemaphore(_spare_processors()),
                     on_written=self._make_room,
-                    renew=renew,
                 ),
             )
             self._frozen = self._frozen.pop_all()
@@ -349,7 +346,7 @@ class LiveRecording:
     @property
     def lag(self) -> int:
         """Messages that are not indexed yet."""
-        return max(self._capture.writer.totals.messages - self._capture.index.indexed, 0)
+        return self._capture.lag
 
     @property
     def index_failure(self) -> HybridlogError | None:

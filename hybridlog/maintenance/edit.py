@@ -13,6 +13,7 @@ from hybridlog.entries import (
     sealed_event,
     take_inventory,
 )
+from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import finish_renaming, put_entry
 from hybridlog.marks import mark_channel, mark_payload
 from hybridlog_storage import files, journal
@@ -112,7 +113,9 @@ def mark(
             segment.abandon()
             _take_back(segment)
             raise
-        put_entry(directory, catalog, label)
+        now = put_entry(directory, catalog, label)
+        if entry.is_decoded:
+            decode_again(directory, catalog, now)
 
 
 def _take_back(segment: SegmentFile) -> None:

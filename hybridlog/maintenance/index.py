@@ -6,8 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 
     from hybridlog.entries import Inventory
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
@@ -46,6 +45,8 @@ if TYPE_CHECKING:
 
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
+Decoded: TypeAlias = "Mapping[int, Mapping[int, Mapping[int, ChannelStats]]]"
+"""Statistics of messages by segment, chunk and channel."""
 _TRIES = 10
 
 
@@ -297,7 +298,7 @@ def catch_up(
         if (number, chunk) not in done
     }
     damage = catalog.damage(entry.id)
-    _index(
+    decoded = _index(
         directory,
         catalog,
         database,
@@ -307,7 +308,7 @@ def catch_up(
         progress=progress,
     )
     catalog.put_damage(entry.id, damage)
-    entry = finish(directory, catalog, database, label, turn=indexed.turn)
+    entry = finish(directory, catalog, database, label, turn=indexed.turn, decoded=decoded)
     if not entry.is_decoded:  # documents indexed before
         IndexState(database).show(decode_again(directory, catalog, entry, progress))
     return len(missing.keys() - damage.keys())
@@ -375,14 +376,14 @@ def _index(
     missing: Mapping[Place, int],
     damage: dict[Place, str],
     progress: Progress | None,
-) -> None:
+) -> Decoded:
     """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
-    from hybridlog.index_writer import IndexWriter
+    from hybridlog.index_writer import IndexTarget, IndexWriter
     from hybridlog.indexing import ChunkIndexer
 
     topics = tables.missing(directory, entry)
     writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
-    index = IndexWriter(ChunkIndexer(entry.id), database)
+    index = IndexWriter(entry, ChunkIndexer(entry.id), IndexTarget(database))
     # A chunk that is indexed already may be missing in the tables all the same.
     found = _chunks(
         directory,
@@ -411,6 +412,7 @@ def _index(
         raise
     finally:
         writer.discard()
+    return index.decoded
 
 
 def _chunks(
@@ -448,38 +450,58 @@ def _chunks(
 
 
 def finish(
-    directory: StoreDirectory, catalog: Catalog, database: Database, label: str, *, turn: int
+    directory: StoreDirectory,
+    catalog: Catalog,
+    database: Database | None,
+    label: str,
+    *,
+    turn: int,
+    decoded: Decoded,
 ) -> RecordingEntry:
     """Mark the index of a recording as complete; return the recording's complete entry.
 
     Decoding results go into the catalog, then the mirror becomes `complete`, and last the
     list of chunks is dropped.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        database: The index; None without one.
+        label: The recording.
+        turn: As for `IndexState.put`.
+        decoded: Statistics of chunks.
     """
-    state = IndexState(database)
     inventory = take_inventory(directory, label)
-    catalog.put_stamps(inventory.id, _stamps(state, inventory))
+    damage = catalog.damage(inventory.id)
+    catalog.put_stamps(inventory.id, _stamps(inventory, decoded, damage))
     described = describe_inventory(catalog, inventory)
     catalog.put(described)
     entry = described.entry
+    if database is None:
+        return entry
+    state = IndexState(database)
     state.put(
         entry,
         "complete",
         turn=turn,
         segments=entry.digests,
         has_list=True,
-        damage=catalog.damage(entry.id),
+        damage=damage,
     )
     state.drop_list(entry.key)
     return entry
 
 
-def _stamps(state: IndexState, inventory: Inventory) -> Iterator[tuple[int, str, NDArray[np.void]]]:
-    """Number, digest and stamp rows of each segment that has indexed chunks."""
-    indexed = state.chunks(inventory.id[:16])
-    for segment, chunks in groupby(indexed, key=lambda chunk: chunk.segment):
+def _stamps(
+    inventory: Inventory, decoded: Decoded, damage: Collection[Place]
+) -> Iterator[tuple[int, str, NDArray[np.void]]]:
+    """Number, digest and stamp rows of each segment whose chunks are all decoded."""
+    for segment, stats in decoded.items():
         summary = inventory.summaries.get(segment)
-        stats = {chunk.number: chunk.stats for chunk in chunks}
-        if summary is not None:
+        if summary is None:
+            continue
+        places = {(segment, number) for number in range(len(summary.table.chunks))}
+        if places.issubset({*damage, *((segment, number) for number in stats)}):
             yield segment, summary.digest, stamps_of(summary.table, stats)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog_storage.errors import StoreError, UsageError
-from hybridlog_storage.settings import EMBEDDED, read_settings, write_settings
+from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:
     from hybridlog_storage.database import Database
@@ -88,7 +88,8 @@ def become_another(path: Path, mongo: str | None) -> None:
 
     Args:
         path: The store.
-        mongo: URI of the MongoDB for its index, or `embedded`; None to keep the embedded one.
+        mongo: URI of the MongoDB for its index, `embedded`, or `none`; None to keep the embedded
+            one, or none.
 
     Raises:
         UsageError: It names a MongoDB, and no other one is given.
@@ -97,13 +98,13 @@ def become_another(path: Path, mongo: str | None) -> None:
     from hybridlog import consent
 
     settings = read_settings(path)
-    if settings.mongo is not None and mongo is None:
+    if is_uri(settings.mongo) and mongo is None:
         raise UsageError(
             "The copy names the same MongoDB as the store that it was copied from. Give it one "
             "of its own: --mongo mongodb://host/NAME, or --mongo embedded."
         )
-    own = None if mongo in {None, EMBEDDED} else mongo
+    own = None if mongo == EMBEDDED else mongo or settings.mongo
     changed = replace(settings, store_id=secrets.token_hex(16), mongo=own)
     write_settings(path, changed)
-    if own is not None:
+    if is_uri(own):
         consent.remember(changed.store_id, own)

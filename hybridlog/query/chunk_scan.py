@@ -187,7 +187,7 @@ class ChunkScan:
         plan = self._plan
         waiting: list[MessageRun] = []
         try:
-            for run, following in self._loaded():
+            for _, run, following in self.loaded():
                 if len(run.batch):
                     waiting.append(run)
                 ready, waiting = self._split(waiting, following)
@@ -204,7 +204,7 @@ class ChunkScan:
         started = time.monotonic()
         small: list[MessageRun] = []
         size = 0
-        for run, _ in self._loaded():
+        for _, run, _ in self.loaded():
             if not len(run.batch):
                 continue
             length = len(run.batch.buffer)
@@ -233,8 +233,8 @@ class ChunkScan:
                 if task.key in selection.offsets or any(c in selection.unindexed for c in held):
                     yield task, selection
 
-    def _loaded(self) -> Iterator[tuple[MessageRun, ChunkTask | None]]:
-        """The wanted messages of each chunk, and the chunk after it."""
+    def loaded(self) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
+        """Each chunk, its wanted messages, and the chunk after it."""
         tasks = self._plan.tasks()
         size = sum(task.chunk.length for task in tasks)
         if size < _MIN_THREADED_BYTES or not self._reads_ahead:
@@ -250,7 +250,7 @@ class ChunkScan:
         self,
         tasks: list[ChunkTask],
         start: Callable[[ChunkTask, RowSelection | None], _Loading],
-    ) -> Iterator[tuple[MessageRun, ChunkTask | None]]:
+    ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
         loading: deque[tuple[ChunkTask, _Loading]] = deque()
         upcoming = self._selected(tasks)
@@ -263,11 +263,12 @@ class ChunkScan:
             if not loading:
                 return
             check_wanted()
-            run, size, unreadable = loading.popleft()[1].result()
+            task, chunk = loading.popleft()
+            run, size, unreadable = chunk.result()
             counters.chunks_read += 1
             counters.bytes_read += size
             counters.unreadable += unreadable
-            yield run, loading[0][0] if loading else None
+            yield task, run, loading[0][0] if loading else None
 
     def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
         entry = task.chunk

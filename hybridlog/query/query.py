@@ -763,8 +763,7 @@ class Query:
     def documents(self) -> Iterator[dict[str, Any]]:
         """The index documents in MongoDB, in the order of the messages.
 
-        Raises:
-            DatabaseError: MongoDB is unavailable.
+        Without MongoDB, they are made of the messages.
         """
         from hybridlog.query.answers.index_documents import index_documents
 

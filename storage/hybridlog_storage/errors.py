@@ -121,6 +121,10 @@ class DatabaseError(HybridlogError):
     exit_code = 6
 
 
+class WithoutMongoError(DatabaseError):
+    """The store is used without MongoDB, as was asked for."""
+
+
 class ConnectionLostError(DatabaseError):
     """The connection to MongoDB has ended, or there is none. A new one may work."""
 

@@ -14,12 +14,12 @@ import os
 import re
 import secrets
 import struct
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Final, Literal, NamedTuple
 
-from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry
+from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database, ReadConcern
 from hybridlog_storage.topic_places import SHARED, TopicPlace
@@ -29,7 +29,6 @@ CHUNKS: Final = f"{CATALOG_PREFIX}chunks"
 STORE: Final = f"{CATALOG_PREFIX}store"
 """Collection that names the store that owns a database."""
 _AT_ONCE: Final = 500  # entries decoded at once; each takes some kilobytes as a dictionary
-_STATS: Final = tuple(of.name for of in fields(ChannelStats))
 
 State = Literal["open", "clearing", "indexing", "complete", "removing"]
 """State of a recording's index: being recorded, documents being removed for a rebuild, being
@@ -95,16 +94,6 @@ class Progressed(NamedTuple):
 
     turn: int
     segments: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class IndexedChunk:
-    """An indexed chunk."""
-
-    segment: int
-    number: int
-    offset: int
-    stats: dict[int, ChannelStats]
 
 
 class IndexState:
@@ -239,26 +228,10 @@ class IndexState:
                     "seg": chunk.segment,
                     "chunk": chunk.number,
                     "offset": chunk.offset,
-                    "ch": [
-                        {"c": c, **{name: getattr(stats, name) for name in _STATS}}
-                        for c, stats in sorted(chunk.stats.items())
-                    ],
                 }
                 for chunk in chunks
             ],
         )
-
-    def chunks(self, key: str) -> Iterator[IndexedChunk]:
-        """The indexed chunks of a recording, in order."""
-        asked = {"_id": _all_of(key)}
-        found = self._db.find(CHUNKS, asked, sort=[("_id", 1)], batch_size=_AT_ONCE)
-        for document in found:
-            stats = {}
-            for item in document["ch"]:
-                values = dict(item)
-                channel = int(values.pop("c"))
-                stats[channel] = ChannelStats(**values)
-            yield IndexedChunk(document["seg"], document["chunk"], document["offset"], stats)
 
     def places(self, key: str) -> dict[tuple[int, int], int]:
         """Offset of each indexed chunk, by segment and number."""

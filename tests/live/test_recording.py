@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording, memory_reservation
 from hybridlog.live import recording as live
-from hybridlog.maintenance import index
 from hybridlog.tables.reader import Tables
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import append_file, chunk_builder, segment_writer
@@ -36,7 +35,7 @@ from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
-from hybridlog_storage.index_state import CHUNKS, IndexedChunk, IndexState
+from hybridlog_storage.index_state import CHUNKS
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
@@ -864,8 +863,7 @@ def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
         assert isinstance(report.failure, DatabaseError)
     assert store.database is None
     assert [m.raw for m in store.topic("/talk")] == [text(b"kept")] * 5
-    with pytest.raises(DatabaseError, match="refuses it"):
-        list(store.topic("/talk").documents())
+    assert len(list(store.topic("/talk").documents())) == 5
     assert store.topic("/talk").where("data == 'kept'").count() == 5  # the segments know
     with hl.open(store.directory.path) as again:
         assert again.topic("/talk").where("data == 'kept'").count() == 5
@@ -891,46 +889,6 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     (found,) = report.entry.channels
     assert (found.stats.messages, found.stats.payload_bytes) == (2, 8 + 9)
     assert store.topic("/speech").where("data == 'lost'").count() == 1
-    assert not store.verify().findings
-
-
-def test_the_end_of_a_recording_asks_for_the_chunks_of_one_segment_at_a_time(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a day's recording they are more than the memory holds."""
-    handed: list[int] = []
-    made: list[tuple[int, int]] = []
-    real_chunks, real_stamps = IndexState.chunks, index.stamps_of
-
-    def chunks(self: IndexState, key: str) -> Iterator[IndexedChunk]:
-        for chunk in real_chunks(self, key):
-            handed.append(chunk.segment)
-            yield chunk
-
-    def stamps(table: Any, told: Any) -> Any:
-        made.append((len(told), len(handed)))
-        return real_stamps(table, told)
-
-    monkeypatch.setattr(IndexState, "chunks", chunks)
-    monkeypatch.setattr(index, "stamps_of", stamps)
-    settings = SegmentSettings(chunk_size=4000, segment_size=20_000)
-    recording = store.start("talk", flush_interval_s=0.05, settings=settings)
-    speech = channel("/speech")
-    for number in range(1, 31):
-        recording.write(speech, text(os.urandom(4000)), log_time=number)
-        wait_for(lambda n=number: (recording.stored[0], recording.lag) == (n, 0))
-    assert not handed
-    report = recording.close()
-    assert (report.entry.messages, report.entry.chunks) == (30, 30)
-    # One that only says how the recording ended has no messages.
-    assert len(report.entry.spans) == len(made) > 3
-    assert sum(count for count, _ in made) == 30
-    # The first of the next segment tells that one is whole.
-    done = 0
-    for count, seen in made:
-        done += count
-        assert count < 15
-        assert seen <= done + 1
     assert not store.verify().findings
 
 

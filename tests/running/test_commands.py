@@ -9,11 +9,12 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.cli import app, open_store
+from hybridlog_storage.settings import NONE
 from tests.cli.running import run
 from tests.cli.within import Answer, answer
 from tests.running.commands import COMMANDS, EXEMPT, Asked, place_for
 from tests.running.methods import LABEL, same
-from tests.running.running import NO_MONGODB, Running, begun
+from tests.running.running import Running, begun
 from tests.running.sequence import Known
 
 EVERY = [one for rules in COMMANDS.values() for one in rules]
@@ -39,7 +40,7 @@ def test_every_command_has_a_rule() -> None:
 
 
 @pytest.mark.parametrize(
-    "mongo", ["", pytest.param(NO_MONGODB, marks=pytest.mark.slow)], ids=["mongodb", "without"]
+    "mongo", ["", pytest.param(NONE, marks=pytest.mark.slow)], ids=["mongodb", "without"]
 )
 @pytest.mark.parametrize("one", EVERY, ids=_id)
 def test_at_rest(
@@ -71,9 +72,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, int]]:
     found: list[dict[str, int]] = []
     rebuilt = open_store._print_rebuilt
 
-    def look(store: hl.Store) -> None:
+    def look(store: hl.Store, doing: str) -> None:
         found.append(dict(store.entry(LABEL).messages_by_topic()))
-        rebuilt(store)
+        rebuilt(store, doing)
 
     monkeypatch.setattr(open_store, "_print_rebuilt", look)
     return found

@@ -1,4 +1,7 @@
-"""Index documents as MongoDB holds them, in the order of the messages."""
+"""Index documents as MongoDB holds them, in the order of the messages.
+
+Without MongoDB, they are made of the messages.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,17 @@ from typing import TYPE_CHECKING, Any
 import bson
 import numpy as np
 
+from hybridlog.indexing import ChunkIndexer
+from hybridlog.query.chunk_scan import ChunkScan
 from hybridlog.query.index_reader import without_documents
 from hybridlog.query.planner import Planner
-from hybridlog_storage.errors import ConnectionLostError
+from hybridlog_storage.chunk import StoredChunk
+from hybridlog_storage.errors import ConnectionLostError, DatabaseError
 from hybridlog_storage.index_columns import KeyColumns
 from hybridlog_storage.index_documents import KEY_BYTES
 
 if TYPE_CHECKING:
+    from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Question
     from hybridlog.session import Session
@@ -29,7 +36,7 @@ def index_documents(session: Session, question: Question, counters: Counters) ->
     """The index documents of the answer to a question.
 
     Raises:
-        DatabaseError: MongoDB is unavailable.
+        DatabaseError: the predicate is a MongoDB filter, and MongoDB is unavailable.
         IndexChangedError: another process changes the index.
         TopicError: a topic was recorded without index documents.
     """
@@ -66,14 +73,62 @@ def _matching(
     missing = next((part.topic for part in parts if not part.is_indexed), None)
     if missing is not None:
         raise without_documents(missing)
-    planner.index.connect(parts)
+    try:
+        planner.index.connect(parts)
+    except DatabaseError:
+        if any(part.needs_index for part in parts):
+            raise
+        yield from _made(planner, parts)
+        return
     counters.unindexed = planner.count_unindexed(parts)
     by_topic: dict[str, list[Part]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)
     streams = [stream for of_topic in by_topic.values() for stream in _of_topic(planner, of_topic)]
     # Keys are ordered by log time, recording and arrival, over all topics.
-    return heapq.merge(*streams, key=_key, reverse=question.reverse)
+    yield from heapq.merge(*streams, key=_key, reverse=question.reverse)
+
+
+def _made(planner: Planner, parts: Sequence[Part]) -> Iterator[tuple[str, Document]]:
+    """All matching documents with their topics, in order, made of the messages."""
+    plan = planner.plan(parts)
+    channels = {index: one.channel for index, one in enumerate(plan.channels)}
+    indexers = {part.recording.id: ChunkIndexer(part.recording.id) for part in parts}
+    waiting: list[tuple[str, Document]] = []
+    for task, run, following in ChunkScan(plan, planner.session.segment).loaded():
+        if len(run.batch):
+            at = task.chunk
+            chunk = StoredChunk(
+                segment=at.segment,
+                number=at.number,
+                offset=at.offset,
+                length=at.length,
+                trailer=at.trailer,
+                crc=0,
+                trailer_crc=0,
+                batch=run.batch,
+                seq=run.seq,
+                compressed_size=0,
+            )
+            found, _ = indexers[task.scan.recording.id].documents_of([chunk], channels)
+            for topic, tables in found:
+                raw = b"".join(table.tobytes() for table in tables)
+                waiting += [(topic, document) for document in bson.decode_all(raw)]
+            waiting.sort(key=_key, reverse=plan.reverse)
+        yield from _before(waiting, following, reverse=plan.reverse)
+
+
+def _before(
+    waiting: list[tuple[str, Document]], following: ChunkTask | None, *, reverse: bool
+) -> Iterator[tuple[str, Document]]:
+    """Take out the documents that none of the following chunks can precede."""
+    ready = len(waiting)
+    if following is not None:
+        times = (document["_meta"]["t"] for _, document in waiting)
+        is_later = (t <= following.last if reverse else t >= following.first for t in times)
+        ready = next((row for row, later in enumerate(is_later) if later), ready)
+    yield from waiting[:ready]
+    del waiting[:ready]
 
 
 def _key(pair: tuple[str, Document]) -> bytes:

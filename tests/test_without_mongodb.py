@@ -1,0 +1,235 @@
+"""Recording without MongoDB, and what is made of it where MongoDB is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.demo.write import write_bag
+from hybridlog.maintenance import index
+from hybridlog.query.query import Query
+from hybridlog_storage.errors import (
+    ConnectionLostError,
+    DatabaseError,
+    StoreError,
+    WithoutMongoError,
+)
+from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.settings import (
+    EMBEDDED,
+    NAME,
+    NONE,
+    StoreSettings,
+    read_settings,
+    write_settings,
+)
+from tests.cli.within import answer
+from tests.running.running import NO_MONGODB
+from tests.storage.test_mongod import fake_mongod
+
+TOPICS = ("/imu/data", "/base/scan", "/tf")
+SMALL = SegmentSettings(chunk_size=8192, segment_size=200_000)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "robot.bag"
+    write_bag(path, duration_s=5.0, topics=[*TOPICS])
+    return path
+
+
+@pytest.fixture(scope="module")
+def stores(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, hl.Store]]:
+    """One recording, without MongoDB and with it."""
+    path = tmp_path_factory.mktemp("stores")
+    opened = {mongo: hl.open(path / mongo, create=True, mongo=mongo) for mongo in (NONE, EMBEDDED)}
+    for store in opened.values():
+        report = store.record(bag, settings=SMALL)
+        assert (report.failure, report.missed) == (None, 0)
+        assert report.indexed == (0 if store is opened[NONE] else report.entry.messages)
+    yield opened
+    for store in opened.values():
+        store.close()
+
+
+QUESTIONS: dict[str, Callable[[hl.Store], Query]] = {
+    "all": lambda store: store.all_topics(),
+    "one": lambda store: store.topic("scan"),
+    "some": lambda store: store.topic("imu/data", "tf").every(7).limit(20),
+    "backwards": lambda store: store.all_topics().reverse().limit(50),
+    "in a range": lambda store: store.all_topics().between("+1s", "+2.5s"),
+    "by stamp": lambda store: store.topic("imu/data").clock("header").between("+1s", "+2s"),
+    "a condition": lambda store: store.topic("scan").where("ranges.min < 3 and range_max > 1"),
+    "a pattern": lambda store: store.topic("imu/data").where("header.frame_id =~ 'imu'"),
+    "nothing": lambda store: store.topic("scan").where("ranges.min < -1"),
+}
+
+
+def documents(query: Query) -> list[dict[str, Any]]:
+    """Documents without what differs from store to store."""
+    found = []
+    for document in query.documents():
+        del document["_id"], document["_meta"]["rec"]
+        found.append(document)
+    return found
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_documents_are_made_of_messages(stores: dict[str, hl.Store], name: str) -> None:
+    made, kept = (documents(QUESTIONS[name](stores[mongo])) for mongo in (NONE, EMBEDDED))
+    assert made == kept
+    assert bool(made) == (name != "nothing")
+
+
+def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
+    store = stores[NONE]
+    for ask in (
+        lambda: store.topic("scan").where({"$expr": {"$gt": ["$header.seq", 3]}}).count(),
+        lambda: list(store.topic("scan").where({"$expr": True}).documents()),
+        store.indexes,
+        store.reindex,
+        store.connect,
+    ):
+        with pytest.raises(DatabaseError, match=r"without MongoDB.*--mongo embedded"):
+            ask()
+    assert isinstance(store.without_database, WithoutMongoError)
+    assert (store.verify().index, store.verify().findings) == (False, [])
+    assert store.index_place == "none"
+
+
+def test_header_statistics_and_marks(
+    stores: dict[str, hl.Store], bag: Path, tmp_path: Path
+) -> None:
+    (want,) = stores[EMBEDDED].recordings()
+    with hl.open(tmp_path / "store", create=True, mongo=NONE) as store:
+        entry = store.record(bag, settings=SMALL).entry
+        stats = [c.stats for c in entry.channels]
+        assert stats == [c.stats for c in want.channels]
+        assert any(of.stamped for of in stats)
+        marked = store.mark(entry.id, "+1s", "here")
+        assert marked.is_decoded
+        assert store.topic("/hybridlog/marks").count() == 1
+        assert store.topic("scan").stats("range_max")[0].count == store.topic("scan").count()
+
+
+@pytest.mark.parametrize("way", ["option", "variable", "settings"])
+def test_the_ways_to_say_so(
+    way: str, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "store"
+    words: tuple[str, ...] = ()
+    if way == "option":
+        words = ("--mongo", NONE)
+    elif way == "variable":
+        monkeypatch.setenv("HYBRIDLOG_MONGO_URI", NONE)
+    else:
+        hl.open(path, create=True).close()
+        before = read_settings(path)
+        write_settings(path, StoreSettings(before.store_id, NONE))
+        assert 'mongo = "none"' in (path / NAME).read_text()
+    done = answer("record", bag, *words, store=path)
+    assert "MongoDB" not in done.err
+    assert not (path / "mongod").exists()
+    assert read_settings(path).mongo == NONE
+    done = answer("index", *words, store=path, code=6)
+    assert answer("trust", store=path).out == (
+        "the store names no MongoDB: there is nothing to trust\n"
+    )
+
+
+def test_no_mongod_is_none(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/nowhere/mongod")
+    done = answer("record", bag, "-q", store=tmp_path / "store")
+    (line,) = done.err.splitlines()
+    assert line.startswith("MongoDB is unavailable, so there is no index:")
+    assert "/nowhere/mongod" in line
+    with hl.open(tmp_path / "store") as store:
+        assert len(list(store.topic("scan").documents())) == store.topic("scan").count() > 0
+
+
+def test_a_mongod_that_ends_twice_is_none(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = f'echo start >> {tmp_path}/starts; echo "Exec format error"; exit 1'
+    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    with hl.open(tmp_path / "store", create=True) as store:
+        report = store.record(bag)
+        assert (report.failure, report.indexed) == (None, 0)
+        assert (tmp_path / "starts").read_text() == "start\n" * 2
+        assert store.topic("scan").where("ranges.min > 0").count() > 0
+
+
+def test_a_server_that_is_away_gets_its_index_later(bag: Path, tmp_path: Path) -> None:
+    hl.open(tmp_path / "store", create=True).close()
+    done = answer("record", bag, "-q", "--mongo", NO_MONGODB, store=tmp_path / "store")
+    assert "MongoDB is unavailable, so the index is made later: " in done.err
+    assert "not in the index" in done.err
+    with hl.open(tmp_path / "store") as store:
+        store.connect()
+        (entry,) = store.recordings()
+        assert entry.is_decoded
+        assert store.repairs.indexed == {entry.label: entry.chunks}
+        assert store.verify().findings == []
+
+
+def test_a_live_recording_while_the_server_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hybridlog.live import LiveOptions
+    from tests.running.sequence import CHANNELS, messages
+
+    with hl.open(tmp_path / "store", create=True) as store:
+        real = store.session.connection.another
+        away = True
+
+        def another() -> Any:
+            if away:
+                raise ConnectionLostError("MongoDB does not answer")
+            return real()
+
+        monkeypatch.setattr(store.session.connection, "another", another)
+        with store.start("live", LiveOptions(flush_interval_s=0.1)) as recording:
+            for one in messages(0, 50, 0):
+                recording.write(CHANNELS[one.topic], one.raw, log_time=one.log_time)
+            assert str(recording.index_failure) == "MongoDB does not answer"
+            away = False
+        report = recording.close()
+        assert (report.failure, report.indexed) == (None, report.entry.documents)
+        assert store.verify().findings == []
+        assert store.verify().index
+
+
+def test_a_store_is_adopted_where_mongodb_is(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An adoption that ends in between goes on where it was."""
+    path = tmp_path / "store"
+    with hl.open(path, create=True, mongo=NONE) as store:
+        for name in ("one", "two"):
+            store.record(bag, name=name, again=True, settings=SMALL)
+        chunks = {entry.label: entry.chunks for entry in store.recordings()}
+    read = index._chunks
+    left = [chunks["one"] + chunks["two"] // 2]
+
+    def some(*args: Any, **options: Any) -> Any:
+        for one in read(*args, **options):
+            if not left[0]:
+                raise StoreError("killed")
+            left[0] -= 1
+            yield one
+
+    with hl.open(path, mongo=EMBEDDED) as store, monkeypatch.context() as patch:
+        patch.setattr(index, "_chunks", some)
+        with pytest.raises(StoreError, match="killed"):
+            store.connect()
+    with hl.open(path, mongo=EMBEDDED) as store:
+        store.connect()
+        assert "one" not in store.repairs.indexed
+        assert 0 < store.repairs.indexed["two"] <= chunks["two"]
+        found = store.verify()
+        assert (found.findings, found.index) == ([], True)
+        assert store.topic("scan").where({"$expr": True}).count() == store.topic("scan").count()
