@@ -7,7 +7,6 @@ the rules of `document.py` to it.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import bson
@@ -21,9 +20,8 @@ from hybridlog.schema.codec import (
     DecodedObjects,
     error_group,
 )
-from hybridlog.schema.column import Scalars
 from hybridlog.schema.document import top_level_names
-from hybridlog.schema.summary import summarise
+from hybridlog.schema.summary import nearest_double, summary_of
 from hybridlog.schema.utf8 import repaired_text
 from hybridlog.schema.wire import Unreadable
 from hybridlog_storage.errors import PayloadError
@@ -44,7 +42,6 @@ MAX_BYTES = 8 << 20
 MAX_DEPTH = 100
 """Deepest nesting that MongoDB surely accepts."""
 
-_NUMBERS = (bool, int, float)
 _INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
 
 
@@ -101,7 +98,7 @@ def _indexed(value: Plain, limit: int, depth: int) -> object:
     if isinstance(value, str):
         return repaired_text(value)
     if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:
-        return _double(value)
+        return nearest_double(value)
     return value
 
 
@@ -109,36 +106,11 @@ def _key(key: str) -> str:
     return repaired_text(key).replace("\0", "\N{REPLACEMENT CHARACTER}")
 
 
-def _double(value: float) -> float:
-    """The nearest double; beyond the largest, an infinity."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
-
-
-def _numbers(values: Sequence[Plain]) -> NDArray[Any] | None:
-    """Numbers as an array: bool, int64, uint64 or float64; None if they are not numbers."""
-    numbers = [v for v in values if isinstance(v, _NUMBERS)]
-    if len(numbers) < len(values):
-        return None
-    if numbers and all(isinstance(v, bool) for v in numbers):
-        return np.array(numbers, np.bool_)
-    if numbers and all(isinstance(v, int) for v in numbers):
-        low, high = min(numbers), max(numbers)
-        if low >= _INT64_MIN and high <= _INT64_MAX:
-            return np.array(numbers, np.int64)
-        if low >= 0 and high < 1 << 64:
-            return np.array(numbers, np.uint64)
-    return np.array([_double(v) for v in numbers], np.float64)
-
-
 def _summary(values: list[Plain]) -> dict[str, object]:
     found: dict[str, object] = {"n": Int64(len(values))}
-    numbers = _numbers(values)
-    if numbers is None:
+    summary = summary_of(values)
+    if summary is None:
         return found
-    summary = summarise(Scalars(numbers), np.array([0, len(numbers)], np.int64))
     if not summary.has[0]:
         return found | {"min": None, "max": None, "mean": None}
     low, high = _element(summary.min[0].item()), _element(summary.max[0].item())

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from hybridlog.schema.column import Scalars
 
-    from hybridlog.schema.column import Scalars
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
 
 _LONG = 4096  # elements of a row from which a loop over rows is faster
@@ -74,6 +77,33 @@ class Totals:
         with np.errstate(over="ignore"):  # all are the greatest, and their mean is rounded up
             large = np.clip(self._large / counts * _LARGE, -most, most)
             return np.clip(self._sums / counts + large, -most, most)
+
+
+def nearest_double(value: float) -> float:
+    """The nearest double; beyond the largest, an infinity."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
+def summary_of(values: Sequence[object]) -> Summary | None:
+    """The summary of one list of Python numbers and booleans; None of other values."""
+    numbers = [value for value in values if isinstance(value, bool | int | float)]
+    if len(numbers) < len(values):
+        return None
+    kind: type[np.generic] = np.float64
+    if numbers and all(isinstance(value, bool) for value in numbers):
+        kind = np.bool_
+    elif numbers and all(isinstance(value, int) for value in numbers):
+        low, high = min(numbers), max(numbers)
+        if low >= -(1 << 63) and high < 1 << 63:
+            kind = np.int64
+        elif low >= 0 and high < 1 << 64:
+            kind = np.uint64
+    if kind is np.float64:
+        numbers = [nearest_double(value) for value in numbers]
+    return summarise(Scalars(np.array(numbers, kind)), np.array([0, len(numbers)], np.int64))
 
 
 def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias, TypeGuard, cast
 
-from hybridlog.query.predicate.numbers import HIGH, LOW, equal, is_number, nearest, ordered
+from hybridlog.query.predicate.numbers import equal, is_number, nearest, ordered
 from hybridlog.query.predicate.regex import compile_regex, text_of
 from hybridlog.query.predicate.tree import (
     And,
@@ -336,6 +336,8 @@ def statistic(stat: Stat, values: Sequence[object]) -> float | None:
     """A statistic of an array, equal to that in its summary in the index."""
     if stat == "n":
         return len(values)
+    from hybridlog.schema.summary import summary_of
+
     numbers = [value for value in values if isinstance(value, int | float)]
     finite = [
         value * 1  # True counts as 1
@@ -345,7 +347,8 @@ def statistic(stat: Stat, values: Sequence[object]) -> float | None:
     if not finite:
         return None
     if stat == "mean":
-        return _mean(numbers)
+        found = summary_of(numbers)
+        return float(found.mean[0]) if found is not None and found.has[0] else None
     return min(finite) if stat == "min" else max(finite)
 
 
@@ -360,23 +363,6 @@ def with_statistics(message: Message, paths: Iterable[str]) -> Message:
         if isinstance(array, list | bytes):
             found[path] = statistic(cast("Stat", stat), array)
     return found
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    import numpy as np
-
-    from hybridlog.schema.column import Scalars
-    from hybridlog.schema.summary import summarise
-
-    integers = all(isinstance(value, int) for value in values)
-    if integers and min(values) >= LOW and max(values) <= HIGH:
-        numbers = np.array(values)
-    elif integers and min(values) >= 0 and max(values) < 2**64:
-        numbers = np.array(values, np.uint64)
-    else:
-        numbers = np.array([nearest(value) for value in values], np.float64)
-    found = summarise(Scalars(numbers), np.array([0, len(numbers)], np.int64))
-    return float(found.mean[0]) if found.has[0] else None
 
 
 def _node(node: Node, reader: _Reader) -> Decision:
