@@ -29,6 +29,7 @@ from hybridlog.maintenance.opening import (
 )
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
@@ -54,7 +55,8 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.forks import begins_anew
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segment_reader import SegmentReader, place_of
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -1000,6 +1002,36 @@ class Session:
         except CatalogError:
             put_again(self.directory, self.catalog, recording)
             return self.catalog.table(recording, number)
+
+    def parts(
+        self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
+    ) -> Parts:
+        """The parts of chunks that may hold messages of some channels in a time range.
+
+        Args:
+            recording: The recording.
+            channels: Channel ids.
+            span: Log time `[begin, end)`, ns.
+        """
+        ids = np.array([*channels], np.int64)
+        found = [np.empty((0, 6), np.int64)]
+        for number, first, last in recording.spans:
+            if min(first, END - 1) < span[1] and last >= span[0]:
+                rows = part_rows(number, self.chunk_table(recording, number))
+                inside = (placed(rows[:, 4]) < span[1]) & (rows[:, 5] >= span[0])
+                found.append(rows[inside & np.isin(rows[:, 2], ids)])
+        return Parts.of(np.concatenate(found))
+
+    def times(
+        self, recording: RecordingEntry, segment: int, chunk: int
+    ) -> dict[int, NDArray[np.int64]]:
+        """Log times of a chunk's messages by channel, ascending; reads no payload.
+
+        Raises:
+            SegmentError: They are missing or damaged.
+        """
+        place = place_of(self.chunk_table(recording, segment), chunk)
+        return self.segment(recording.id, segment).read_times(place)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a segment of a recording, by its id. Thread safe."""

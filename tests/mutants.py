@@ -1084,19 +1084,22 @@ SILENT = [
         ),
     ),
     *_of(
-        "hybridlog/drawing/chunk_parts.py",
+        "hybridlog/query/chunk_counts.py",
         (
             "chunks-that-were-flushed-later-have-other-numbers",
-            "np.repeat(np.arange(known, count), counts[known:])",
-            "np.repeat(np.arange(count - known), counts[known:])",
+            "np.repeat(np.arange(known, len(counts)), counts[known:])",
+            "np.repeat(np.arange(len(counts) - known), counts[known:])",
             DENSITY,
         ),
         (
             "chunks-are-counted-each-time-they-are-looked-for",
-            "new = table.parts[int(counts[:known].sum()) :]",
-            "new = table.parts[known:]",
+            "parts = table.parts[int(counts[:known].sum()) :]",
+            "parts = table.parts[known:]",
             DENSITY,
         ),
+    ),
+    *_of(
+        "hybridlog/drawing/chunk_parts.py",
         (
             "a-segment-is-read-up-to-what-was-flushed",
             "            if not table.is_flushed:\n",

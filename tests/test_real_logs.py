@@ -11,6 +11,7 @@ import bson
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog_storage.errors import AlreadyRecordedError, SourceError
@@ -182,3 +183,39 @@ def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> No
     assert sum(map(len, before.values())) > 150_000
     store.reindex()
     assert dump(store) == before
+
+
+@pytest.mark.parametrize("name", [name for name in WHOLE if name.startswith("real/")])
+def test_segments_are_hardly_larger_than_a_plain_mcap_file(name: str, tmp_path: Path) -> None:
+    """One that the `mcap` package writes with its defaults: chunks of 1 MiB, zstd."""
+    with hl.open(tmp_path / "store", create=True) as store:
+        label = store.record(DATA / name).entry.label
+    plain = io.BytesIO()
+    writer = Writer(plain)
+    writer.start()
+    channels: dict[int, int] = {}
+    schemas: dict[int, int] = {0: 0}
+    size = 0
+    for path in sorted((tmp_path / "store" / "recordings" / label).glob("*.mcap")):
+        size += path.stat().st_size
+        with path.open("rb") as file:
+            for schema, channel, message in make_reader(file).iter_messages():
+                if schema is not None and schema.id not in schemas:
+                    about = (schema.name, schema.encoding, schema.data)
+                    schemas[schema.id] = writer.register_schema(*about)
+                if channel.id not in channels:
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic,
+                        channel.message_encoding,
+                        schemas[channel.schema_id],
+                        channel.metadata,
+                    )
+                writer.add_message(
+                    channels[channel.id],
+                    message.log_time,
+                    message.data,
+                    message.publish_time,
+                    message.sequence,
+                )
+    writer.finish()
+    assert size <= 1.05 * len(plain.getvalue())

@@ -109,7 +109,7 @@ def _is_file(word: str) -> bool:
     help="Compression of chunks.",
 )
 @click.option(
-    "--level", type=click.IntRange(1, 19), default=1, metavar="N", help="zstd level, 1 to 19."
+    "--level", type=click.IntRange(1, 19), default=3, metavar="N", help="zstd level, 1 to 19."
 )
 @click.option(
     "--ros1",

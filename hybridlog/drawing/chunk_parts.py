@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.segment_reader import places_of
+from hybridlog.query.chunk_counts import Parts, part_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,35 +15,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.segment_reader import ChunkPlace
 
 _CHANNELS = 1 << 16  # ids of channels
-
-
-class Parts(NamedTuple):
-    """The messages of one channel in one chunk, a row each.
-
-    Attributes:
-        segment: int64[n], number of the segment.
-        chunk: int64[n], number of the chunk in it.
-        channel: int64[n], id.
-        topic: intp[n], place of its topic among those asked for.
-        messages: int64[n].
-        first: int64[n], least log time, ns.
-        last: int64[n], greatest log time, ns.
-    """
-
-    segment: NDArray[np.int64]
-    chunk: NDArray[np.int64]
-    channel: NDArray[np.int64]
-    topic: NDArray[np.intp]
-    messages: NDArray[np.int64]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
-
-    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Parts:
-        """Some rows."""
-        return Parts(*(column[rows] for column in self))
 
 
 class RecordedChunks:
@@ -61,7 +34,6 @@ class RecordedChunks:
         self._recording = recording
         self._known: dict[int, int] = {}  # chunks of each segment whose parts are known
         self._sealed: set[int] = set()  # segments with no other chunks
-        self._places: dict[int, list[ChunkPlace]] = {}
         self._rows: list[NDArray[np.int64]] = []
         self._size = 0
 
@@ -115,20 +87,15 @@ class RecordedChunks:
         Args:
             span: Log time `[begin, end)`, ns.
         """
-        names = ("channel", "messages", "first", "last")
         for number, first, last in self._recording.spans:
             if number in self._sealed or first >= span[1] or last < span[0]:
                 continue
             table = self._session.chunk_table(self._recording, number)
-            known, count = self._known.get(number, 0), len(table.chunks)
-            counts = table.chunks["parts"]
-            new = table.parts[int(counts[:known].sum()) :]
-            chunk = np.repeat(np.arange(known, count), counts[known:])
-            columns = [new[name].astype(np.int64) for name in names]
+            new = part_rows(number, table, self._known.get(number, 0))
             if len(new):
-                self._rows.append(np.stack([np.full_like(chunk, number), chunk, *columns], axis=1))
+                self._rows.append(new)
                 self._size += len(new)
-            self._known[number] = count
+            self._known[number] = len(table.chunks)
             if not table.is_flushed:
                 self._sealed.add(number)
 
@@ -149,8 +116,7 @@ class RecordedChunks:
         for channel in self._recording.channels:
             topic_of[channel.id] = places.get(channel.topic, -1)
         wanted = (rows[:, 4] < span[1]) & (rows[:, 5] >= span[0]) & (topic_of[rows[:, 2]] >= 0)
-        segment, chunk, channel, messages, first, last = np.ascontiguousarray(rows[wanted].T)
-        return Parts(segment, chunk, channel, topic_of[channel], messages, first, last)
+        return Parts.of(rows[wanted], topic_of[rows[wanted, 2]])
 
     def times(self, segment: int, chunk: int) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, ascending; reads no payload.
@@ -158,8 +124,4 @@ class RecordedChunks:
         Raises:
             SegmentError: They are missing or damaged.
         """
-        places = self._places.get(segment, [])
-        if chunk >= len(places):
-            places = places_of(self._session.chunk_table(self._recording, segment))
-            self._places[segment] = places
-        return self._session.segment(self._recording.id, segment).read_times(places[chunk])
+        return self._session.times(self._recording, segment, chunk)

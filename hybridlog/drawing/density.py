@@ -1,28 +1,27 @@
 """Counts of messages by pixel, for timelines. No payload is read.
 
-A chunk table has the number, the first and the last log time of each channel's messages in
-each chunk. Where these lie in one pixel, they are counted without reading anything. For the
-other chunks the message indexes are read, 16 bytes a message. If these are too many, the
-messages of a chunk are spread evenly over its time, and the counts are marked as estimates.
+They are counted as `chunk_counts` says. If too many message indexes would be read, the messages
+of a chunk are spread evenly over its time, and the counts are marked as estimates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from hybridlog.drawing.chunk_parts import RecordedChunks
+from hybridlog.query.chunk_counts import Placed
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.times import placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.chunk_parts import Parts
+    from hybridlog.query.chunk_counts import Parts
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -103,17 +102,16 @@ def count(
     pixels = len(edges) - 1
     counts = np.zeros((len(topics), pixels), np.int64)
     exact = np.ones(len(topics), np.bool_)
-    placed = _Placed.of(chunks.parts((int(edges[0]), int(edges[-1])), topics, since), edges)
-    whole = placed.take(placed.is_whole)
-    np.add.at(counts, (whole.parts.topic, whole.low), whole.parts.messages)
-    # Of two messages both times are known.
-    pairs = placed.take(~placed.is_whole & (placed.parts.messages == 2))
-    for place in (pairs.low, pairs.high):
-        inside = (place >= 0) & (place < pixels)
-        np.add.at(counts, (pairs.parts.topic[inside], place[inside]), 1)
-    others = placed.take(placed.is_cut)
+    parts = chunks.parts((int(edges[0]), int(edges[-1])), topics, since)
+    others = Placed.of(parts, edges).add_known(counts)
+
+    def times(segment: int, chunk: int) -> Mapping[int, NDArray[np.int64]]:
+        with suppress(SegmentError):
+            return chunks.times(segment, chunk)
+        return {}
+
     if _work(others.parts) <= most_work:
-        others = _add_read(chunks, others, edges, counts)
+        others = others.add_read(edges, counts, times)
     if len(others.low):
         _add_estimated(others.parts, edges, counts)
         exact[others.parts.topic] = False
@@ -122,86 +120,12 @@ def count(
 
 def reading_work(chunks: RecordedChunks, topics: Sequence[str], edges: NDArray[np.int64]) -> int:
     """Cost of `count`: the messages whose times it reads, and `_CHUNK_WORK` for each chunk."""
-    placed = _Placed.of(chunks.parts((int(edges[0]), int(edges[-1])), topics), edges)
-    return _work(placed.parts.take(placed.is_cut))
-
-
-class _Placed(NamedTuple):
-    """Parts, and the pixels of their first and last messages.
-
-    Attributes:
-        parts: n parts.
-        low: intp[n], -1 before the first pixel.
-        high: intp[n], the number of pixels behind the last one.
-    """
-
-    parts: Parts
-    low: NDArray[np.intp]
-    high: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, parts: Parts, edges: NDArray[np.int64]) -> _Placed:
-        """Parts in a picture."""
-        low, high = (
-            np.searchsorted(edges, placed(t), "right") - 1 for t in (parts.first, parts.last)
-        )
-        return cls(parts, low, high)
-
-    @property
-    def is_whole(self) -> NDArray[np.bool_]:
-        """bool[n], whether all messages of a part are in one pixel."""
-        found: NDArray[np.bool_] = self.low == self.high
-        return found
-
-    @property
-    def is_cut(self) -> NDArray[np.bool_]:
-        """bool[n], whether the pixels of a part's messages are unknown."""
-        found: NDArray[np.bool_] = ~self.is_whole & (self.parts.messages > 2)
-        return found
-
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> _Placed:
-        """Some rows."""
-        return _Placed(self.parts.take(rows), self.low[rows], self.high[rows])
+    placed = Placed.of(chunks.parts((int(edges[0]), int(edges[-1])), topics), edges)
+    return _work(placed.parts.take(~placed.is_whole & (placed.parts.messages > 2)))
 
 
 def _work(parts: Parts) -> int:
-    if not len(parts.chunk):
-        return 0
-    segment, chunk = parts.segment, parts.chunk
-    is_next = (segment[1:] != segment[:-1]) | (chunk[1:] != chunk[:-1])
-    return int(parts.messages.sum()) + _CHUNK_WORK * (1 + int(is_next.sum()))
-
-
-def _add_read(
-    chunks: RecordedChunks,
-    placed: _Placed,
-    edges: NDArray[np.int64],
-    counts: NDArray[np.int64],
-) -> _Placed:
-    """Count messages by their times; returns those of chunks that cannot be read."""
-    pixels = len(edges) - 1
-    parts = placed.parts
-    columns = (parts.segment, parts.chunk, parts.channel, parts.topic, placed.low, placed.high)
-    is_unread = np.zeros(len(parts.chunk), np.bool_)
-    chunk: tuple[int, int] | None = None
-    times: dict[int, NDArray[np.int64]] = {}
-    for row, (segment, number, channel, topic, low, high) in enumerate(
-        zip(*(column.tolist() for column in columns), strict=True)
-    ):
-        if chunk != (segment, number):
-            chunk, times = (segment, number), {}
-            with suppress(SegmentError):
-                times = chunks.times(segment, number)
-        found = times.get(channel)
-        if found is None:
-            is_unread[row] = True
-            continue
-        bounds = np.searchsorted(found, edges[low + 1 : high + 1])
-        steps = np.append(bounds, len(found))
-        steps[1:] -= bounds
-        begin, end = max(low, 0), min(high + 1, pixels)
-        counts[topic, begin:end] += steps[begin - low : end - low]
-    return placed.take(is_unread)
+    return int(parts.messages.sum()) + _CHUNK_WORK * len(parts.chunk_starts)
 
 
 def _add_estimated(parts: Parts, edges: NDArray[np.int64], counts: NDArray[np.int64]) -> None:

@@ -8,21 +8,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from hybridlog_storage.errors import TimeError, UsageError
-from hybridlog_storage.times import placed, span_of
+from hybridlog_storage.times import earlier, placed, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
-
-_BACK_NS: Final = 1_000_000_000
-_FURTHER: Final = 64
 
 
 @dataclass(frozen=True)
@@ -193,13 +190,13 @@ def matches_before(matches: Matches, place: Match, count: int) -> list[Match]:
     """The last matches in front of a place, in order; see `matches_after`."""
     found: list[Match] = []
     end = span_of(place.time, place.time)[1]
-    for begin in _earlier(place.time):
-        earlier: deque[Match] = deque(maxlen=count - len(found))
+    for begin in earlier(place.time):
+        last: deque[Match] = deque(maxlen=count - len(found))
         for times, seqs in matches.rows(begin, end):
             in_front = (times < place.time) | ((times == place.time) & (seqs < place.seq))
             rows = np.flatnonzero(in_front)[-count:]
-            earlier.extend(map(Match, times[rows].tolist(), seqs[rows].tolist()))
-        found = [*earlier, *found]
+            last.extend(map(Match, times[rows].tolist(), seqs[rows].tolist()))
+        found = [*last, *found]
         if len(found) == count:
             break
         end = begin
@@ -214,12 +211,3 @@ def count_before(matches: Matches, place: Match) -> int:
         in_front = (times < place.time) | ((times == place.time) & (seqs < place.seq))
         count += int(np.count_nonzero(in_front))
     return count
-
-
-def _earlier(time: int) -> Iterator[int]:
-    """Beginnings of spans before a time, each longer than the last; the last one is 0."""
-    back = _BACK_NS
-    while time - back > 0:
-        yield time - back
-        back *= _FURTHER
-    yield 0

@@ -13,7 +13,8 @@ from hybridlog_storage.errors import SegmentError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.chunk_parts import Parts, RecordedChunks
+    from hybridlog.drawing.chunk_parts import RecordedChunks
+    from hybridlog.query.chunk_counts import Parts
 
 _SAMPLED: Final = 16  # chunks that are read for one topic
 

@@ -106,7 +106,7 @@ def mark(
             Journal(path).append(marked, sealed_event(sealed))
 
         try:
-            segment.define(channel_id, schema_id, channel)
+            segment.define([(channel_id, schema_id, channel)])
             segment.append_chunks([_chunk(channel_id, moment, payload, seq)], segment.position + 1)
             segment.seal(sync=True, on_sealing=announce)
         except BaseException:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.times import placed
+from hybridlog_storage.times import earlier, placed
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChunkEntry
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     """Asks the database for the chunks of some channels in a time range, or in all times."""
 
 _MOST = 20_000  # entries cached for one recording, about 1 kB each
-_BACK_NS = 1_000_000_000  # length of the first span searched for the last message
-_FURTHER = 64  # factor by which each next span is longer
 
 
 class ChunkLists:
@@ -114,7 +112,7 @@ def latest_first(
     """
     start, latest = span
     seen: set[tuple[int, int]] = set()
-    for begin in earlier_and_earlier(latest, start):
+    for begin in earlier(latest, start):
         part = _ChunkList(fetch((begin, latest + 1)), channels)
         for chunk, last in part.before(latest):
             place = chunk.segment, chunk.offset
@@ -122,15 +120,6 @@ def latest_first(
                 seen.add(place)
                 # Chunks that are not yet fetched end before this piece begins.
                 yield chunk, max(last, begin - 1)
-
-
-def earlier_and_earlier(latest: int, start: int) -> Iterator[int]:
-    """Starts of the search for the last message by a time, ns: the nearest first."""
-    back = _BACK_NS
-    while latest - back > start:
-        yield latest - back
-        back *= _FURTHER
-    yield start
 
 
 class _ChunkList:

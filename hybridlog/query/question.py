@@ -188,6 +188,8 @@ class Part:
         low, high = self.bounds if self.bounds and self.clock == "log" else (0, END)
         if self.windows is None:
             return np.array([[low, high]] if low < high else [], np.int64).reshape(-1, 2)
+        if self.bounds is None:
+            return self.windows
         cut = np.clip(self.windows, low, high)
         return cut[cut[:, 1] > cut[:, 0]]
 

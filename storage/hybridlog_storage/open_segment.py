@@ -26,7 +26,13 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable, parts_of
 from hybridlog_storage.compression import FilePart
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD, RECORD_HEAD, read_record
+from hybridlog_storage.mcap_content import (
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    Record,
+    parse_content,
+    read_record,
+)
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segment_format import (
@@ -46,7 +52,7 @@ from hybridlog_storage.segment_format import (
     proof_of,
     split_trailer,
 )
-from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader, loss_rows
+from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader, loss_rows, open_chunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -266,7 +272,11 @@ class OpenSegment:
             raise SegmentError("the arrival record is too large")
         elif opcode == ARRIVAL_OPCODE and self._chunk is not None:
             (offset, size), self._chunk = self._chunk, None
-            self._add_chunk(offset, size, at, length)
+            if at > offset + size or proof_of(self._content(at, length)).chunk:
+                self._add_chunk(offset, size, at, length)
+            else:  # a chunk with definitions alone
+                self._unproven.append((Opcode.CHUNK, offset, size))
+                self._prove(proof_of(self._content(at, length)), at)
         elif opcode == ARRIVAL_OPCODE:
             self._prove(proof_of(self._content(at, length)), at)
         elif opcode in _HELD:
@@ -298,15 +308,24 @@ class OpenSegment:
             return
         if length > _MAX_RECORD:
             raise SegmentError("the record is too large")
+        if opcode == Opcode.CHUNK:
+            content, _ = open_chunk(self.reader.read(at, length))
+            for definition in parse_content(content).definitions:
+                self._define(definition.record)
+            return
         record, size = read_record(opcode, self._content(at, length))
         if size != length - RECORD_HEAD.size:
             raise SegmentError("the record is longer than its fields")
+        if isinstance(record, Metadata):
+            self._add_metadata(record, at, length)
+        else:
+            self._define(record)
+
+    def _define(self, record: Record | None) -> None:
         if isinstance(record, SchemaRecord):
             self._schemas[record.id] = record
         elif isinstance(record, ChannelRecord):
             self.channels[record.id] = channel_of(record, self._schemas)
-        elif isinstance(record, Metadata):
-            self._add_metadata(record, at, length)
 
     def _content(self, at: int, length: int) -> memoryview:
         return self.reader.read(at + RECORD_HEAD.size, length - RECORD_HEAD.size)

@@ -242,6 +242,24 @@ class _Rebuilder:
 
     def _take_record(self, offset: int, item: Item, end: int) -> None:
         length = end - offset
+        if isinstance(item, ScannedChunk):
+            for definition in parse_content(item.content_bytes()).definitions:
+                self._define(definition.record)
+        elif isinstance(item, Metadata):
+            self._take_metadata(item)
+            self.segment.note_metadata(item.name, offset, length)
+        else:
+            self._define(item)
+        self._cover(offset)
+        if isinstance(item, Attachment):
+            self.is_empty = False
+            self.segment.note_attachment(item, offset, length)
+            self.segment.table.stretch(length, _crc_of(self._fd, offset, length))
+            return
+        record = os.pread(self._fd, length, offset)
+        self.segment.table.other(record, alone=isinstance(item, Metadata))
+
+    def _define(self, item: object) -> None:
         if isinstance(item, SchemaRecord):
             self._schemas[item.id] = item
             # The crash may have come before its channel was written.
@@ -252,18 +270,7 @@ class _Rebuilder:
                 channel = channel_of(item, self._schemas)
             except SegmentError as error:
                 raise _DamagedError(str(error)) from error
-            self.segment.define(item.id, item.schema_id, channel, write=False)
-        elif isinstance(item, Metadata):
-            self._take_metadata(item)
-            self.segment.note_metadata(item.name, offset, length)
-        self._cover(offset)
-        if isinstance(item, Attachment):
-            self.is_empty = False
-            self.segment.note_attachment(item, offset, length)
-            self.segment.table.stretch(length, _crc_of(self._fd, offset, length))
-            return
-        record = os.pread(self._fd, length, offset)
-        self.segment.table.other(record, alone=isinstance(item, Metadata))
+            self.segment.define([(item.id, item.schema_id, channel)], write=False)
 
     def _take_metadata(self, item: Metadata) -> None:
         if item.name not in {RECORDING_METADATA, END_METADATA, LOSSES_METADATA}:
@@ -290,6 +297,9 @@ class _Rebuilder:
     def _take_chunk(self, item: ScannedChunk) -> None:
         try:
             chunk = self._whole(item)
+            if chunk is None:
+                self._unproven.append((item.offset, item, item.offset + item.length))
+                return
         except SegmentError as error:
             self._damage.append(f"chunk at byte {item.offset}: {error}")
             return
@@ -343,11 +353,15 @@ class _Rebuilder:
         )
         return arrival_record(right, packed)
 
-    def _whole(self, item: ScannedChunk) -> _Whole:
+    def _whole(self, item: ScannedChunk) -> _Whole | None:
+        """The chunk, after checking its content; None for one with definitions alone."""
         content = item.content_bytes(check_crc=False)
         if item.uncompressed_crc != crc32(content):
             raise SegmentError("its checksum differs")
-        batch = parse_content(content).batch
+        parsed = parse_content(content)
+        batch = parsed.batch
+        if not len(batch) and parsed.definitions:
+            return None
         if not len(batch):
             raise SegmentError("it holds no message")
         head = right_head(

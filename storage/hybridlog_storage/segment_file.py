@@ -47,6 +47,7 @@ from hybridlog_storage.segment_format import (
     channel_record,
     chunk_index_record,
     compression_of,
+    definitions_chunk,
     head_length,
     json_metadata,
     padding_record,
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
+_SMALL_DEFINITIONS = 1024  # bytes of definitions that are not compressed
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,19 +225,31 @@ class SegmentFile:
         """True if written bytes are on the disk already, except for the file's length."""
         return self._file.direct
 
-    def define(
-        self, channel_id: int, schema_id: int, channel: Channel, *, write: bool = True
-    ) -> None:
-        """Write a channel; before it its schema, on its first use in the file."""
-        parts: list[bytes] = []
-        if schema_id and channel.schema is not None and schema_id not in self.schemas:
-            parts.append(record_bytes(schema_record(schema_id, channel.schema)))
-        parts.append(record_bytes(channel_record(channel_id, schema_id, channel)))
-        if write:
-            self._write(parts)
-        if schema_id and channel.schema is not None:
-            self.schemas.setdefault(schema_id, channel.schema)
-        self.channels[channel_id] = (schema_id, channel)
+    def define(self, channels: Iterable[tuple[int, int, Channel]], *, write: bool = True) -> None:
+        """Write channels; before each its schema, on its first use in the file.
+
+        Args:
+            channels: Id, id of the schema, and channel.
+            write: False for channels that are in the file already.
+        """
+        records: list[bytes] = []
+        schemas: dict[int, Schema] = {}
+        defined = [*channels]
+        for channel_id, schema_id, channel in defined:
+            if schema_id and channel.schema is not None:
+                if schema_id not in self.schemas and schema_id not in schemas:
+                    records.append(record_bytes(schema_record(schema_id, channel.schema)))
+                schemas[schema_id] = channel.schema
+            records.append(record_bytes(channel_record(channel_id, schema_id, channel)))
+        if write and records:
+            content = b"".join(records)
+            if len(content) < _SMALL_DEFINITIONS:
+                self._write(records)
+            else:
+                self._write([definitions_chunk(content)])
+                self._prove()
+        self.schemas = schemas | self.schemas
+        self.channels |= {number: (schema, channel) for number, schema, channel in defined}
 
     def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
         """Append the metadata of the recording and of the segment."""

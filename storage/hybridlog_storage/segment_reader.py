@@ -633,26 +633,31 @@ def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
     """Position of each chunk of a table, in file order."""
-    channels = table.parts["channel"].tolist()
-    bounds = table.part_bounds().tolist()
-    names = ("offset", "length", "trailer", "first", "last", "crc", "trailer_crc")
-    columns = (table.chunks[name].tolist() for name in names)
-    return [
-        ChunkPlace(
-            number=number,
-            offset=offset,
-            length=length,
-            trailer=trailer,
-            first=first,
-            last=last,
-            channels=tuple(channels[bounds[number] : bounds[number + 1]]),
-            crc=crc,
-            trailer_crc=trailer_crc,
-        )
-        for number, (offset, length, trailer, first, last, crc, trailer_crc) in enumerate(
-            zip(*columns, strict=True)
-        )
-    ]
+    bounds = table.part_bounds()
+    return [place_of(table, number, bounds) for number in range(len(table.chunks))]
+
+
+def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = None) -> ChunkPlace:
+    """Position of a chunk of a table.
+
+    Args:
+        table: The chunks of a segment.
+        number: Number of the chunk.
+        bounds: The table's `part_bounds`, if they are at hand.
+    """
+    bounds = table.part_bounds() if bounds is None else bounds
+    offset, length, trailer, crc, trailer_crc, first, last, _ = table.chunks[number].item()
+    return ChunkPlace(
+        number=number,
+        offset=offset,
+        length=length,
+        trailer=trailer,
+        first=first,
+        last=last,
+        channels=tuple(table.parts["channel"][bounds[number] : bounds[number + 1]].tolist()),
+        crc=crc,
+        trailer_crc=trailer_crc,
+    )
 
 
 def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:

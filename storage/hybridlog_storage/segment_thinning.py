@@ -98,8 +98,9 @@ def _copy(
     moved: Collection[int],
     progress: Callable[[], None] | None,
 ) -> None:
-    for channel_id, channel in summary.channels.items():
-        segment.define(channel_id, summary.schema_ids[channel_id], channel, write=False)
+    ids = summary.schema_ids
+    channels = ((number, ids[number], channel) for number, channel in summary.channels.items())
+    segment.define(channels, write=False)
     bounds = summary.table.part_bounds().tolist()
     places = summary.chunks
     old: list[int] = []

@@ -49,7 +49,7 @@ _TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
 _SHARED = -1
 _MOST_SPAN = 3600 * 10**9  # ns
 _PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
-_SMALL_SPANS = 64  # times the usual span, for a chunk that is still small
+_SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
 _WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
 
@@ -62,7 +62,7 @@ class SegmentSettings:
         chunk_size: Bytes of uncompressed content at which a chunk closes; a live recording
             uses larger chunks at high rates.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
-        span_size: Bytes of content below which such a chunk may span 64 times as much: small
+        span_size: Bytes of content below which such a chunk may span 256 times as much: small
             chunks compress badly, and reading one whole costs little.
         large_payload: Mean payload bytes from which a channel gets chunks of its own.
         compression: Codec of chunks that can be compressed.
@@ -76,7 +76,7 @@ class SegmentSettings:
 
     chunk_size: int = 2 << 20
     chunk_span_ns: int = 250_000_000
-    span_size: int = 512 << 10
+    span_size: int = 1 << 20
     large_payload: int = 1024
     compression: Literal["zstd", "lz4", "none"] = "zstd"
     level: int = 3
@@ -489,9 +489,7 @@ class RecordingWriter:
         chunks are written at once; the file is the same either way.
         """
         first = self._packed[0].result()
-        for channel_id in first.indexes:
-            if channel_id not in segment.channels:
-                self._define(segment, channel_id)
+        self._define(segment, [c for c in first.indexes if c not in segment.channels])
         chunks, size = [first], len(first.data)
         while size < _WRITTEN_AT_ONCE and len(chunks) < len(self._packed):
             following = self._packed[len(chunks)]
@@ -515,14 +513,14 @@ class RecordingWriter:
 
     def _define_rest(self) -> None:
         """Define the channels without messages in the last segment."""
-        for channel_id in self.channels:
-            if not self.written[channel_id]:
-                self._define(self._open_segment(), channel_id)
+        self._define(self._open_segment(), [c for c in self.channels if not self.written[c]])
 
-    def _define(self, segment: SegmentFile, channel_id: int) -> None:
-        channel = self.channels[channel_id]
-        schema = channel.schema
-        segment.define(channel_id, self._schema_ids[schema] if schema else 0, channel)
+    def _define(self, segment: SegmentFile, channel_ids: Sequence[int]) -> None:
+        channels = [(number, self.channels[number]) for number in channel_ids]
+        segment.define(
+            (number, self._schema_ids[channel.schema] if channel.schema else 0, channel)
+            for number, channel in channels
+        )
 
     def _write(self) -> None:
         segment = self._open_segment()

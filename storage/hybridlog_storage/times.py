@@ -9,6 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -26,6 +28,22 @@ def placed(times: NDArray[np.int64]) -> NDArray[np.int64]:
 def span_of(first: int, last: int) -> tuple[int, int]:
     """The range from a first to a last time, ns, which is never empty."""
     return min(first, END - 1), min(last + 1, END)
+
+
+_BACK_NS: Final = 1_000_000_000
+_FURTHER: Final = 64
+
+
+def earlier(time: int, start: int = 0) -> Iterator[int]:
+    """Starts of ever longer spans before a time, ns, to look for the last message in.
+
+    What is looked for is mostly near. The last span begins at `start`.
+    """
+    back = _BACK_NS
+    while time - back > start:
+        yield time - back
+        back *= _FURTHER
+    yield start
 
 
 def touches(windows: NDArray[np.int64], first: int, last: int) -> bool:

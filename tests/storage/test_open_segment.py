@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from io import BytesIO
@@ -70,9 +71,14 @@ class Written:
         assert len(self.ends) == 6
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
-    return Written(tmp_path_factory.mktemp("open") / "r")
+@pytest.fixture(scope="module", params=["plain definitions", "definitions in chunks"])
+def written(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Iterator[Written]:
+    with pytest.MonkeyPatch.context() as patch:
+        if "chunks" in request.param:
+            patch.setattr("hybridlog_storage.segment_file._SMALL_DEFINITIONS", 1)
+        yield Written(tmp_path_factory.mktemp("open") / "r")
 
 
 def check(segment: OpenSegment, written: Written, size: int) -> None:

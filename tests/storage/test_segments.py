@@ -645,23 +645,25 @@ def test_large_payloads_do_not_share_chunks(tmp_path: Path) -> None:
 def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> None:
     setup = SegmentSettings()
     loads = {
-        "sparse": (3000, 4, 64),
-        "usual": (20_000, 16, 27),
-        "rare": (5000, 1, 16),
-        "few": (40_000, 4, 14),
-        "fewer": (160_000, 4, 4),
-        "large": (600_000, 4, 1),
+        "sparse": (3000, 4, 256),
+        "usual": (20_000, 16, 53),
+        "rare": (5000, 1, 64),
+        "few": (40_000, 4, 27),
+        "fewer": (160_000, 4, 7),
+        "large": (600_000, 4, 2),
+        "larger": (1_200_000, 4, 1),
     }
     for place, (size, hz, want) in loads.items():
         step = 10**9 // hz
-        rows = many(100, size=size, step=step)
+        total = 2 * want + 10
+        rows = many(total, size=size, step=step)
         batches = [rows[at : at + at_once] for at in range(0, len(rows), at_once)]
         _, chunks = write(tmp_path / place, batches)
         counts = [len(chunk.batch) for chunk in chunks]
-        assert sum(counts) == 100
+        assert sum(counts) == total
         for chunk in chunks:
             span = int(chunk.batch.log_time.max() - chunk.batch.log_time.min())
-            assert span < 64 * setup.chunk_span_ns
+            assert span < 256 * setup.chunk_span_ns
             before = len(chunk.batch) - 1  # messages, when the last one was laid down
             assert span < setup.chunk_span_ns or before * (size + 31) < setup.span_size
         assert set(counts[:-1]) == {want}, place

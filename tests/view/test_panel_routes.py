@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ import hybridlog as hl
 from hybridlog.drawing.series import series
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.answers.next_time import next_time
-from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -267,26 +265,6 @@ def test_the_next_time_is_found_in_any_chunk(tmp_path: Path) -> None:
             found = next_time(store.session, entry, "/b", moment)
             assert found == (int(later[0]) if len(later) else None)
         assert next_time(store.session, entry, "/c", 0) is None
-
-
-def test_a_later_chunk_may_have_the_earlier_time() -> None:
-    """Of chunks that overlap a span, one may begin with another topic's messages."""
-
-    def chunk(first: int, own: int) -> ChunkEntry:
-        stats = {1: ChannelStats(1, first=own, last=own)}
-        return ChunkEntry("", 0, 0, 0, 0, 0, None, None, first, own, stats)
-
-    chunks = [chunk(0, 90 * S), chunk(50 * S, 60 * S)]
-
-    def within(_: object, __: object, bounds: tuple[int, int], ___: str) -> list[Any]:
-        return [one for one in chunks if one.first < bounds[1] and one.last >= bounds[0]]
-
-    channel = SimpleNamespace(channel_id=1, channel=SimpleNamespace(topic="/a"))
-    session: Any = SimpleNamespace(channels=lambda _: [channel], chunks=within)
-    recording: Any = SimpleNamespace(span=(0, 90 * S))
-    assert next_time(session, recording, "/a", 5 * S) == 60 * S
-    assert next_time(session, recording, "/a", 70 * S) == 90 * S
-    assert next_time(session, recording, "/a", 91 * S) is None
 
 
 def test_a_damaged_chunk_is_told(tmp_path: Path, asking: Asking) -> None:

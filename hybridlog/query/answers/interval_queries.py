@@ -21,7 +21,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.times import END, placed
+from hybridlog_storage.times import END, earlier, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -220,9 +220,9 @@ class IntervalQueries:
             first: From `_just_before`.
         """
         further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
-        for earlier in (*first, *further):
+        for before in (*first, *further):
             last = None
-            for found in self._beside(self._planner.outcomes, earlier):
+            for found in self._beside(self._planner.outcomes, before):
                 if len(found.log_time):
                     last = int(found.log_time[-1]), bool(found.holds[-1])
             if last is not None:
@@ -298,20 +298,12 @@ class IntervalQueries:
             )
 
 
-_BACK_NS = 1_000_000_000
-_FURTHER = 64
-
-
 def _earlier(part: Part, span: Span) -> Iterator[int]:
     """Starts of ever longer spans that end where a span begins; the last is the recording's."""
     entry_span = part.recording.span
     if entry_span is None or span[0] <= entry_span[0]:
-        return
-    back = _BACK_NS
-    while span[0] - back > entry_span[0]:
-        yield span[0] - back
-        back *= _FURTHER
-    yield entry_span[0]
+        return iter(())
+    return earlier(span[0], entry_span[0])
 
 
 def _just_before(part: Part, span: Span) -> list[Part]:

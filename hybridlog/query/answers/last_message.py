@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.message import Documents, Message, messages_in
-from hybridlog.query.chunk_lists import earlier_and_earlier
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import TimeLike, is_relative, parse_time
-from hybridlog_storage.times import END, span_of
+from hybridlog_storage.times import END, earlier, span_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -85,7 +84,7 @@ def _last_of(
     """The last message of a recording in `[start, latest]`, ns."""
     if question.predicate is not None:
         start, latest = span
-        for begin in earlier_and_earlier(latest, start):
+        for begin in earlier(latest, start):
             narrow = just_before(question, recording.id, begin, latest)
             for run in Planner(session, narrow, counters).runs():
                 return next(messages_in(run))

@@ -1,7 +1,8 @@
-"""The log time of the next message, mostly without reading it."""
+"""The log time of the next message, without reading messages."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -10,8 +11,7 @@ from hybridlog_storage.errors import SegmentError
 
 if TYPE_CHECKING:
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.catalog import RecordingEntry
 
 _FIRST_LOOK: Final = 1 << 30  # ns, about a second
 
@@ -19,7 +19,8 @@ _FIRST_LOOK: Final = 1 << 30  # ns, about a second
 def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:
     """The least log time of a topic's messages that is not before a time, ns; None without any.
 
-    Chunks tell it, but for those that hold the time itself. Damaged ones are left out.
+    Chunk tables tell it, and the message indexes of chunks that hold the time itself. Damaged
+    ones are left out.
 
     Args:
         session: The open store.
@@ -35,42 +36,16 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
     width = _FIRST_LOOK
     while True:
         end = moment + width
-        found: int | None = None
-        for entry in session.chunks(recording, channels, (moment, end), "log"):
-            time = _in_chunk(session, recording, entry, channels, moment)
-            if time is not None and (found is None or time < found):
-                found = time
+        parts = session.parts(recording, channels, (moment, end))
+        found = parts.first[parts.first >= moment].tolist()
+        cut = parts.take((parts.first < moment) & (parts.last >= moment))
+        for segment, chunk, channel in zip(*(c.tolist() for c in cut[:3]), strict=True):
+            with suppress(SegmentError):
+                times = session.times(recording, segment, chunk)[channel]
+                found.append(int(times[np.searchsorted(times, moment)]))
         # Chunks that were not looked at hold nothing before the end.
-        if found is not None and found < end:
-            return found
+        if found and min(found) < end:
+            return int(min(found))
         if end > last:
             return None
         width *= 4
-
-
-def _in_chunk(
-    session: Session,
-    recording: RecordingEntry,
-    entry: ChunkEntry,
-    channels: list[int],
-    moment: int,
-) -> int | None:
-    spans = [
-        (stats.first, stats.last)
-        for stats in entry.stats_of(channels)
-        if stats.first is not None and stats.last is not None
-    ]
-    later = [first for first, last in spans if last >= moment]
-    if not later or min(later) >= moment:
-        return min(later, default=None)
-
-    def load() -> StoredChunk:
-        return session.segment(recording.id, entry.segment).read_chunk(entry.place)
-
-    key = recording.id, entry.segment, entry.number
-    try:
-        batch = session.recent_chunks.get(key, load).batch
-    except SegmentError:
-        return None
-    times = batch.log_time[np.isin(batch.channel, channels) & (batch.log_time >= moment)]
-    return int(times.min()) if len(times) else None

@@ -1,32 +1,27 @@
-"""Counts messages in ranges of log time from the chunk index.
-
-The entry of a chunk has the number of messages of each channel, and their first and last
-time. A chunk inside a range is counted without reading it. For a chunk that crosses an end,
-the message indexes are read from the segment: 16 bytes a message, and no payload. The
-entry holds their checksum.
-"""
+"""Counts messages in ranges of log time from chunk tables; see `chunk_counts`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.query.chunk_counts import Placed
 from hybridlog.query.engines.base import Need, Outcomes, Values
-from hybridlog_storage.distinct import distinct
-from hybridlog_storage.times import END, inside, placed
+from hybridlog_storage.times import inside
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.chunk_counts import Parts
     from hybridlog.query.chunk_scan import ChunkTask, RowSelection
     from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Part
+    from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import ChunkEntry
-    from hybridlog_storage.segment_reader import SegmentReader
+    from hybridlog_storage.catalog import RecordingEntry
 
 _ENTRY_S = 2e-5  # seconds to fetch the entry of a chunk
 _READ_S = 1e-4  # seconds to read the message indexes of a chunk
@@ -61,7 +56,10 @@ class ChunkIndex:
         Raises:
             SegmentError: a segment cannot be read, or is damaged in a part that is needed.
         """
-        return sum(map(self._count, parts))
+        alike: dict[tuple[str, Span | None, int], list[Part]] = defaultdict(list)
+        for part in parts:
+            alike[part.recording.id, part.bounds, id(part.windows)].append(part)
+        return sum(map(self._count, alike.values()))
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """All log times in the windows, sorted; arrival numbers are unknown and 0.
@@ -70,16 +68,12 @@ class ChunkIndex:
             SegmentError: a segment cannot be read, or is damaged in a part that is needed.
         """
         windows = part.log_windows
-        channels = [channel.channel_id for channel in part.channels]
         found = [np.empty(0, np.int64)]
-        if len(windows):
-            span = int(windows[0, 0]), int(windows[-1, 1])
-            for chunk in self._session.chunks(part.recording, channels, span, "log"):
-                reader = self._session.segment(part.recording.id, chunk.segment)
-                read_before = reader.bytes_read
-                times = reader.read_times(chunk.place)
-                self._counters.bytes_read += reader.bytes_read - read_before
-                found.extend(times[channel] for channel in channels if channel in times)
+        parts = self._parts([part])
+        rows = parts.chunk_starts
+        for segment, chunk in zip(*(c[rows].tolist() for c in parts[:2]), strict=True):
+            times = self._times(part.recording, segment, chunk)
+            found += [times[c.channel_id] for c in part.channels if c.channel_id in times]
         time = np.sort(np.concatenate(found))
         time = time[inside(time, windows)]
         yield Outcomes(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
@@ -92,64 +86,25 @@ class ChunkIndex:
         """Not supported: `cost` returns None."""
         raise NotImplementedError
 
-    def _count(self, part: Part) -> int:
-        windows = part.log_windows
-        if not len(windows):
-            return 0
-        channels = [channel.channel_id for channel in part.channels]
-        span = int(windows[0, 0]), int(windows[-1, 1])
-        return count_in_chunks(
-            self._session.chunks(part.recording, channels, span, "log"),
-            set(channels),
-            windows,
-            partial(self._session.segment, part.recording.id),
-            self._counters,
-        )
+    def _count(self, parts: Sequence[Part]) -> int:
+        """Number of messages of some topics of one recording in the same windows."""
+        edges = parts[0].log_windows.ravel()
+        counts = np.zeros((1, max(len(edges) - 1, 0)), np.int64)
+        cut = Placed.of(self._parts(parts), edges).add_known(counts)
+        cut.add_read(edges, counts, partial(self._times, parts[0].recording))
+        return int(counts[0, ::2].sum())
 
+    def _parts(self, parts: Sequence[Part]) -> Parts:
+        windows = parts[0].log_windows
+        span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
+        channels = [channel.channel_id for part in parts for channel in part.channels]
+        return self._session.parts(parts[0].recording, channels, span)
 
-def count_in_chunks(
-    chunks: Sequence[ChunkEntry],
-    channels: Collection[int],
-    windows: NDArray[np.int64],
-    reader_of: Callable[[int], SegmentReader],
-    counters: Counters,
-) -> int:
-    """Number of messages of some channels of a recording within some ranges.
-
-    Args:
-        chunks: All chunks that may hold such messages.
-        channels: Ids of the channels.
-        windows: int64[n, 2], `[begin, end)` of log time, ns, apart and in order.
-        reader_of: Returns the reader of a segment, by its number.
-        counters: Count the bytes that are read.
-
-    Raises:
-        SegmentError: a segment cannot be read, or is damaged in a part that is needed.
-    """
-    held = [
-        (number, channel, stats.first, stats.last, stats.messages)
-        for number, chunk in enumerate(chunks)
-        for channel in channels
-        if (stats := chunk.stats.get(channel)) is not None and stats.first is not None
-    ]
-    if not held or not len(windows):
-        return 0
-    number, channel, first, last, messages = np.array(held, np.int64).T
-    first, last = placed(first), placed(last)
-    # Only the first window that ends after the start of a chunk can contain the whole chunk.
-    window = np.searchsorted(windows[:, 1], first, "right")
-    begin, end = np.append(windows, [[END, END]], axis=0)[window].T
-    touched = begin <= last
-    whole = touched & (begin <= first) & (last < end)
-    total = int(messages[whole].sum())
-    cut = np.flatnonzero(touched & ~whole)
-    for row in distinct(number[cut]).tolist():
-        chunk = chunks[row]
-        reader = reader_of(chunk.segment)
+    def _times(
+        self, recording: RecordingEntry, segment: int, chunk: int
+    ) -> dict[int, NDArray[np.int64]]:
+        reader = self._session.segment(recording.id, segment)
         read_before = reader.bytes_read
-        times = reader.read_times(chunk.place)
-        counters.bytes_read += reader.bytes_read - read_before
-        for of in channel[cut[number[cut] == row]].tolist():
-            before = np.searchsorted(placed(times[of]), windows)
-            total += int((before[:, 1] - before[:, 0]).sum())
-    return total
+        times = self._session.times(recording, segment, chunk)
+        self._counters.bytes_read += reader.bytes_read - read_before
+        return times

@@ -1,0 +1,56 @@
+"""A condition on one topic, asked of many: worked out once, and each chunk is read once."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+import hybridlog as hl
+from tests.scale.cost import cost_of
+
+START = 1_577_836_800 * 10**9
+FEW, MANY = 10, 500
+MESSAGES = 8
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    """A store of a recording with few topics, and one with many; as many messages a second."""
+    found = {}
+    for count in (FEW, MANY):
+        log = tmp_path_factory.mktemp("topics") / "log.mcap"
+        with log.open("wb") as file:
+            writer = Writer(file)
+            writer.start(profile="ros1")
+            schema = writer.register_schema("std_msgs/Float32", "ros1msg", b"float32 data\n")
+            topics = [writer.register_channel(f"/s{n}", "ros1", schema) for n in range(count)]
+            for number in range(MESSAGES * count):
+                time = START + number * 10**6
+                payload = struct.pack("<f", number // count)
+                writer.add_message(topics[number % count], time, payload, time)
+            writer.finish()
+        found[count] = log.parent / "store"
+        with hl.open(found[count], create=True) as store:
+            store.record(log, name="log")
+    return found
+
+
+def near(count: int) -> int:
+    """Messages within 3 ms of one on /s1 with data > 3, which come one a round."""
+    times = [(turn * count + 1) for turn in range(4, MESSAGES)]
+    return sum(any(abs(n - t) <= 3 for t in times) for n in range(MESSAGES * count))
+
+
+def test_a_condition_on_another_topic_reads_each_chunk_once(stores: dict[int, Path]) -> None:
+    costs = {}
+    for count, path in stores.items():
+        with hl.open(path) as store:
+            query = store.all_topics().where("s1: data > 3", within="3ms")
+            assert query.count() == near(count)
+            size = sum(one.stat().st_size for one in (path / "recordings").glob("*/*.mcap"))
+            costs[count] = cost_of(store, store.all_topics().during(query.question.during).count)
+            assert costs[count].bytes_read <= size
+    assert costs[MANY].counts == costs[FEW].counts
