@@ -91,7 +91,7 @@ def measure(path: Path, count: int, logs: Path) -> dict[str, float]:
             ),
             "rm of one": lambda: store.remove(store.summaries()[-1].id),
             "verify of one": lambda: store.verify(["day00003"]),
-            "reindex of one": lambda: store.reindex(["day00003"]),
+            "index rebuild of one": lambda: store.rebuild_index(["day00003"]),
         }
 
     with hl.open(path, create=True) as store:
@@ -110,7 +110,7 @@ def measure(path: Path, count: int, logs: Path) -> dict[str, float]:
         for name, once in {
             "count of all, predicate": lambda: store.topic("pose").where("x > 7").count(),
             "verify of all": store.verify,
-            "reindex of all": store.reindex,
+            "index rebuild of all": store.rebuild_index,
         }.items():
             if count > MOST_AT_ONCE:
                 continue

@@ -300,7 +300,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "compact: dry run": ("compact", "--dry-run"),
     "compact": ("compact",),
     "compact: without MCAP": ("compact", "--drop-mcap"),
-    "reindex": ("reindex",),
+    "index rebuild": ("index", "rebuild"),
 }
 """Arguments by name, in an order in which the store is changed last."""
 SYNC = """

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -26,6 +27,18 @@ if TYPE_CHECKING:
 _TIMEOUT_S = 5.0
 _EMBEDDED_TIMEOUT_S = 2.0
 """Seconds to wait for a server that was reached before; the embedded one has no network."""
+
+
+class IndexAddress(NamedTuple):
+    """Where other programs find the index.
+
+    Attributes:
+        uri: As `pymongo.MongoClient` takes it, without a password.
+        database: Name of the database.
+    """
+
+    uri: str
+    database: str
 
 
 class Connection:
@@ -137,6 +150,21 @@ class Connection:
         if self._uri == EMBEDDED and not isinstance(error, DiskFullError):
             return isinstance(error, DatabaseError | MissingDependencyError | ResourceError)
         return isinstance(error, WithoutMongoError)
+
+    def address(self, wait_s: float) -> str:
+        """The URI of the index for other programs; it stays the same. Has no password.
+
+        Args:
+            wait_s: Seconds for which an embedded MongoDB waits for clients.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
+        """
+        self.open()
+        if self._mongod is not None:
+            return self._mongod.publish(wait_s)
+        assert self._uri is not None
+        return re.sub(r"//([^:/@]*):[^/]*@", r"//\1@", self._uri)
 
     @property
     def place(self) -> str:

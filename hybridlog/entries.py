@@ -1,6 +1,6 @@
 """Makes catalog entries of recordings from their journals and segments.
 
-Recording, recovery, reindexing and opening use the same functions, so their entries are
+Recording, recovery, rebuilding and opening use the same functions, so their entries are
 equal. Files that differ from the journal are not used. Content that the journal lists and
 that is missing or changed becomes rows of the loss ledger.
 """

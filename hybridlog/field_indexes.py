@@ -1,7 +1,7 @@
 """Indexes on fields, with which MongoDB finds documents without a scan.
 
 They change the duration of a query and never its answer, so the segments do not have
-them: MongoDB stores them, and `reindex` leaves them in place. In a collection that topics
+them: MongoDB stores them, and `index rebuild` leaves them in place. In a collection that topics
 share, an index holds the documents of one topic (a partial index).
 """
 

@@ -116,10 +116,10 @@ class GuardedIndex:
         return self._each(self.database.find_raw(collection, *args, **options))
 
     def find_each(
-        self, collection: str, filters: Sequence[_Filter], projection: _Filter
+        self, questions: Sequence[tuple[str, _Filter]], projection: _Filter
     ) -> Iterator[bytes]:
         """Documents of many questions, one after the other, in the form of `find_raw`."""
-        return self._each(self.database.find_each(collection, filters, projection))
+        return self._each(self.database.find_each(questions, projection))
 
     def _each(self, found: Iterator[bytes]) -> Iterator[bytes]:
         """Verified items: each is yielded once the next item or the end has been received."""

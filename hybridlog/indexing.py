@@ -1,7 +1,7 @@
 """Makes index documents from chunks, as a pure function.
 
 `documents_of` makes the index disposable: it needs only chunks and their channels.
-`record`, recovery, `reindex` and `verify` all call it.
+`record`, recovery, `index rebuild` and `verify` all call it.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeAlias, TypeVar, cast
 
 from hybridlog import consent, field_indexes
 from hybridlog.choice import Choice
+from hybridlog.connection import IndexAddress
 from hybridlog.entries import text
 from hybridlog.field_indexes import FieldIndex
 from hybridlog.losses import extent_of
@@ -66,6 +67,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.topic_places import TopicPlace
 
 DEFAULT_STORE = "hybridlog-store"
+_CLIENTS_WAIT_S = 600.0
+"""Seconds for which a published MongoDB waits for clients."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by label, name or id, or their entries."""
 _P = ParamSpec("_P")
@@ -669,7 +672,7 @@ class Store:
             report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     @_again_if_lost
-    def reindex(
+    def rebuild_index(
         self,
         recordings: Names | None = None,
         progress: Progress | None = None,
@@ -688,12 +691,12 @@ class Store:
         """
         from hybridlog.maintenance import index
 
-        database = self.database_for("reindex", writes=True)
+        database = self.database_for("Rebuilding the index", writes=True)
         if recordings is None:
             self.catalog.mend()
         self.refresh()
         chosen = self.select(recordings)
-        left = index.reindex(
+        left = index.rebuild(
             self.directory,
             self.catalog,
             database,
@@ -748,6 +751,33 @@ class Store:
         database = self.database_for("Indexes")
         names = self.topic(*topics).topics if topics else self.topics()
         return field_indexes.of_topics(database, names)
+
+    @_again_if_lost
+    def index_address(self) -> IndexAddress:
+        """Where other programs find the index, up to date with all recordings.
+
+        The embedded MongoDB keeps its address, waits ten minutes for the first client, and runs
+        as long as one is connected.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+        """
+        database = self.connect()
+        return IndexAddress(self.session.connection.address(_CLIENTS_WAIT_S), database.name)
+
+    @_again_if_lost
+    def index_contents(self) -> list[tuple[str, str, int]]:
+        """Each topic with the MongoDB collection of its documents, and their number there."""
+        database = self.database_for("The contents of the index")
+        places = self.session.places("The contents of the index").of(self.topics())
+        known = [place for place in places.values() if place.is_listed]
+        asked = [(place.collection, place.documents()) for place in known]
+        counts = database.count_each([one for one in asked if one[1]])
+        shared = iter(counts)
+        return [
+            (place.topic, collection, next(shared) if own else database.count(collection))
+            for place, (collection, own) in zip(known, asked, strict=True)
+        ]
 
     @_again_if_lost
     @of_one_moment

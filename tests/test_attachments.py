@@ -202,7 +202,7 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         shutil.rmtree(tmp_path / "s" / derived, ignore_errors=True)
         (tmp_path / "s" / derived).unlink(missing_ok=True)
     with hl.open(tmp_path / "s") as store:
-        store.reindex()
+        store.rebuild_index()
         assert store.verify().findings == []
         (entry,) = store.recordings()
         assert (entry.attachments, entry.metadata_records) == (5, 3)

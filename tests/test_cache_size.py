@@ -89,5 +89,5 @@ def test_as_a_command(tmp_path: Path) -> None:
     assert not place.exists()
     run("record", log, "--cache-size", 400, store=place, HYBRIDLOG_MONGOD_LINGER_S="0")
     assert read_settings(place).cache_mb == 400
-    run("reindex", "--cache-size", 300, store=place, HYBRIDLOG_MONGOD_LINGER_S="0")
+    run("index", "rebuild", "--cache-size", 300, store=place, HYBRIDLOG_MONGOD_LINGER_S="0")
     assert read_settings(place).cache_mb == 400

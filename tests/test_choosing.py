@@ -222,10 +222,10 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
     rows = json.loads(call(store, "du", *chosen, "--json").out)["rows"]
     assert [row["recording"] for row in rows] == ["tuesday"]
     assert call(store, "verify", *chosen).out.startswith("1 recording,")
-    assert call(store, "reindex", *chosen).out.startswith("1 recording,")
+    assert call(store, "index", "rebuild", *chosen).out.startswith("1 recording,")
     assert call(store, "repair", *chosen).out == "nothing to mend\n"
-    for command in ("info", "losses", "du", "verify", "reindex", "repair", "rm"):
-        assert call(store, command, "--tag", "robot=9").code == 2
+    for command in ("info", "losses", "du", "verify", "index rebuild", "repair", "rm"):
+        assert call(store, *command.split(), "--tag", "robot=9").code == 2
     for command in ("fetch", "intervals", "schema"):
         topic = ["scan"] if command == "schema" else ["-t", "scan"]
         assert "robot=9" in call(store, command, *topic, "--tag", "robot=9").err

@@ -450,6 +450,13 @@ def commands() -> dict[str, Any]:
     return {name: app.get_command(context, name) for name in app.list_commands(context)}
 
 
+def params_of(command: click.Command) -> list[click.Parameter]:
+    """The parameters of a command, or of all commands of a group."""
+    if not isinstance(command, click.Group):
+        return command.params
+    return [param for each in command.commands.values() for param in each.params]
+
+
 CHOICE = "| `-r`, `--tag`, `--has`, `--type`, `--during`, `--with` | [which recordings]"
 """The row of a command that chooses recordings by the options that all share."""
 _CHOOSING = {"recording", "tag", "has", "types", "during", "conditions"}
@@ -462,7 +469,7 @@ def test_every_option_is_described(name: str) -> None:
         re.findall(r"(?<![\w-])--?[a-zA-Z][\w-]*", "".join(re.findall("`[^`]+`", text)))
     )
     real: set[str] = set()
-    params = commands()[name].params
+    params = params_of(commands()[name])
     if CHOICE in text:
         assert {parameter.name for parameter in params} >= _CHOOSING
         shared = sections(DOCS / "cli.md", 2)["Choosing recordings"]

@@ -564,7 +564,7 @@ def test_a_segment_that_is_lost(
         assert {f.recording for f in findings} == {"short"}
         assert any(path.name in f.place + f.problem for f in findings)
         # And it does not become right by making the index again.
-        opened.reindex()
+        opened.rebuild_index()
         check_what_is_missing(opened, said, {number})
         assert opened.verify().findings
     run("verify", store=store.directory.path, code=1)
@@ -585,7 +585,7 @@ def test_a_recording_without_any_segment_is_told(store: hl.Store, said: Counter[
         (entry,) = opened.recordings()
         assert (entry.status, entry.messages) == ("damaged", 0)
         assert lost(entry) == topics_of(said)
-        opened.reindex()
+        opened.rebuild_index()
         (entry,) = opened.recordings()
         assert (entry.status, lost(entry)) == ("damaged", topics_of(said))
 
@@ -681,7 +681,7 @@ def test_a_summary_is_made_again(store: hl.Store, said: Counter[Message]) -> Non
     damage_summary(place.path)
     with reopened(store) as opened:
         check_what_is_missing(opened, said, {place.segment})
-    run("reindex", store=store.directory.path, code=0)
+    run("index", "rebuild", store=store.directory.path, code=0)
     run("verify", store=store.directory.path, code=1)
     done = run("repair", store=store.directory.path, code=0)
     assert place.path.name in done.stdout
@@ -826,7 +826,7 @@ def test_an_altered_index_is_found_and_mended(
     with pymongo.MongoClient[dict[str, Any]](uri) as client:
         alter(client[store.database.name])
     assert store.verify().findings
-    store.reindex()
+    store.rebuild_index()
     assert store.verify().findings == []
 
 
@@ -882,7 +882,7 @@ def test_verify_and_reindex_as_commands(store: hl.Store) -> None:
     path = store.directory.path
     done = run("verify", store=path, code=1)
     assert "imu__data" in done.stdout
-    run("reindex", store=path, code=0)
+    run("index", "rebuild", store=path, code=0)
     run("verify", store=path, code=0)
 
 
@@ -1003,8 +1003,8 @@ def test_reindex_does_not_cost_a_running_recording_its_index(
         store.record(short)
     with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
         with pytest.raises(StoreError, match="being written"):
-            store.reindex(["robot"])
-        assert [entry.label for entry in store.reindex()] == ["short"]
+            store.rebuild_index(["robot"])
+        assert [entry.label for entry in store.rebuild_index()] == ["short"]
         assert content(fetched(store, "short")) == said
     (report,) = writing.result
     assert not isinstance(report, Exception), report
@@ -1035,7 +1035,7 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
                     else:
                         assert query.count() == said.total(), (label, name)
 
-        store.reindex(progress=ask)
+        store.rebuild_index(progress=ask)
         assert asked > 14
     assert store.verify().findings == []
 

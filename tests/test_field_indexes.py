@@ -1,4 +1,4 @@
-"""Indexes on fields: found by MongoDB, the same answers, kept by `reindex`."""
+"""Indexes on fields: found by MongoDB, the same answers, kept by `index rebuild`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_reindex_makes_indexes_again(store: hl.Store) -> None:
     store.add_index("/odom", "pose.pose.position.x")
     known = store.indexes()
     assert len(known) == 2
-    store.reindex()
+    store.rebuild_index()
     assert store.indexes() == known
     assert "IXSCAN" in how(store, "odom", {"pose.pose.position.x": {"$gt": 0}})
     assert store.verify().findings == []
@@ -103,11 +103,12 @@ def test_as_a_command(store: hl.Store) -> None:
         done = run("index", *arguments, store=place, code=code)
         return done.out if code == 0 else done.err
 
-    assert said() == "no index on a field\n"
-    assert said("--quiet") == ""
-    assert "angular_velocity.z" in said("imu/data", "angular_velocity.z")
-    assert json.loads(said("--json")) == [{"topic": "/imu/data", "fields": ["angular_velocity.z"]}]
-    assert json.loads(said("/odom", "--json")) == []
-    assert "Its indexes: angular_velocity.z." in said("imu/data", "x", "--remove", code=2)
-    assert "Name the topic" in said("imu/data", "--remove", code=2)
-    assert said("imu/data", "angular_velocity.z", "--remove") == "no index on a field\n"
+    made = [{"topic": "/imu/data", "fields": ["angular_velocity.z"]}]
+    assert said("list") == "no index on a field\n"
+    assert said("list", "--quiet") == ""
+    assert "angular_velocity.z" in said("add", "imu/data", "angular_velocity.z")
+    assert json.loads(said("list", "--json")) == made
+    assert json.loads(said("list", "/odom", "--json")) == []
+    assert "Its indexes: angular_velocity.z." in said("remove", "imu/data", "x", code=2)
+    assert "FIELD..." in said("remove", "imu/data", code=2)
+    assert said("remove", "imu/data", "angular_velocity.z") == "no index on a field\n"

@@ -154,7 +154,7 @@ def test_two_users_of_a_group_share_a_store(place: Path, umask: int) -> None:
     bob.run("rm", "-y", "anns", *where)
     ann.run("rm", "-y", "bobs", *where)
     assert bob.run("ls", "--json", *where).json == []
-    ann.run("reindex", "-q", *where)
+    ann.run("index", "rebuild", "-q", *where)
     assert [p.name for p in (store / "recordings").iterdir()] == []
 
 
@@ -184,7 +184,7 @@ def test_somebody_outside_of_the_group_changes_nothing(place: Path) -> None:
     expected = ann.run(*COUNT, *where).out
     before = {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)}
     assert eve.run(*COUNT, *where).out == expected, "who can read asks by topic and time"
-    for command in (("rm", "-y", "small"), ("record", place / "small.bag"), ("reindex",)):
+    for command in (("rm", "-y", "small"), ("record", place / "small.bag"), ("index", "rebuild")):
         assert eve.run(*command, *where, code=None).code in {5, 6}
     assert {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)} == before
 

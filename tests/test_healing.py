@@ -337,7 +337,7 @@ def test_a_recording_is_removed_from_an_index_that_ends(store: Path) -> None:
         assert not opened.verify().findings
 
 
-@pytest.mark.parametrize("work", ["reindex", "indexes"])
+@pytest.mark.parametrize("work", ["rebuild_index", "indexes"])
 def test_work_on_an_index_that_ends_is_done_again(store: Path, work: str) -> None:
     with hl.open(store, require_database=True) as opened:
         kill_mongod(store)
@@ -466,7 +466,7 @@ def test_a_user_who_may_only_read_can_ask_everything(
         assert opened.topic(IMU).where({"header.seq": {"$mod": [100, 0]}}).count() > 0
         assert not opened.verify().findings
         for change in (
-            opened.reindex,
+            opened.rebuild_index,
             lambda: opened.add_index(IMU, "header.seq"),
             lambda: opened.start("more"),
         ):

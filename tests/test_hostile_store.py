@@ -194,7 +194,7 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
         store.record(bag, name="again", again=True)
 
     attempt(False, look, fetch, ask)
-    attempt(False, lambda store: store.verify(), lambda store: store.reindex())
+    attempt(False, lambda store: store.verify(), lambda store: store.rebuild_index())
     attempt(True, record_live, record, look, fetch)
     attempt(False, lambda store: store.remove("small"))
     attempt(False, look)
@@ -467,7 +467,7 @@ def test_the_commands(tmp_path: Path, bag: Path) -> None:
         ("fetch", "-t", "/imu/data", "--where", "header.seq >= 0", "--count", "-q"),
         ("rm", "-y", "nosuch"),
         ("verify", "-q"),
-        ("reindex", "-q"),
+        ("index", "rebuild", "-q"),
         ("top", "--once"),
         ("mark", "here"),
         ("record", bag, "--again", "-q"),

@@ -110,7 +110,7 @@ def test_a_renamed_directory_changes_the_label_alone(place: Path, uri: str) -> N
         assert not store.repairs.indexed
         assert answers(store) == answers(store, "other") == answers(store, before.id) == right()
         assert not store.verify().findings
-        store.reindex()
+        store.rebuild_index()
         assert answers(store) == right()
 
 
@@ -132,7 +132,7 @@ def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, co
             assert answers(store) == answers(store, copy) == right()
             (finding,) = store.verify().findings
             assert (finding.recording, "copy of one" in finding.problem) == (copy, True)
-            store.reindex()
+            store.rebuild_index()
             assert answers(store) == right()
             done = store.repair()
             assert [one.is_cured for one in done if one.recording == copy] == [False]
@@ -341,7 +341,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             mirror = database.find_one("hybridlog.recordings", {})
             assert mirror is not None
             assert (mirror["name"], mirror["tags"]) == ("second floor", {"a": "3"})
-        store.reindex()
+        store.rebuild_index()
         check(store)
     (place / "catalog.sqlite").unlink()
     with hl.open(place, mongo=uri) as store:
@@ -666,7 +666,7 @@ def test_an_index_is_made_of_the_recording_that_was_chosen(
             turns = IndexState(store.connect()).of([one[:16], other.key])
             with monkeypatch.context() as patch:
                 patch.setattr(files, "folder", exchange.folder)
-                assert [entry.id for entry in store.reindex([one])] == [one]
+                assert [entry.id for entry in store.rebuild_index([one])] == [one]
             found = IndexState(store.connect()).of([one[:16], other.key])
             assert found[other.key].turn == turns[other.key].turn, step
             assert found[one[:16]].turn > turns[one[:16]].turn, step

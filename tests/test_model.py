@@ -539,8 +539,8 @@ class Machine(RuleBasedStateMachine):
         return {place for known in self.model.values() for _, place in known.findings}
 
     @rule()
-    def reindex(self) -> None:
-        assert {r.id for r in self.store.reindex()} == set(self.model)
+    def rebuild(self) -> None:
+        assert {r.id for r in self.store.rebuild_index()} == set(self.model)
         self.changed = True
 
     # What people do to a recording.
@@ -687,7 +687,7 @@ class Machine(RuleBasedStateMachine):
             self.open_again()
         else:
             self.store.refresh()
-            self.store.reindex([recording])
+            self.store.rebuild_index([recording])
         self.take_kinds(recording)
         self.changed = True
 
@@ -1212,7 +1212,7 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
         lambda: model.rename(0, "x/y"),
         lambda: model.lose_the_catalog("deleted", 0),
         lambda: model.restore_a_segment(0),
-        model.reindex,
+        model.rebuild,
         lambda: model.restore_a_segment(0),
         lambda: model.crash_while_marking(0, SPOTS // 2, is_listed=False),
         lambda: model.mark(0, 5, "\u00e9"),

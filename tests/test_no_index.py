@@ -72,9 +72,9 @@ def test_index_documents_that_are_not_there_are_no_empty_answer(store: hl.Store)
 
 def test_every_rebuild_keeps_it(store: hl.Store) -> None:
     assert store.verify().findings == []
-    store.reindex()
+    store.rebuild_index()
     assert documents(store) == INDEXED
-    store.reindex(["log"])
+    store.rebuild_index(["log"])
     assert documents(store) == INDEXED
     store.database_for("this test").drop_all()
     path = store.directory.path
@@ -103,7 +103,7 @@ def test_what_has_no_documents_is_not_missing_among_those_of_others(
         store.record(log, name="whole")
         store.record(log, name="part", again=True, no_index=matcher(["re:.*signal[23]"]))
         monkeypatch.setattr(index, "catch_up", catch_up)
-        store.reindex()
+        store.rebuild_index()
         assert sorted(indexed) == ["part", "whole"]
         assert store.verify().findings == []
 
@@ -116,7 +116,7 @@ def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
     database.replace(collection_of(LEFT_OUT[0]), {"_id": stray["_id"]}, stray)
     (finding,) = store.verify().findings
     assert "1 index documents, 0 messages" in finding.problem
-    store.reindex()
+    store.rebuild_index()
     assert documents(store) == INDEXED
     assert store.verify().findings == []
 
@@ -162,11 +162,12 @@ def test_as_a_command(tmp_path: Path, log: Path) -> None:
     shown = {channel["topic"]: channel["not_indexed"] for channel in channels}
     assert [name for name in FOUR if shown[name]] == LEFT_OUT
     assert run("info", "log", store=place).out.count("not indexed: recorded with --no-index") == 2
-    told = run("reindex", "--json", store=place).json
+    told = run("index", "rebuild", "--json", store=place).json
     assert (told["messages"], told["messages_without_documents"]) == (40, 40)
     assert run("verify", "--json", store=place).json["without_documents"] == 40
-    for command in ("reindex", "verify"):
-        assert "; 40 messages have no documents (--no-index)" in run(command, store=place).out
+    for command in ("index rebuild", "verify"):
+        out = run(*command.split(), store=place).out
+        assert "; 40 messages have no documents (--no-index)" in out
     replayed = run(
         *("record", "--replay", log, "--speed", 1000, "--name", "live"),
         *("--no-index", "**", "--quiet"),

@@ -91,7 +91,7 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
         lambda: store.topic("scan").where({"$expr": {"$gt": ["$header.seq", 3]}}).count(),
         lambda: list(store.topic("scan").where({"$expr": True}).documents()),
         store.indexes,
-        store.reindex,
+        store.rebuild_index,
         store.connect,
     ):
         with pytest.raises(DatabaseError, match=r"without MongoDB.*--mongo embedded"):
@@ -135,7 +135,7 @@ def test_the_ways_to_say_so(
     assert "MongoDB" not in done.err
     assert not (path / "mongod").exists()
     assert read_settings(path).mongo == NONE
-    done = answer("index", *words, store=path, code=6)
+    done = answer("index", "list", *words, store=path, code=6)
     assert answer("trust", store=path).out == (
         "the store names no MongoDB: there is nothing to trust\n"
     )

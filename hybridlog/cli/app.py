@@ -43,7 +43,6 @@ COMMANDS: Final = (
     "open",
     "attachments",
     "index",
-    "reindex",
     "verify",
     "repair",
     "compact",

@@ -1,63 +1,203 @@
-"""`hybridlog index`."""
+"""`hybridlog index`: MongoDB indexes on fields, the address of the index, and its rebuilding."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.query_options import recordings_of
+from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
+if TYPE_CHECKING:
+    from hybridlog.choice import Choice
+    from hybridlog.field_indexes import FieldIndex
 
-@click.command()
+_FIELDS = click.argument(
+    "field",
+    nargs=-1,
+    required=True,
+    metavar="FIELD...",
+    help="Its fields, the most selective first.",
+)
+_TOPIC = click.argument("topic", metavar="TOPIC", shell_complete=complete_topic, help="A topic.")
+
+
+@click.group()
+def command() -> None:
+    """Index fields in MongoDB, for questions and other programs."""
+
+
+@command.command("list")
 @click.argument(
     "topic",
     required=False,
     metavar="[TOPIC]",
     shell_complete=complete_topic,
-    help="A topic; without, list the indexes.",
-)
-@click.argument(
-    "field", nargs=-1, metavar="[FIELD]...", help="Its fields, the most selective first."
+    help="A topic; without, all.",
 )
 @options.store
-@click.option("--remove", is_flag=True, help="Drop this index.")
 @options.mongo
 @options.as_json
 @options.quiet
-def command(
+def list_(
+    *, topic: str | None, store: Path | None, mongo: str | None, as_json: bool, quiet: bool
+) -> None:
+    """List the indexes on fields."""
+    with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
+        found = opened.indexes() if topic is None else opened.indexes(topic)
+    _print(found, as_json=as_json, quiet=quiet)
+
+
+@command.command()
+@_TOPIC
+@_FIELDS
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def add(
     *,
-    topic: str | None,
+    topic: str,
     field: tuple[str, ...],
     store: Path | None,
-    remove: bool,
     mongo: str | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Make, list or drop an index of a field.
-
-    Queries of that field become faster.
-    """
-    if remove and not field:
-        raise UsageError("--remove needs an index. Name the topic and the fields after it.")
+    """Make an index on fields of a topic, for all recordings."""
     with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
-        if topic is None:
-            found = opened.indexes()
-        elif remove:
-            if not opened.remove_index(topic, *field):
-                known = ", ".join(" ".join(one.fields) for one in opened.indexes(topic)) or "none"
-                raise UsageError(
-                    f"{topic} has no index on {' '.join(field)}. Its indexes: {known}."
-                )
-            found = opened.indexes(topic)
-        elif field:
-            found = opened.add_index(topic, *field)
-        else:
-            found = opened.indexes(topic)
+        found = opened.add_index(topic, *field)
+    _print(found, as_json=as_json, quiet=quiet)
+
+
+@command.command()
+@_TOPIC
+@_FIELDS
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def remove(
+    *,
+    topic: str,
+    field: tuple[str, ...],
+    store: Path | None,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Drop an index."""
+    with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
+        if not opened.remove_index(topic, *field):
+            known = ", ".join(" ".join(one.fields) for one in opened.indexes(topic)) or "none"
+            raise UsageError(f"{topic} has no index on {' '.join(field)}. Its indexes: {known}.")
+        found = opened.indexes(topic)
+    _print(found, as_json=as_json, quiet=quiet)
+
+
+@command.command()
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def address(*, store: Path | None, mongo: str | None, as_json: bool, quiet: bool) -> None:
+    """Print the address of the index for other programs, and what is in it.
+
+    The index is brought up to date first. The embedded MongoDB keeps its address, waits ten
+    minutes for the first client, and runs as long as one is connected.
+    """
+    with opened_store(store, mongo, needs_database=True, quiet=quiet) as opened:
+        found = opened.index_address()
+        places = [] if quiet and not as_json else opened.index_contents()
+        recordings = len(opened.session.snapshot())
+    if as_json:
+        topics = [
+            {"topic": topic, "collection": collection, "documents": documents}
+            for topic, collection, documents in places
+        ]
+        about = {"uri": found.uri, "database": found.database, "recordings": recordings}
+        output.print_json({**about, "topics": topics})
+        return
+    output.say(found.uri)
+    if not quiet:
+        output.print_table(
+            (("topic", "whole"), ("collection", "whole"), ("documents", "right")),
+            [(topic, collection, str(documents)) for topic, collection, documents in places],
+        )
+        output.say(f"database {found.database}, {output.counted(recordings, 'recording')}")
+
+
+@command.command()
+@options.choice
+@options.store
+@options.mongo
+@options.cache_size
+@options.as_json
+@options.quiet
+def rebuild(
+    *,
+    choice: Choice,
+    store: Path | None,
+    mongo: str | None,
+    cache_size: int | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Rebuild the index from the segments, recording by recording.
+
+    Queries of the other recordings work meanwhile. After an interruption, the next command
+    that needs the index finishes the recording at which it stopped.
+    """
+    started = time.monotonic()
+    with opened_store(
+        store, mongo, needs_database=True, cache_mb=cache_size, quiet=quiet
+    ) as opened:
+        chosen = recordings_of(opened, choice)
+        total = sum(entry.stored_bytes for entry in chosen.summaries)
+        with (
+            if_stopped(
+                "Finished recordings stay indexed; the next command that needs the index "
+                "finishes the recording at which it stopped."
+            ),
+            progress_bar("index rebuild", total, quiet=quiet) as bar,
+        ):
+            done = opened.rebuild_index(None if choice.is_everything else chosen, Stages(bar))
+    left = [entry.label for entry in chosen.summaries if entry.id not in {r.id for r in done}]
+    for label in left:
+        output.note(f"Recording {label} is in use, and was left as it is.")
+    for entry in done:
+        if entry.status == "damaged":
+            output.note(f"{entry.label} is damaged: `hybridlog losses {entry.label}` shows where.")
+    messages = sum(r.documents for r in done)
+    without = sum(r.messages for r in done) - messages
+    elapsed = time.monotonic() - started
+    if as_json:
+        output.print_json(
+            {
+                "recordings": len(done),
+                "messages": messages,
+                "messages_without_documents": without,
+                "left": left,
+                "seconds": round(elapsed, 3),
+            }
+        )
+    elif not quiet:
+        output.say(
+            f"{output.counted(len(done), 'recording')}, "
+            f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
+            f"{output.without_documents(without)}"
+        )
+
+
+def _print(found: list[FieldIndex], *, as_json: bool, quiet: bool) -> None:
     if as_json:
         output.print_json([{"topic": one.topic, "fields": list(one.fields)} for one in found])
     elif found:

@@ -505,7 +505,7 @@ def _stamps(
             yield segment, summary.digest, stamps_of(summary.table, stats)
 
 
-def reindex(
+def rebuild(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import journal_from_segments, take_inventory, unlisted_lines
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.index import catch_up, reindex
+from hybridlog.maintenance.index import catch_up, rebuild
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
 from hybridlog.payloads.contents import open_segment
 from hybridlog_storage import durability, files
@@ -188,7 +188,7 @@ def repair_index(
         if entry.status == "open":
             continue
         if _is_restored(directory, catalog, entry):
-            if not reindex(directory, catalog, database, [entry], progress):
+            if not rebuild(directory, catalog, database, [entry], progress):
                 done.append(Repaired(entry.label, "index", "damaged chunks are readable again"))
             continue
         if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:

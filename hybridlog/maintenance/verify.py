@@ -328,11 +328,11 @@ class _Check:
             problem = _compare(self._indexed.database, key, chunk, places, want)
             if problem:
                 where = f"{name} byte {chunk.offset}, collection {collection}"
-                self.found(where, problem, self._reindex)
+                self.found(where, problem, self._rebuild)
 
     @property
-    def _reindex(self) -> str:
-        return f"run `hybridlog reindex -r {self._label}`"
+    def _rebuild(self) -> str:
+        return f"run `hybridlog index rebuild -r {self._label}`"
 
     def _row(self, entry: RecordingEntry) -> None:
         """Check the catalog's row and its chunk tables."""
@@ -354,9 +354,9 @@ class _Check:
         state = IndexState(self._indexed.database)
         indexed = state.of([entry.key]).get(entry.key)
         if indexed is None or not indexed.is_whole(entry):
-            self.found("index", "it is not complete", self._reindex)
+            self.found("index", "it is not complete", self._rebuild)
         elif not state.is_mirrored(entry):
-            self.found("index", "its entry of the recording differs", self._reindex)
+            self.found("index", "its entry of the recording differs", self._rebuild)
         have = self._indexed.documents_of(entry)
         if self._indexed.count_all and +have != +self._expected:
             # The recording may have ended since all documents were counted.
@@ -366,7 +366,7 @@ class _Check:
             if found != want:
                 problem = f"{found} index documents, {want} messages in the segments"
                 # Surplus documents may have any time.
-                cure = self._reindex if found < want else "run `hybridlog reindex`"
+                cure = self._rebuild if found < want else "run `hybridlog index rebuild`"
                 self.found(f"collection {collection}", problem, cure)
 
     def _tables(self, entry: RecordingEntry) -> None:
@@ -407,10 +407,10 @@ def _compare(
     """
     first, end = int(chunk.batch.log_time.min()), int(chunk.batch.log_time.max()) + 1
     asked = {"_meta.ref.chunk": chunk.number, "_meta.ref.seg": chunk.segment}
-    filters = [{**place.documents(first, end), **asked} for place in places]
+    filters = [(place.collection, {**place.documents(first, end), **asked}) for place in places]
     have = {
         document
-        for raw in database.find_each(places[0].collection, filters)
+        for raw in database.find_each(filters)
         for document in _split(raw)
         if recording_key(document) == key
     }

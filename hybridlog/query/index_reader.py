@@ -13,7 +13,13 @@ import numpy as np
 from hybridlog.query.predicate.to_mongo import replaced, to_mongo
 from hybridlog.query.predicate.tree import Field, Member, Node, Opaque, Predicate, nodes
 from hybridlog.schema.column import STAMP
-from hybridlog_storage.errors import ConnectionLostError, IndexChangedError, TopicError
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.errors import (
+    ConnectionLostError,
+    DatabaseError,
+    IndexChangedError,
+    TopicError,
+)
 from hybridlog_storage.index_columns import KEY, key_columns
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
@@ -64,10 +70,10 @@ class IndexReader:
         """Parts with predicates that columns and messages decide.
 
         What only documents can answer becomes the arrival numbers of the messages for which it
-        holds. Each topic is asked about once.
+        holds.
 
         Raises:
-            DatabaseError: MongoDB is unavailable.
+            DatabaseError: MongoDB is unavailable, or its list of topics is damaged.
             IndexChangedError: another process changes the index.
             TopicError: a topic was recorded without index documents.
             WhereError: MongoDB does not understand the predicate.
@@ -75,23 +81,18 @@ class IndexReader:
         missing = next((part.topic for part in parts if not part.is_indexed), None)
         if missing is not None:
             raise without_documents(missing)
-        groups: dict[tuple[str, Node], list[Part]] = defaultdict(list)
+        groups: dict[Node, list[Part]] = defaultdict(list)
         for part in parts:
             for node in _of_documents(part):
-                groups[part.topic, node].append(part)
-
-        def ask() -> dict[tuple[str, Node], dict[str, NDArray[np.int64]]]:
-            self._places(parts)  # of all topics, with one command
-            return {
-                (topic, node): self._holding(group, to_filter(node))
-                for (topic, node), group in groups.items()
-            }
-
-        found = self._again(parts, ask)
+                groups[node].append(part)
+        found = self._again(
+            parts,
+            lambda: {node: self._holding(group, to_filter(node)) for node, group in groups.items()},
+        )
 
         def decided(part: Part) -> Part:
             def seqs(node: Node) -> Node:
-                numbers = found[part.topic, node].get(part.recording.key)
+                numbers = found[node].get(part.recording.key)
                 return Member(_SEQ, () if numbers is None else tuple(numbers.tolist()), False)
 
             assert part.predicate is not None
@@ -180,16 +181,23 @@ class IndexReader:
         return self._index(parts).find_raw(*query, sort=[("_id", order)], batch_size=_DOCUMENTS)
 
     def _holding(self, parts: Sequence[Part], own: Filter) -> dict[str, NDArray[np.int64]]:
-        """Arrival numbers of the documents of parts of one topic that a filter finds, by key."""
-        queries = [query for (_, query), _ in self._queries(parts, own)]
-        collection = self._places(parts)[parts[0].topic].collection
+        """Arrival numbers of the documents that a filter finds, by key of the recording.
+
+        A recording has each number once, whatever the topic.
+        """
+        index, places = self._index(parts), self._places(parts)
+        kinds: dict[bool, list[Part]] = defaultdict(list)  # keys differ in their length
+        for part in parts:
+            kinds[places[part.topic].is_shared].append(part)
         found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for raw in self._index(parts).find_each(collection, queries, KEY):
-            check_wanted()
-            keys = key_columns(raw)
-            self._counters.documents_read += len(keys)
-            for recording in np.unique(keys.recording).tolist():
-                found[f"{recording:016x}"].append(keys.seq[keys.recording == recording])
+        for group in kinds.values():
+            queries = [query for query, _ in self._queries(group, own)]
+            for raw in index.find_each(queries, KEY):
+                check_wanted()
+                keys = key_columns(raw)
+                self._counters.documents_read += len(keys)
+                for recording in np.unique(keys.recording).tolist():
+                    found[f"{recording:016x}"].append(keys.seq[keys.recording == recording])
         return {key: np.unique(np.concatenate(numbers)) for key, numbers in found.items()}
 
     def _again(self, parts: Sequence[Part], ask: Callable[[], _T]) -> _T:
@@ -215,7 +223,13 @@ class IndexReader:
         return self._session.index_for(_PURPOSE, _entries(parts))
 
     def _places(self, parts: Sequence[Part]) -> dict[str, TopicPlace]:
-        return self._session.places(_PURPOSE).of({part.topic for part in parts})
+        found = self._session.places(_PURPOSE).of({part.topic for part in parts})
+        for part in parts:
+            if not found[part.topic].is_listed and part.recording.status not in UNFINISHED:
+                raise DatabaseError(
+                    f"The index does not list {part.topic}: run `hybridlog index rebuild`."
+                )
+        return found
 
     # Queries.
 

@@ -717,7 +717,8 @@ class Catalog:
             )
         if _is_damage(error):
             return CatalogError(
-                f"The catalog {self._path} is damaged: {error}. `hybridlog reindex` rebuilds it."
+                f"The catalog {self._path} is damaged: {error}. `hybridlog index rebuild` makes "
+                "it again."
             )
         return StoreError(
             f"The catalog {self._path} cannot be {what}: {error}. Delete it while no "
@@ -864,7 +865,7 @@ class Catalog:
         if row is None or type(row[0]) is not str or hash_of(row[0]) != digest:
             raise CatalogError(
                 f"The catalog {self._path} has lost the topics of recordings. "
-                "`hybridlog reindex` rebuilds it."
+                "`hybridlog index rebuild` rebuilds it."
             )
         return topics_from_json(row[0])
 
@@ -977,7 +978,7 @@ class Catalog:
         if _crc(*row[:2]) != row[2] or row[0] != recording:
             raise CatalogError(
                 f"The catalog's list of damaged chunks of recording {recording} is damaged. "
-                "`hybridlog reindex` rebuilds it."
+                "`hybridlog index rebuild` rebuilds it."
             )
         return {(segment, chunk): reason for segment, chunk, reason in json.loads(row[1])}
 
@@ -1040,7 +1041,7 @@ class Catalog:
             if row is None or _crc(*row[:4]) != row[4] or row[:3] != key:
                 raise CatalogError(
                     f"The catalog has lost the chunks of segment {number} of recording "
-                    f"{entry.label}. `hybridlog reindex` rebuilds it."
+                    f"{entry.label}. `hybridlog index rebuild` rebuilds it."
                 )
             table = ChunkTable.from_bytes(row[3])
             cached = table, self.stamps(entry, number, table)

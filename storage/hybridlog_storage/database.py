@@ -609,28 +609,26 @@ class Database:
 
     def find_each(
         self,
-        collection: str,
-        filters: Sequence[Mapping[str, object]],
+        questions: Sequence[tuple[str, Mapping[str, object]]],
         projection: Mapping[str, object] | None = None,
     ) -> Iterator[bytes]:
         """Find the documents of many questions, one after the other, as in `find_raw`.
 
         Args:
-            collection: The collection.
-            filters: The questions, each with a range of `_id`. The documents that about a
-                hundred of them find must fit into memory.
+            questions: Collection and filter of each, the latter with a range of `_id`. The
+                documents that about a hundred of them find must fit into memory.
             projection: MongoDB's projection document; names the fields to return.
         """
-        of = self._collection(collection)
         shape = [] if projection is None else [{"$project": dict(projection)}]
-        for _, part in _together([(collection, query) for query in filters]):
+        for _, part in _together(questions):
             if len(part) == 1:  # one command; a pipeline takes two
-                yield from self.find_raw(collection, part[0][1], projection, sort=[("_id", 1)])
+                yield from self.find_raw(*part[0], projection, sort=[("_id", 1)])
                 continue
             parts = [(where, [{"$match": dict(query)}, _IN_ORDER, *shape]) for where, query in part]
-            _, pipeline = _union(parts)
+            collection, pipeline = _union(parts)
+            of = self._collection(collection)
 
-            def ask(pipeline: list[Document] = pipeline) -> list[bytes]:
+            def ask(of: Any = of, pipeline: list[Document] = pipeline) -> list[bytes]:
                 found = of.aggregate_raw_batches(pipeline, batchSize=1 << 30, allowDiskUse=True)
                 with _closing(found) as cursor:
                     return [*cursor]

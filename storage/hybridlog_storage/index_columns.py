@@ -84,9 +84,7 @@ def _documents(batch: bytes, layout: np.dtype[np.void]) -> NDArray[np.void]:
 
 
 def _strange(what: str) -> StoreError:
-    return StoreError(
-        f"An index document has an unexpected {what}. `hybridlog reindex` makes the index anew."
-    )
+    return StoreError(f"An index document has an unexpected {what}: run `hybridlog index rebuild`.")
 
 
 def _prefix_bytes(batch: bytes) -> int:

@@ -59,7 +59,7 @@ from hybridlog_storage.errors import (
     exhausted,
 )
 from hybridlog_storage.settings import MIN_CACHE_MB
-from hybridlog_storage.socket_directory import is_our_socket, is_socket_of, new_socket
+from hybridlog_storage.socket_directory import is_our_socket, is_socket_of, link_of, new_socket
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -169,7 +169,7 @@ class EmbeddedMongod:
 
     @property
     def data(self) -> Path:
-        """The directory of mongod's data files; a reindex rebuilds it after a removal."""
+        """The directory of mongod's data files; `index rebuild` fills it after a removal."""
         return self._directory / "data"
 
     def start(self) -> str:
@@ -192,11 +192,34 @@ class EmbeddedMongod:
                     self._leave()  # the store was removed, and may have been created again
                 if self._users is None:
                     self._users = self._enter()
-                return _uri(self._find_or_launch())
+                path = self._find_or_launch()
+                with contextlib.suppress(OSError):
+                    link_of(Path(path), self._directory)
+                return _uri(path)
             except HybridlogError:
                 if entered:
                     self._leave()
                 raise
+
+    def publish(self, wait_s: float) -> str:
+        """An address for other programs that stays the same, as a URI.
+
+        mongod ends when nobody has been connected for a while.
+
+        Args:
+            wait_s: Seconds for which it runs in any case from now on.
+
+        Raises:
+            HybridlogError: As for `start`.
+        """
+        self.start()
+        with self._mutex:
+            assert self._users is not None
+            try:
+                os.utime(self._users, (time.time() + wait_s,) * 2)  # its keeper looks at it
+                return _uri(str(link_of(Path(self._find_or_launch()), self._directory)))
+            except OSError as error:
+                raise _directory_error(self._directory, error) from error
 
     def stop(self) -> None:
         """End the use of mongod by this object. Does nothing if it was not started."""

@@ -40,6 +40,10 @@ POLL_AT_START_S = 0.05
 YOUNG_S = 3.0
 LOG_CHECK_S = 10.0
 RECORD_LIMIT = 64 << 10
+PUBLISHED_S = 86_400.0
+"""Most seconds for which mongod waits for clients."""
+CONNECTED = b"03"
+"""State of a connection in /proc/net/unix."""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -179,8 +183,11 @@ def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: l
         if os.fstat(users).st_nlink == 0:
             return True
         if _lock(users):
-            idle_since = now if idle_since is None else idle_since
-            if now - idle_since >= job["linger_s"]:
+            if _is_published(users) or _has_clients(job["socket"]):
+                idle_since = None
+            elif idle_since is None:
+                idle_since = now
+            if idle_since is not None and now - idle_since >= job["linger_s"]:
                 # It stays locked: new users wait until mongod and this process have ended,
                 # and then start a new one.
                 return False
@@ -191,6 +198,21 @@ def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: l
             checked_log = now
             _put_log_aside(job)
         time.sleep(POLL_AT_START_S if now - born < YOUNG_S else POLL_S)
+    return False
+
+
+def _is_published(users: int) -> bool:
+    """True while clients are waited for: the time of the file is set to the end of it."""
+    return 0 < os.fstat(users).st_mtime - time.time() < PUBLISHED_S
+
+
+def _has_clients(socket: str) -> bool:
+    """True if any program is connected to a socket; other systems than Linux do not tell."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/net/unix").read_bytes().splitlines()
+        # Num, RefCount, Protocol, Flags, Type, St, Inode, Path
+        connected = [line.split(None, 5)[5].split(None, 2) for line in lines[1:]]
+        return any(one[0] == CONNECTED and one[2:] == [os.fsencode(socket)] for one in connected)
     return False
 
 

@@ -47,6 +47,24 @@ def is_socket_of(path: str, directory: Path) -> bool:
     return own.parent == socket_base() and own.name.startswith(f"{_part(directory)}-")
 
 
+def link_of(path: Path, directory: Path) -> Path:
+    """A path that always leads to the present socket of a directory: a link to it.
+
+    Args:
+        path: The socket, from `new_socket`.
+        directory: The directory that it belongs to.
+
+    Raises:
+        OSError: The link cannot be made.
+    """
+    link = socket_base() / f"{_part(directory)}.sock"
+    if not link.is_symlink() or link.readlink() != path:
+        fresh = link.with_suffix(f".{secrets.token_hex(4)}")
+        fresh.symlink_to(path)
+        fresh.rename(link)
+    return link
+
+
 def _part(directory: Path) -> str:
     return hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
 

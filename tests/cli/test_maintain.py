@@ -1,4 +1,4 @@
-"""`hybridlog reindex`, `verify`, `rm`, and stores that cannot be opened."""
+"""`hybridlog index rebuild`, `verify`, `rm`, and stores that cannot be opened."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
     assert f" {count} messages, " in done.out
     assert done.out.endswith("all is well\n")
     before = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
-    again = run("reindex", "--json", store=fresh).json
+    again = run("index", "rebuild", "--json", store=fresh).json
     assert (again["recordings"], again["messages"]) == (1, count)
     after = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
     assert after == before != b""

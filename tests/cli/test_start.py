@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import cast
 
 import click
 import pytest
@@ -118,11 +119,18 @@ def commands() -> dict[str, click.Command]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_a_command_describes_it_and_every_parameter(name: str) -> None:
-    out = run(name, "--help").out
-    command = commands()[name]
+    out = run(*name.split(), "--help").out
+    command: click.Command = app
+    for word in name.split():
+        found = cast("click.Group", command).get_command(click.Context(command), word)
+        assert found is not None
+        command = found
     assert out.startswith(f"Usage: hybridlog {name} ")
     assert command.help is not None
     assert command.get_short_help_str(200) in " ".join(out.split())
+    for each in getattr(command, "commands", {}):
+        assert f"\n  {each} " in out
+        test_help_of_a_command_describes_it_and_every_parameter(f"{name} {each}")
     for parameter in command.params:
         assert parameter.help, parameter.name
         shown = parameter.opts if isinstance(parameter, click.Option) else [parameter.metavar]
@@ -248,10 +256,10 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
         ("schema", "scan"),
         ("intervals", "-t", "scan", "-r", "robot", "--where", "ranges.min < 1"),
         ("changes", "-t", "scan", "-r", "robot", "--fields", "ranges.min"),
-        ("index",),
+        ("index", "list"),
         ("verify", "robot"),
         ("repair", "robot"),
-        ("reindex", "-r", "odd"),
+        ("index", "rebuild", "-r", "odd"),
     ],
     ids=" ".join,
 )

@@ -348,7 +348,7 @@ def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_pa
     assert "robot" in run("ls", store=store).out
     near = run("fetch", "-t", "scan", "--where", "range_min < 1", "--count", store=store)
     assert near.out.strip() == str(len(seen))  # the segments know
-    assert "does not answer" in run("reindex", store=store, code=6).err
+    assert "does not answer" in run("index", "rebuild", store=store, code=6).err
     # The segments are checked all the same.
     done = run("verify", store=store, code=6)
     assert "all is well in the files" in done.out
@@ -356,7 +356,7 @@ def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_pa
     assert "does not answer" in done.err
 
     # Another server is as good: the index is made anew from the segments.
-    run("reindex", "--mongo", "embedded", store=store)
+    run("index", "rebuild", "--mongo", "embedded", store=store)
     assert "robot" in run("ls", store=store).out
 
 

@@ -418,7 +418,7 @@ def _repair(store: Any, _args: Sequence[str]) -> None:
 COMMANDS: Mapping[str, Command] = {
     "open": _open,
     "rm": _on_store(lambda store, args: store.remove(args[0])),
-    "reindex": _on_store(lambda store, args: store.reindex(args or None)),
+    "reindex": _on_store(lambda store, args: store.rebuild_index(args or None)),
     "rename": _on_store(lambda store, args: store.rename(args[0], args[1])),
     "tag": _on_store(lambda store, args: store.tag(args[0], **{args[1]: args[2]})),
     "note": _on_store(lambda store, args: store.note(args[0], args[1])),

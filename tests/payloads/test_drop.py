@@ -100,7 +100,7 @@ def test_index_and_tables_are_made_again_from_columns(plain: Path, copy: Path) -
     with hl.open(copy) as store:
         store.compact(drop_mcap=True)
         shutil.rmtree(copy / "tables")
-        store.reindex()
+        store.rebuild_index()
         assert store.verify().findings == []
         documents = [d["ranges"]["max"] for d in store.topic("/scan").documents()]
         with hl.open(plain) as other:

@@ -376,8 +376,10 @@ COMMANDS: dict[str, list[Asked]] = {
         asked("verify", lambda a, _: f"as far as sealed: {LABEL}" in a.err, lambda _: True),
     ],
     "repair": [asked("repair --json", lambda a, _: a.json, lambda _: [])],
-    "index": [asked("index --json", lambda a, _: a.json, lambda _: [])],
-    "reindex": [refused(f"reindex -r {LABEL}", 5)],
+    "index": [
+        asked("index list --json", lambda a, _: a.json, lambda _: []),
+        refused(f"index rebuild -r {LABEL}", 5),
+    ],
     "compact": [
         refused(f"compact -r {LABEL} -q", 5),
         asked("compact --json", lambda a, _: a.json, lambda _: []),

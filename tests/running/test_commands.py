@@ -47,7 +47,7 @@ def test_at_rest(
     running: Running, one: Asked, mongo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if mongo:
-        if one.words[0] in {"index", "reindex", "verify"}:
+        if one.words[0] in {"index", "verify"}:
             pytest.skip("needs MongoDB")
         monkeypatch.setenv("HYBRIDLOG_MONGO_URI", mongo)
     words, out = place_for(one.words, tmp_path / "out")

@@ -137,7 +137,7 @@ CHANGES: dict[str, Work] = {
     "rename": lambda store: store.rename("day00004", "fourth"),
     "rename back": lambda store: store.rename("fourth", "day00004"),
     "verify of one": lambda store: store.verify(["day00004"]),
-    "reindex of one": lambda store: store.reindex(["day00004"]),
+    "reindex of one": lambda store: store.rebuild_index(["day00004"]),
     "repair of one": lambda store: store.repair(["day00004"]),
 }
 
@@ -179,7 +179,7 @@ import hybridlog as hl
 with hl.open(sys.argv[1]) as store:
     pose = store.topic("pose")
     print(pose.count(), pose.where("data > 4.5").count(), sum(1 for _ in pose))
-    print(len(pose.to_pandas()), len(store.reindex()), len(store.verify().findings))
+    print(len(pose.to_pandas()), len(store.rebuild_index()), len(store.verify().findings))
 """
 
 

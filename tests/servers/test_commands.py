@@ -81,7 +81,7 @@ def asked(path: Path) -> tuple[dict[str, list[Sent]], dict[str, object]]:
         heard["record"] = [*sent]
         store.connect()
         sent.clear()
-        store.reindex(["more"])
+        store.rebuild_index(["more"])
         heard["reindex"] = [*sent]
         store.connect()
         sent.clear()

@@ -118,7 +118,7 @@ def test_everything_works_and_the_password_stays_where_it_is(
     assert len(rows.lines) == MESSAGES - 100
     indexed = run("index", "/number", "n", store=store, **env)
     verified = run("verify", store=store, **env)
-    again = run("reindex", store=store, **env)
+    again = run("index", "rebuild", store=store, **env)
     said += [counted, rows, indexed, verified, again, run("verify", store=store, **env)]
     monkeypatch.setenv("HYBRIDLOG_MONGO_PASSWORD_FILE", str(password))
     channel = Channel("/live", "ros1", Schema("a/N", "ros1msg", b"uint32 n\n"), {}, False)

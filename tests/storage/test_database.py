@@ -267,10 +267,10 @@ def test_many_questions_at_once(database: Database, name: str) -> None:
     assert database.count_each(mixed) == [0, want[1], 0]
     assert database.count_each([]) == []
     parts = [[x for x in range(a, b) if x != 6] for a, b in spans]
-    some = list(database.find_each(name, ranges, {"x": 1}))
+    some = list(database.find_each([(name, one) for one in ranges], {"x": 1}))
     assert [d["x"] for b in some for d in bson.decode_all(b)] == [x for part in parts for x in part]
-    assert b"".join(database.find_each("none", ranges, {"x": 1})) == b""
-    assert list(database.find_each(name, [], {"x": 1})) == []
+    assert b"".join(database.find_each([("none", one) for one in ranges], {"x": 1})) == b""
+    assert list(database.find_each([], {"x": 1})) == []
     assert database.count(name, ranges[1], by_key=True) == want[1]
 
 
@@ -387,7 +387,7 @@ def test_a_wrong_predicate_is_the_users_error(
     with pytest.raises(WhereError):
         database.count_each([(name, predicate), (name, {})])
     with pytest.raises(WhereError):
-        list(database.find_each(name, [{}, predicate], {"x": 1}))
+        list(database.find_each([(name, {}), (name, predicate)], {"x": 1}))
     with pytest.raises(WhereError):
         list(database.aggregate(name, [{"$match": predicate}]))
 

@@ -115,10 +115,10 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store) -> None:
 
 def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
     before = contents(few)
-    few.reindex()
+    few.rebuild_index()
     assert contents(few) == before
     shutil.rmtree(few.directory.path / TABLES)
-    few.reindex()
+    few.rebuild_index()
     assert contents(few) == before
 
 

@@ -280,7 +280,7 @@ def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables) -> No
     assert recorded.topic("/large").where("i8 > 0").count() == want
     assert recorded.verify().findings == []
     assert count(recorded, tables, "/large") == want
-    recorded.reindex()
+    recorded.rebuild_index()
     assert compare(recorded) == 1800
 
 

@@ -433,7 +433,7 @@ def test_a_disk_that_fills_up(
     tables = Tables(store.directory.path)
     assert all(tables.of(entry, topic) is None for topic in topics_of(entry))
     monkeypatch.undo()
-    store.reindex()
+    store.rebuild_index()
     assert compare(store) == 6000
 
 

@@ -1,0 +1,80 @@
+"""The address of the index for other programs: it stays the same, and the server stays for them."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from pymongo import MongoClient
+
+import hybridlog as hl
+from hybridlog import store as store_module
+from hybridlog_storage import mongod_keeper
+from tests.cli.running import run
+from tests.faults import logs
+
+
+@pytest.fixture
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", "0")
+    log = logs.write(tmp_path / "a.mcap", logs.content(0, 20))
+    with hl.open(tmp_path / "store", create=True) as store:
+        store.record(log)
+    return tmp_path / "store"
+
+
+def mongod(path: Path) -> psutil.Process:
+    return psutil.Process(json.loads((path / "mongod" / "mongod.json").read_bytes())["mongod"])
+
+
+def test_a_server_stays_while_a_client_is_connected(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store_module, "_CLIENTS_WAIT_S", 5.0)
+    with hl.open(path) as store:
+        address = store.index_address()
+        assert store.index_contents() == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]
+    server = mongod(path)
+    with MongoClient[dict[str, object]](address.uri) as client:
+        time.sleep(7)
+        assert server.is_running()
+        assert client[address.database]["number"].count_documents({"n": {"$gte": 5}}) == 15
+    server.wait(30)
+    with hl.open(path) as store:
+        assert store.index_address() == address
+
+
+def test_a_record_of_the_kernel_tells_connections(path: Path) -> None:
+    with hl.open(path) as store:
+        store.connect()
+        record = json.loads((path / "mongod" / "mongod.json").read_bytes())
+        assert mongod_keeper._has_clients(record["socket"])
+        assert not mongod_keeper._has_clients(record["socket"] + "x")
+
+
+def test_as_a_command(path: Path) -> None:
+    (path / "mongod" / "mongod.json").unlink(missing_ok=True)
+    told = run("index", "address", "--json", store=path).json
+    assert told["recordings"] == 1
+    assert [(one["topic"], one["documents"]) for one in told["topics"]] == [
+        ("/number", 20),
+        ("/stamped", 20),
+        ("/text", 20),
+    ]
+    assert run("index", "address", "-q", store=path).lines == [told["uri"]]
+    out = run("index", "address", store=path).out
+    assert out.startswith(told["uri"] + "\n")
+    assert out.endswith("database hybridlog, 1 recording\n")
+    mongod(path).terminate()
+
+
+def test_an_address_has_no_password(tmp_path: Path) -> None:
+    uri = "mongodb://me:secret@127.0.0.1:1/robots?serverSelectionTimeoutMS=1&authSource=admin"
+    with hl.open(tmp_path / "store", create=True, mongo=uri) as store:
+        connection = store.session.connection
+        connection._uri = uri
+        connection.open = lambda: None  # type: ignore[method-assign, assignment, return-value]
+        assert connection.address(1) == uri.replace(":secret", "")
