@@ -15,6 +15,7 @@ from collections.abc import (
 )
 from contextlib import closing, contextmanager, suppress
 from functools import lru_cache, partial, wraps
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
@@ -29,8 +30,8 @@ from hybridlog.maintenance.opening import (
 )
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
-from hybridlog.query.chunk_lists import ChunkLists, latest_first
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
@@ -56,7 +57,7 @@ from hybridlog_storage.forks import begins_anew
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segment_reader import SegmentReader, place_of
-from hybridlog_storage.times import END, placed
+from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,12 +67,13 @@ if TYPE_CHECKING:
     from hybridlog.index_version import GuardedIndex, IndexVersion
     from hybridlog.index_writer import IndexTarget
     from hybridlog.payloads.reader import PayloadReader
+    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
     from hybridlog.running import RunningRecording
     from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
-    from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.database import Database
     from hybridlog_storage.directory import StoreDirectory
@@ -80,6 +82,7 @@ if TYPE_CHECKING:
 
 _SHOWN = 5  # recordings in a message
 _MAX_OPEN_SEGMENTS = 256
+_MAX_COLUMNS = 4096  # sets of chunks that are at hand
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
 _TRIES = 5  # to connect, while the connection breaks; to find a recording, while it is renamed
 _PAUSE_S = 0.1  # before the second try; doubles each time
@@ -196,7 +199,7 @@ class Session:
         self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._contents: dict[Path, MovedContents] = {}
-        self._chunk_lists = ChunkLists()
+        self._columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and made if missing
         self._lock = threading.Lock()
         self._remember_meanings()
@@ -957,51 +960,70 @@ class Session:
         channels: Sequence[int],
         bounds: tuple[int, int] | None,
         clock: str,
-    ) -> list[ChunkEntry]:
+    ) -> list[Chunk]:
         """Chunks that may hold messages of some channels in a time range."""
-        if bounds is None or clock != "log" or recording.status == "open":
-            return self._fetch_chunks(recording, channels, bounds, clock)
-        fetch = partial(self._fetch_chunks, recording, channels)
-        return self._chunk_lists.find(recording.id, channels, bounds, fetch)
+        found: list[Chunk] = []
+        timed = [c.id for c in recording.channels if c.has_publish_time]
+        for number, first, last in recording.spans:
+            is_beside = bounds is not None and not (
+                min(first, END - 1) < bounds[1] and last >= bounds[0]
+            )
+            if clock == "log" and is_beside:
+                continue
+            columns, stamps = self._chunk_columns(recording, number, channels)
+            found += columns.chunks(columns.within(bounds, clock, stamps=stamps, timed=timed))
+        return found
 
     def chunks_before(
-        self, recording: RecordingEntry, channels: Sequence[int], span: tuple[int, int]
-    ) -> Iterator[tuple[ChunkEntry, int]]:
-        """Chunks that may hold the last message of some channels by a time.
-
-        Args:
-            recording: The recording.
-            channels: Channel ids.
-            span: Log time of the recording's first message, and the time, ns.
+        self, recording: RecordingEntry, channels: Sequence[int], latest: int
+    ) -> Iterator[tuple[Chunk, int]]:
+        """Chunks that may hold the last message of some channels by a time, ns.
 
         Yields:
-            See `ChunkLists.before`.
+            A chunk, and the greatest log time, ns, that it or any later chunk may hold.
         """
-        fetch = partial(self._fetch_chunks, recording, channels)
-        if recording.status == "open":
-            return latest_first(frozenset(channels), span, fetch)
-        return self._chunk_lists.before(recording.id, channels, span, fetch)
+        spans = sorted(recording.spans, key=lambda span: span[1])
+        spans = [span for span in spans if span[1] <= latest]
+        lasts = [BEGIN, *accumulate((last for _, _, last in spans), max)]
+        for place in reversed(range(len(spans))):
+            columns, _ = self._chunk_columns(recording, spans[place][0], channels)
+            for chunk, last in columns.before(latest):
+                yield chunk, max(last, lasts[place])
 
-    def _fetch_chunks(
+    def _chunk_columns(
+        self, recording: RecordingEntry, number: int, channels: Sequence[int]
+    ) -> tuple[ChunkColumns, NDArray[np.void] | None]:
+        """The chunks of a segment with some channels, and header stamps of its parts."""
+        table, stamps = self._of_catalog(recording, self.catalog.decoded_table, number)
+        key = recording.id, number, frozenset(channels)
+        known = self._columns.get(key)
+        if known is None or known[0] is not table:
+            if len(self._columns) >= _MAX_COLUMNS:
+                self._columns.clear()
+            known = self._columns[key] = table, ChunkColumns(number, table, channels)
+        return known[1], stamps
+
+    def chunk_stats(self, recording: RecordingEntry, chunk: Chunk) -> dict[int, ChannelStats]:
+        """Statistics of the channels in a chunk."""
+        return self._of_catalog(recording, self.catalog.chunk_stats, chunk.segment, chunk.number)
+
+    def _of_catalog(
         self,
         recording: RecordingEntry,
-        channels: Sequence[int],
-        bounds: tuple[int, int] | None,
-        clock: str = "log",
-    ) -> list[ChunkEntry]:
+        ask: Callable[Concatenate[RecordingEntry, _P], _T],
+        *args: _P.args,
+        **kwargs: _P.kwargs,
+    ) -> _T:
+        """An answer of the catalog, whose lost rows are made again."""
         try:
-            return self.catalog.chunks(recording, channels, bounds, clock)
+            return ask(recording, *args, **kwargs)
         except CatalogError:
             put_again(self.directory, self.catalog, recording)
-            return self.catalog.chunks(recording, channels, bounds, clock)
+            return ask(recording, *args, **kwargs)
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a sealed segment of a recording, as columns."""
-        try:
-            return self.catalog.table(recording, number)
-        except CatalogError:
-            put_again(self.directory, self.catalog, recording)
-            return self.catalog.table(recording, number)
+        """The chunks of a segment of a recording."""
+        return self._of_catalog(recording, self.catalog.table, number)
 
     def parts(
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
@@ -1125,7 +1147,7 @@ class Session:
         with self._lock:
             self._contents.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
-        self._chunk_lists.clear()
+        self._columns.clear()
         self.recent_chunks.clear()
         self._tables_tried.clear()
         if "tables" in vars(self):

@@ -15,6 +15,7 @@ import hybridlog as hl
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.segment_writer import SegmentSettings
+from tests.storage.chunk_entries import chunk_entries
 from tests.test_model import drafts_of, write_mcap
 
 CHANGES = {
@@ -51,7 +52,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             write_mcap(base / f"log{seed}.mcap", drafts_of(seed, 80))
             opened.record(base / f"log{seed}.mcap", settings=SegmentSettings(chunk_size=2048))
         entry = opened.entry("log6")
-        chunk = opened.catalog.chunks(entry)[2]
+        chunk = chunk_entries(opened.catalog, entry)[2]
         segment = opened.directory.recording("log6") / "000000.mcap"
         content = bytearray(segment.read_bytes())
         content[chunk.offset + chunk.length - 1] ^= 1

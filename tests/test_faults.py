@@ -37,6 +37,7 @@ from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests import independent
+from tests.storage.chunk_entries import chunk_entries
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
 LIMIT_S = 120
@@ -237,7 +238,7 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
     state = IndexState(store.database)
     # All chunks are in the index, and it is not done.
     state.put(entry, "open", turn=1)
-    state.put_chunks(store.catalog.chunks(entry))
+    state.put_chunks(chunk_entries(store.catalog, entry))
 
 
 @pytest.mark.parametrize("listed", [False, True])
@@ -502,7 +503,7 @@ def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int,
     (entry,) = store.select(["short"])
     topics = {c.id: c.topic for c in entry.channels}
     got: set[int] = set()
-    for chunk in store.catalog.chunks(entry):
+    for chunk in chunk_entries(store.catalog, entry):
         if (chunk.segment, chunk.number) in lost:
             continue
         # Bounds that no other chunk of these topics can be needed for.

@@ -54,6 +54,7 @@ from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.segment_writer import SegmentSettings
+from tests.storage.chunk_entries import chunk_entries
 
 BEGIN = 1_700_000_000 * 10**9
 STEP = 40_000_000
@@ -760,7 +761,7 @@ class Machine(RuleBasedStateMachine):
         IndexState(self.store.database).put_chunks(
             [
                 chunk
-                for chunk in self.store.catalog.chunks(entry)
+                for chunk in chunk_entries(self.store.catalog, entry)
                 if chunk.segment != number or chunk.number in kept
             ]
         )

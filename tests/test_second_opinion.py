@@ -18,6 +18,7 @@ from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
 from hybridlog_storage.segment_writer import SegmentSettings
 from tests.data import DATA
+from tests.storage.chunk_entries import chunk_entries
 
 HERE = Path(__file__).parent / "second_opinion"
 SMALL = RobotConfig(image_size=(64, 48), cloud_columns=20, scan_beams=180)
@@ -140,7 +141,7 @@ def test_another_reader_refuses_what_was_altered(
     entry = next(r for r in store.recordings() if r.name == "none")
     _, path = store.directory.segments(entry.label)[0]
     data = bytearray(path.read_bytes())
-    data[store.catalog.chunks(entry)[0].offset + 200] ^= 4
+    data[chunk_entries(store.catalog, entry)[0].offset + 200] ^= 4
     altered = tmp_path / "altered.mcap"
     altered.write_bytes(data)
     done = subprocess.run(

@@ -27,9 +27,10 @@ from hybridlog_storage.times import inside, placed, touches
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Clock, RecordedChannel, Span
-    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.segment_reader import SegmentReader
@@ -69,7 +70,7 @@ class RecordingScan:
         recording: The recording.
         channels: Index of each wanted channel in the plan's channels, by channel id.
         bounds: `[begin, end)`, ns, of the plan's clock; None for all times.
-        chunks: The chunks that may hold it.
+        chunks: The chunks that may hold it, asked for with these channels.
         windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all
             times.
     """
@@ -77,7 +78,7 @@ class RecordingScan:
     recording: RecordingEntry
     channels: Mapping[int, int]
     bounds: Span | None
-    chunks: Sequence[ChunkEntry]
+    chunks: Sequence[Chunk]
     windows: NDArray[np.int64] | None = None
 
     def touches(self, first: int, last: int) -> bool:
@@ -95,10 +96,7 @@ class ChunkTask:
     """A chunk to read, and the messages wanted from it."""
 
     scan: RecordingScan
-    chunk: ChunkEntry
-    first: int
-    last: int
-    messages: int
+    chunk: Chunk
 
     @property
     def key(self) -> ChunkKey:
@@ -149,16 +147,15 @@ class ScanPlan:
 
     def tasks(self) -> list[ChunkTask]:
         """The chunks to read, in the order of the scan."""
-        found = []
-        for scan in self.scans:
-            for chunk in scan.chunks:
-                span = chunk.span(scan.channels)
-                if span is not None and scan.touches(*span):
-                    count = sum(stats.messages for stats in chunk.stats_of(scan.channels))
-                    found.append(ChunkTask(scan, chunk, *span, count))
+        found = [
+            ChunkTask(scan, chunk)
+            for scan in self.scans
+            for chunk in scan.chunks
+            if scan.touches(chunk.first, chunk.last)
+        ]
         if self.reverse:
-            return sorted(found, key=lambda t: (-t.last, t.key))
-        return sorted(found, key=lambda t: (t.first, t.key))
+            return sorted(found, key=lambda t: (-t.chunk.last, t.key))
+        return sorted(found, key=lambda t: (t.chunk.first, t.key))
 
 
 class ChunkScan:
@@ -229,14 +226,15 @@ class ChunkScan:
         for group in _groups(tasks):
             selection = selector(group)
             for task in group:
-                held = (index for c, index in task.scan.channels.items() if c in task.chunk.stats)
+                own = task.scan.channels
+                held = (own[channel] for channel in task.chunk.place.channels if channel in own)
                 if task.key in selection.offsets or any(c in selection.unindexed for c in held):
                     yield task, selection
 
     def loaded(self) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         """Each chunk, its wanted messages, and the chunk after it."""
         tasks = self._plan.tasks()
-        size = sum(task.chunk.length for task in tasks)
+        size = sum(task.chunk.place.length for task in tasks)
         if size < _MIN_THREADED_BYTES or not self._reads_ahead:
             yield from self._ahead(tasks, lambda *item: _Deferred(partial(self._load, *item)))
             return
@@ -271,9 +269,8 @@ class ChunkScan:
             yield task, run, loading[0][0] if loading else None
 
     def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
-        entry = task.chunk
-        reader = self._reader_of(task.scan.recording.id, entry.segment)
-        chunk = reader.read_chunk(entry.place)
+        reader = self._reader_of(task.scan.recording.id, task.chunk.segment)
+        chunk = reader.read_chunk(task.chunk.place)
         run = self._wanted(task, chunk, selection)
         run, unreadable = self._filtered(run)
         return run, chunk.length + chunk.trailer, unreadable
@@ -354,7 +351,11 @@ class ChunkScan:
         ready, rest = [], []
         for run in waiting:
             times = run.batch.log_time
-            now = times > following.last if self._plan.reverse else times < following.first
+            now = (
+                times > following.chunk.last
+                if self._plan.reverse
+                else times < following.chunk.first
+            )
             if now.all():
                 ready.append(run)
             elif now.any():
@@ -429,7 +430,7 @@ def _groups(tasks: list[ChunkTask], limit: int = 50_000) -> Iterator[list[ChunkT
     messages = 0
     for task in tasks:
         group.append(task)
-        messages += task.messages
+        messages += task.chunk.messages
         if messages >= limit:
             yield group
             group, messages = [], 0

@@ -216,7 +216,8 @@ class RangeResolver:
             return
         number = channel.channel_id
         for chunk in self._session.chunks(recording, [number], None, "log"):
-            known = _known_ends(chunk.stats[number], is_publish=is_publish)
+            stats = self._session.chunk_stats(recording, chunk)[number]
+            known = _known_ends(stats, is_publish=is_publish)
             if not known:
                 from hybridlog.schema.stamps import stamps_of
 

@@ -164,14 +164,13 @@ class TopicOfRecording:
         if self.entry.flushed:
             messages: dict[int, int] = {}
             for chunk in chunks:
-                count = sum(stats.messages for stats in chunk.stats_of(self.channels))
-                messages[chunk.segment] = messages.get(chunk.segment, 0) + count
+                messages[chunk.segment] = messages.get(chunk.segment, 0) + chunk.messages
             made = self.session.tables.of_sealed(self.entry, self.topic, messages)
             if made is not None:
                 table, covered = made
                 found += [_TableRows(self, table, part) for part in table.parts]
         found += [
-            _ChunkRows(self, chunk.segment, chunk.place, chunk.span(self.channels))
+            _ChunkRows(self, chunk.segment, chunk.place, (chunk.first, chunk.last))
             for chunk in chunks
             if chunk.segment not in covered
         ]

@@ -16,7 +16,7 @@ import os
 import sqlite3
 import stat
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -30,7 +30,7 @@ import numpy as np
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.chunk_table import ChunkTable
-from hybridlog_storage.distinct import distinct, run_starts
+from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import (
     CatalogError,
     DiskFullError,
@@ -48,7 +48,6 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
-from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -332,13 +331,6 @@ class ChunkEntry:
     last: int
     stats: Mapping[int, ChannelStats]
 
-    def stats_of(self, channels: Collection[int]) -> Iterator[ChannelStats]:
-        """Statistics of those of some channels that have messages in it."""
-        stats = self.stats
-        if len(channels) > len(stats):
-            return (stats[channel] for channel in stats if channel in channels)
-        return (stats[channel] for channel in channels if channel in stats)
-
     @property
     def place(self) -> ChunkPlace:
         """Its position, as the segment reader expects it."""
@@ -358,13 +350,6 @@ class ChunkEntry:
     def messages(self) -> int:
         """Number of its messages."""
         return sum(stats.messages for stats in self.stats.values())
-
-    def span(self, channels: Collection[int]) -> tuple[int, int] | None:
-        """First and last log time of some channels in it; None without messages of them."""
-        stats = list(self.stats_of(channels))
-        firsts = [s.first for s in stats if s.first is not None]
-        lasts = [s.last for s in stats if s.last is not None]
-        return (min(firsts), max(lasts)) if firsts and lasts else None
 
 
 def _damage_crc(db: sqlite3.Connection, recording: str) -> int:
@@ -1021,11 +1006,16 @@ class Catalog:
         Raises:
             CatalogError: The catalog has lost them.
         """
-        return self._table(entry, number)[0]
+        return self.decoded_table(entry, number)[0]
 
-    def _table(
+    def decoded_table(
         self, entry: RecordingEntry, number: int
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
+        """The chunks of a segment, and the results of decoding for each row of its parts.
+
+        Raises:
+            CatalogError: The catalog has lost them.
+        """
         if number in entry.flushed:
             return entry.flushed[number].table, None
         key = entry.id, number, entry.digests.get(str(number), "")
@@ -1057,163 +1047,24 @@ class Catalog:
                 self._cached -= _size(oldest)
             return cached
 
-    def chunks(
-        self,
-        entry: RecordingEntry,
-        channels: Sequence[int] | None = None,
-        bounds: tuple[int, int] | None = None,
-        clock: str = "log",
-    ) -> list[ChunkEntry]:
-        """Chunks of a recording that may hold messages of some channels in a time range.
+    def chunk_stats(
+        self, entry: RecordingEntry, segment: int, number: int
+    ) -> dict[int, ChannelStats]:
+        """Statistics of the channels in a chunk.
 
         Args:
             entry: The recording.
-            channels: Channel ids, None for all.
-            bounds: `[begin, end)`, ns, None for all times.
-            clock: `log`, `publish` or `header`: the time that `bounds` refers to. Before
-            messages are decoded, every chunk may hold any stamp.
+            segment: Number of the segment.
+            number: Number of the chunk in it.
+
+        Raises:
+            CatalogError: The catalog has lost them.
         """
-        found: list[ChunkEntry] = []
-        for number, first, last in entry.spans:
-            if (
-                bounds is not None
-                and clock == "log"
-                and not (min(first, END - 1) < bounds[1] and last >= bounds[0])
-            ):
-                continue
-            table, stamps = self._table(entry, number)
-            found += chunk_entries(
-                entry, number, table, stamps, channels=channels, bounds=bounds, clock=clock
-            )
-        return found
-
-
-def chunk_entries(
-    entry: RecordingEntry,
-    segment: int,
-    table: ChunkTable,
-    stamps: NDArray[np.void] | None,
-    *,
-    channels: Sequence[int] | None = None,
-    bounds: tuple[int, int] | None = None,
-    clock: str = "log",
-) -> list[ChunkEntry]:
-    """Entries of a segment's chunks that may hold messages of some channels in a time range."""
-    parts = table.parts
-    wanted = np.ones(len(parts), np.bool_)
-    if channels is not None:
-        wanted &= np.isin(parts["channel"], np.array(channels, np.int64))
-    if bounds is not None:
-        wanted &= _in_bounds(entry, parts, stamps, bounds, clock)
-    if not wanted.any():
-        return []
-    chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-    edges = table.part_bounds().tolist()
-    # The publish times of flushed chunks stand in their messages only.
-    silent = {c.id for c in entry.channels if table.is_flushed or not c.has_publish_time}
-    found = []
-    for number in distinct(chunk_of[wanted]).tolist():
-        chunk = table.chunks[number]
-        rows = slice(edges[number], edges[number + 1])
-        stats = _PartStats(parts[rows], None if stamps is None else stamps[rows], silent)
-        found.append(
-            ChunkEntry(
-                entry.id,
-                segment,
-                number,
-                int(chunk["offset"]),
-                int(chunk["length"]),
-                int(chunk["trailer"]),
-                int(chunk["crc"]),
-                int(chunk["trailer_crc"]),
-                int(chunk["first"]),
-                int(chunk["last"]),
-                stats,
-            )
-        )
-    return found
-
-
-def _in_bounds(
-    entry: RecordingEntry,
-    parts: NDArray[np.void],
-    stamps: NDArray[np.void] | None,
-    bounds: tuple[int, int],
-    clock: str,
-) -> NDArray[np.bool_]:
-    begin, end = (max(min(bound, END), BEGIN) for bound in bounds)
-    if clock == "header":
-        if stamps is None:
-            return np.ones(len(parts), np.bool_)
-        inside = (placed(stamps["first_stamp"]) < end) & (stamps["last_stamp"] >= begin)
-        return np.asarray(inside & (stamps["stamped"] > 0))
-    suffix = "_publish" if clock == "publish" else ""
-    inside = (placed(parts[f"first{suffix}"]) < end) & (parts[f"last{suffix}"] >= begin)
-    if clock == "publish":
-        timed = [c.id for c in entry.channels if c.has_publish_time]
-        inside &= np.isin(parts["channel"], np.array(timed, np.int64))
-    return np.asarray(inside)
-
-
-class _PartStats(Mapping[int, ChannelStats]):
-    """Statistics of the channels of a chunk, each made when it is asked for.
-
-    A question is about few of the channels, which may be thousands.
-
-    Args:
-        parts: The chunk's rows of the chunk table.
-        stamps: Its rows of stamps; None if they are unknown.
-        silent: Ids of channels without publish times.
-    """
-
-    __slots__ = ("_parts", "_rows", "_silent", "_stamps")
-
-    def __init__(
-        self, parts: NDArray[np.void], stamps: NDArray[np.void] | None, silent: Container[int]
-    ) -> None:
-        self._parts = parts
-        self._stamps = stamps
-        self._silent = silent
-        self._rows = {channel: row for row, channel in enumerate(parts["channel"].tolist())}
-
-    def __getitem__(self, channel: int) -> ChannelStats:
-        row = self._rows[channel]
-        stamp = None if self._stamps is None else self._stamps[row]
-        return _stats(self._parts[row], stamp, self._silent)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._rows)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __contains__(self, channel: object) -> bool:
-        return channel in self._rows
-
-
-def _stats(part: np.void, stamp: np.void | None, silent: Container[int]) -> ChannelStats:
-    first, last = int(part["first"]), int(part["last"])
-    stats = ChannelStats(
-        messages=int(part["messages"]),
-        payload_bytes=int(part["payload_bytes"]),
-        first=first,
-        last=last,
-        longest=last - first,
-    )
-    if int(part["channel"]) not in silent:
-        stats.first_publish = int(part["first_publish"])
-        stats.last_publish = int(part["last_publish"])
-    if stamp is not None:
-        stats.unreadable = int(stamp["unreadable"])
-        stats.surplus = int(stamp["surplus"])
-        if stamp["stamped"]:
-            stats.stamped = int(stamp["stamped"])
-            stats.skew_sum = float(stamp["skew_sum"])
-            stats.first_stamp = int(stamp["first_stamp"])
-            stats.last_stamp = int(stamp["last_stamp"])
-            stats.skew_min = int(stamp["skew_min"])
-            stats.skew_max = int(stamp["skew_max"])
-    return stats
+        table, stamps = self.decoded_table(entry, segment)
+        begin, end = table.part_bounds()[number : number + 2].tolist()
+        own = replace(table, chunks=table.chunks[number : number + 1], parts=table.parts[begin:end])
+        silent = {c.id for c in entry.channels if not c.has_publish_time}
+        return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
 
 
 def schema_hash(schema: Schema) -> str:

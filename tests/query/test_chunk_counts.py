@@ -113,12 +113,14 @@ def test_a_count_by_time_where_a_segment_cannot_be_read(many: hl.Store) -> None:
     chunk = many.session.chunks(
         many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log"
     )[0]
-    length = chunk.length + chunk.trailer
+    length = chunk.place.length + chunk.place.trailer
     with (
         hl.open(many.directory.path, require_database=True) as opened,
         hl.open(many.directory.path, mongo=AWAY) as alone,
     ):
-        path.write_bytes(whole[: chunk.offset] + bytes(length) + whole[chunk.offset + length :])
+        path.write_bytes(
+            whole[: chunk.place.offset] + bytes(length) + whole[chunk.place.offset + length :]
+        )
         try:
             for store in (opened, alone):
                 with pytest.raises(SegmentError, match=path.name):
@@ -136,14 +138,14 @@ def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) ->
     chunk = many.session.chunks(
         many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log"
     )[0]
-    index = chunk.offset + chunk.length
+    index = chunk.place.offset + chunk.place.length
     entry = 9 + 6 + 16  # the second one: record head, channel, length, the first one
     at = {
         "opcode": 0,
         "length": 2,
         "time": entry,
         "place": entry + 8,
-        "arrivals": chunk.trailer - 1,
+        "arrivals": chunk.place.trailer - 1,
     }[damage]
     damaged = bytearray(whole)
     damaged[index + at] ^= 1
@@ -155,7 +157,7 @@ def test_a_damaged_message_index_is_not_believed(many: hl.Store, damage: str) ->
                 # The messages have a checksum of their own, and so have the arrival numbers.
                 assert query.count() == len(list(query)) == 160
             else:
-                with pytest.raises(SegmentError, match=f"{chunk.offset} of .*{path.name}"):
+                with pytest.raises(SegmentError, match=f"{chunk.place.offset} of .*{path.name}"):
                     query.count()
             # Within one range the chunk is not looked at.
             assert alone.topic("/state").between("+20s", "+165s").count() == 145

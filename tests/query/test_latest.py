@@ -138,10 +138,10 @@ def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
     path = many.directory.recording(entry.label) / "000000.mcap"
     whole = path.read_bytes()
     last = many.session.chunks(entry, [entry.channels[0].id], None, "log")[-1]
-    place = last.offset + last.length - 1
+    place = last.place.offset + last.place.length - 1
     path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
     try:
-        with pytest.raises(SegmentError, match=f"{last.offset} of .*{path.name}"):
+        with pytest.raises(SegmentError, match=f"{last.place.offset} of .*{path.name}"):
             many.topic("/state").at("end")
         assert many.topic("/state").at("+3s").fields["n"] == 3
     finally:

@@ -234,7 +234,7 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
     chunk = own.session.chunks(entry, channels, None, "log")[3]
     path = own.directory.recording("first") / "000000.mcap"
     with path.open("r+b") as file:
-        file.seek(chunk.offset + 100)
+        file.seek(chunk.place.offset + 100)
         file.write(b"\xff\x00\xff")
     assert own.sql("select max(angle) from scan").rows() == [((SCANS - 1) / 2,)]
     with pytest.raises(SegmentError, match="damaged"):

@@ -22,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.entries import summary_of, topic_types
+from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog_storage import catalog as module
 from hybridlog_storage.catalog import (
     CATALOG,
@@ -39,6 +40,7 @@ from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable
 from hybridlog_storage.errors import CatalogError, DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
 from tests.imports import ROOT
+from tests.storage.chunk_entries import chunk_entries
 
 STORE = "5" * 32
 CHANNELS = range(1, 6)
@@ -250,8 +252,13 @@ def test_chunks_by_channel_time_and_clock(
     kinds = set()
     for channels, bounds in questions:
         want = model.wanted(channels, bounds, clock, decoded=decoded)
-        got = catalog.chunks(model.entry, channels, bounds, clock)
-        assert got == want, (channels, bounds)
+        got = []
+        timed = [c for c in CHANNELS if c != SILENT]
+        for number in model.tables:
+            table, stamps = catalog.decoded_table(model.entry, number)
+            columns = ChunkColumns(number, table, channels)
+            got += columns.chunks(columns.within(bounds, clock, stamps=stamps, timed=timed))
+        assert [(c.segment, c.number) for c in got] == [(c.segment, c.number) for c in want]
         kinds.add((len(want) > 0, len(want) < 36))
     if decoded or clock != "header":
         assert kinds == {(True, True), (True, False), (False, True)}
@@ -263,46 +270,35 @@ def test_a_segment_without_messages_is_not_looked_for(catalog: Catalog, model: M
     entry = replace(model.entry, digests={**model.entry.digests, "3": "sha256:3"})
     tables = {**model.tables, 3: empty}
     catalog.put(replace(model.described, entry=entry, tables=tables))
-    assert len(catalog.chunks(entry)) == 36
+    assert len(chunk_entries(catalog, entry)) == 36
     assert catalog.table(entry, 3).end == 20
 
 
 def test_a_chunk_says_where_it_lies_and_when(catalog: Catalog, model: Model) -> None:
     model.put(catalog)
-    for got, want in zip(catalog.chunks(model.entry), model.chunks(), strict=True):
-        place = got.place
-        assert (place.offset, place.length, place.trailer) == (
-            want.offset, want.length, want.trailer,
-        )  # fmt: skip
-        assert (place.number, place.crc, place.trailer_crc) == (
-            want.number, want.crc, want.trailer_crc,
-        )  # fmt: skip
-        assert place.channels == tuple(want.stats)
+    found = [
+        chunk
+        for number, table in model.tables.items()
+        for chunk in ChunkColumns(number, table, CHANNELS).chunks()
+    ]
+    for got, want in zip(found, model.chunks(), strict=True):
+        assert got.place == want.place
         assert got.messages == sum(s.messages for s in want.stats.values())
-        assert got.span({99}) is None
-        assert got.span(set(CHANNELS)) == (want.first, want.last)
+        assert (got.first, got.last) == (want.first, want.last)
+    assert not ChunkColumns(0, model.tables[0], [99]).chunks()
 
 
-def test_only_the_statistics_that_are_asked_for_are_made(
-    catalog: Catalog, model: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A chunk may have thousands of channels, and a question is about few of them."""
-    model.put(catalog)
-    one = max(catalog.chunks(model.entry), key=lambda chunk: len(chunk.stats))
-    first, _, third, *_ = one.stats
-    made: list[int] = []
-    stats_of = module._stats
-
-    def counted(part: np.void, stamp: np.void | None, silent: set[int]) -> ChannelStats:
-        made.append(int(part["channel"]))
-        return stats_of(part, stamp, silent)
-
-    monkeypatch.setattr(module, "_stats", counted)
-    assert one.span([third]) is not None
-    assert len(list(one.stats_of({first, 1 << 40}))) == 1
-    assert made == [third, first]
-    assert len(list(one.stats_of(range(1 << 10)))) == len(one.stats)
-    assert made[2:] == list(one.stats)
+def test_the_last_chunks_come_first(model: Model) -> None:
+    for number, table in model.tables.items():
+        columns = ChunkColumns(number, table, [3])
+        for latest in range(-1, 110):
+            found = [*columns.before(latest)]
+            assert {c.number for c, _ in found} == {
+                n for n, first in zip(columns.number.tolist(), columns.first, strict=True)
+                if first <= latest
+            }  # fmt: skip
+            for place, (_, last) in enumerate(found):
+                assert last == max(c.last for c, _ in found[place:])
 
 
 def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
@@ -355,16 +351,16 @@ def test_totals_of_a_segment_are_those_of_its_chunks(model: Model) -> None:
 def test_what_replaces_a_segment_is_what_counts(catalog: Catalog, model: Model) -> None:
     """A list of chunks belongs to one content of the segment, and to no other."""
     model.put(catalog)
-    assert catalog.chunks(model.entry) == model.chunks()
+    assert chunk_entries(catalog, model.entry) == model.chunks()
     again = Model(3, segments=2)
     again.id = again.entry.id = model.id
     with pytest.raises(CatalogError, match="segment 0"):
-        catalog.chunks(again.entry)
+        chunk_entries(catalog, again.entry)
     again.put(catalog)
-    assert catalog.chunks(again.entry) == again.chunks()
+    assert chunk_entries(catalog, again.entry) == again.chunks()
     # Also for whoever asks with what was known before, and has the old lists at hand.
     with pytest.raises(CatalogError, match="segment 0"):
-        catalog.chunks(model.entry)
+        chunk_entries(catalog, model.entry)
 
 
 def test_stamps_of_other_bytes_are_not_believed(catalog: Catalog, model: Model) -> None:
@@ -420,8 +416,8 @@ def test_a_recording_is_removed_without_a_trace(
     assert rows_of(catalog).keys() == {other.id}
     assert catalog.damage(model.id) == {}
     with pytest.raises(CatalogError):
-        catalog.chunks(model.entry)
-    assert catalog.chunks(other.entry) == other.chunks()
+        chunk_entries(catalog, model.entry)
+    assert chunk_entries(catalog, other.entry) == other.chunks()
     with closing(sqlite3.connect(tmp_path / CATALOG)) as db:
         for table in ("recordings", "segments", "stamps", "damage"):
             assert {i for (i,) in db.execute(f"select distinct id from {table}")} == {other.id}
@@ -434,7 +430,7 @@ def test_so_many_lists_of_chunks_are_kept_at_hand(
     size = module._size(model.tables[0])
     monkeypatch.setattr(module, "_CACHED_BYTES", 2 * size + size // 2)
     for _ in range(2):
-        assert catalog.chunks(model.entry) == model.chunks()
+        assert chunk_entries(catalog, model.entry) == model.chunks()
         assert [key[1] for key in catalog._tables] == [1, 2]
         assert catalog._cached == sum(module._size(table) for table, _ in catalog._tables.values())
     assert catalog.table(model.entry, 2) is catalog.table(model.entry, 2)
@@ -446,7 +442,7 @@ def test_one_in_memory_leaves_no_file(tmp_path: Path, model: Model) -> None:
     with closing(Catalog(None, STORE)) as made:
         assert made.is_in_memory
         model.put(made)
-        assert made.chunks(model.entry) == model.chunks()
+        assert chunk_entries(made, model.entry) == model.chunks()
         made.rebuild()
         assert rows_of(made) == {}
         model.put(made)
@@ -564,7 +560,7 @@ class Truth:
 
     @staticmethod
     def _chunks(catalog: Catalog, model: Model) -> bool:
-        got = catalog.chunks(model.entry)
+        got = chunk_entries(catalog, model.entry)
         assert len(got) == 8
         for one, decoded, plain in zip(
             got, model.chunks(), model.chunks(decoded=False), strict=True
@@ -753,9 +749,9 @@ def test_the_catalog_of_another_store_is_made_anew(tmp_path: Path, model: Model)
     with closing(Catalog(tmp_path, "6" * 32)) as other:
         assert rows_of(other) == {}
         with pytest.raises(CatalogError):
-            other.chunks(model.entry)
+            chunk_entries(other, model.entry)
         model.put(other)
-        assert other.chunks(model.entry) == model.chunks()
+        assert chunk_entries(other, model.entry) == model.chunks()
 
 
 @pytest.mark.parametrize("version", ["1", "", "5", None])
@@ -777,7 +773,7 @@ def test_the_catalog_of_another_version_is_made_anew(
         assert rows_of(again) == {}
         model.put(again)
     with closing(Catalog(tmp_path, STORE)) as again:
-        assert again.chunks(model.entry) == model.chunks()
+        assert chunk_entries(again, model.entry) == model.chunks()
 
 
 @pytest.mark.parametrize("target", ["file", "nothing"])
@@ -800,7 +796,7 @@ def test_a_symlink_to_the_store_is_no_hindrance(tmp_path: Path, model: Model) ->
     with closing(Catalog(tmp_path / "link", STORE)) as made:
         model.put(made)
     with closing(Catalog(tmp_path / "real", STORE)) as same:
-        assert same.chunks(model.entry) == model.chunks()
+        assert chunk_entries(same, model.entry) == model.chunks()
 
 
 USES: dict[str, Callable[[Catalog, Model], object]] = {
@@ -831,7 +827,7 @@ def test_one_in_memory_takes_the_place_of_a_locked_file(
             assert not made.was_damaged
             assert rows_of(made).keys() == ({model.id} if use == "written" else set())
             model.put(made)
-            assert made.chunks(model.entry) == model.chunks()
+            assert chunk_entries(made, model.entry) == model.chunks()
         db.execute("rollback")
     with closing(Catalog(tmp_path, STORE)) as same:
         assert rows_of(same).keys() == {model.id}
@@ -846,7 +842,7 @@ def test_a_full_disk_leaves_it_as_it_was(catalog: Catalog, model: Model) -> None
         Model(4, "other").put(catalog)
     catalog._db.execute("pragma max_page_count = 1000000")
     assert rows_of(catalog).keys() == {model.id}
-    assert catalog.chunks(model.entry) == model.chunks()
+    assert chunk_entries(catalog, model.entry) == model.chunks()
 
 
 def test_what_is_interrupted_leaves_it_as_it_was(
@@ -864,9 +860,9 @@ def test_what_is_interrupted_leaves_it_as_it_was(
         with pytest.raises(KeyboardInterrupt):
             again.put(catalog)
     assert rows_of(catalog)[model.id][1] == model.entry
-    assert catalog.chunks(model.entry) == model.chunks()
+    assert chunk_entries(catalog, model.entry) == model.chunks()
     again.put(catalog)
-    assert catalog.chunks(again.entry) == again.chunks()
+    assert chunk_entries(catalog, again.entry) == again.chunks()
 
 
 # Several at once.
@@ -876,14 +872,14 @@ def test_two_that_have_it_open_see_what_the_other_does(tmp_path: Path, model: Mo
     with closing(Catalog(tmp_path, STORE)) as one, closing(Catalog(tmp_path, STORE)) as other:
         model.put(one)
         assert rows_of(other).keys() == {model.id}
-        assert other.chunks(model.entry) == model.chunks()
+        assert chunk_entries(other, model.entry) == model.chunks()
         other.remove(model.id)
         assert rows_of(one) == {}
         model.put(other)
         one.rebuild()
         assert rows_of(other) == {}
         model.put(other)
-        assert one.chunks(model.entry) == model.chunks()
+        assert chunk_entries(one, model.entry) == model.chunks()
 
 
 @pytest.mark.parametrize("how", ["deleted", "damaged"])
@@ -910,13 +906,13 @@ def test_one_that_was_made_anew_is_taken_up(tmp_path: Path, model: Model, how: s
             assert rows_of(one).keys() == {other_model.id}
             model.put(one)
             assert rows_of(other).keys() == {model.id, other_model.id}
-            assert other.chunks(model.entry) == model.chunks()
+            assert chunk_entries(other, model.entry) == model.chunks()
 
 
 WRITER = """
 import sys
 from pathlib import Path
-from tests.storage.test_catalog import STORE, Catalog, Model, rows_of
+from tests.storage.test_catalog import STORE, Catalog, Model, chunk_entries, rows_of
 
 first, count = int(sys.argv[2]), int(sys.argv[3])
 catalog = Catalog(Path(sys.argv[1]), STORE)
@@ -924,7 +920,7 @@ for number in range(first, first + count):
     model = Model(number, f"run{number}", segments=2, chunks=3)
     model.put(catalog)
     catalog.put_damage(model.id, {(0, number): "x"})
-    assert catalog.chunks(model.entry) == model.chunks()
+    assert chunk_entries(catalog, model.entry) == model.chunks()
     assert rows_of(catalog)[model.id][1] == model.entry
     if number % 5 == 0:
         catalog.remove(model.id)
@@ -957,7 +953,7 @@ def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
     with closing(Catalog(tmp_path, STORE)) as opened:
         assert rows_of(opened).keys() == want.keys()
         for model in want.values():
-            assert opened.chunks(model.entry) == model.chunks()
+            assert chunk_entries(opened, model.entry) == model.chunks()
             assert len(opened.damage(model.id)) == 1
 
 
@@ -969,7 +965,7 @@ def test_several_threads_use_one(catalog: Catalog) -> None:
             for number in range(first, first + 10):
                 model = Model(number, f"run{number}", segments=2, chunks=3)
                 model.put(catalog)
-                assert catalog.chunks(model.entry) == model.chunks()
+                assert chunk_entries(catalog, model.entry) == model.chunks()
                 catalog.remove(model.id)
         except BaseException as error:
             failures.append(error)

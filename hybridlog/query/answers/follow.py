@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.message import messages_in
 from hybridlog.query.answers.lost import flush_interval_ns
+from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.topics import later
-from hybridlog_storage.catalog import chunk_entries
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
@@ -26,12 +26,13 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from hybridlog.message import Message
+    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun, ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines.base import Engine
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 _EVERY_S: Final = 0.25
@@ -128,18 +129,17 @@ class Following(Planner, Iterator["Message"]):
             is_past = one.span[1] - flush_interval_ns(one) >= bounds[1]
         return one.status == "open" and not is_past
 
-    def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[ChunkEntry]:
+    def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[Chunk]:
         """The chunks that have come since the last call, and may have messages in bounds."""
         clock = self.question.clock
         last, read = self._read[entry.id]
         for segment in sorted({*map(int, entry.digests), *entry.flushed} - {*range(last)}):
             flushed = entry.flushed.get(segment)
             table = flushed.table if flushed else self.session.chunk_table(entry, segment)
-            start = min(read if segment == last else 0, len(table.chunks))
-            parts = table.parts[int(table.part_bounds()[start]) :]
-            new = replace(table, chunks=table.chunks[start:], parts=parts)
-            for chunk in chunk_entries(entry, segment, new, None, bounds=bounds, clock=clock):
-                yield replace(chunk, number=chunk.number + start)
+            columns = ChunkColumns(segment, table)
+            timed = [c.id for c in entry.channels if c.has_publish_time]
+            is_new = columns.number >= (read if segment == last else 0)
+            yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
             self._read[entry.id] = segment, len(table.chunks)
 
     def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
@@ -160,7 +160,7 @@ class _Arrived(PayloadScan):
 
     def __init__(self, session: Session, counters: Counters) -> None:
         super().__init__(session, counters)
-        self.chunks: dict[str, list[ChunkEntry]] = {}
+        self.chunks: dict[str, list[Chunk]] = {}
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         return RecordingScan(part.recording, indexes, part.bounds, self.chunks[part.recording.id])

@@ -101,9 +101,9 @@ def _made(planner: Planner, parts: Sequence[Part]) -> Iterator[tuple[str, Docume
             chunk = StoredChunk(
                 segment=at.segment,
                 number=at.number,
-                offset=at.offset,
-                length=at.length,
-                trailer=at.trailer,
+                offset=at.place.offset,
+                length=at.place.length,
+                trailer=at.place.trailer,
                 crc=0,
                 trailer_crc=0,
                 batch=run.batch,
@@ -125,7 +125,8 @@ def _before(
     ready = len(waiting)
     if following is not None:
         times = (document["_meta"]["t"] for _, document in waiting)
-        is_later = (t <= following.last if reverse else t >= following.first for t in times)
+        first, last = following.chunk.first, following.chunk.last
+        is_later = (t <= last if reverse else t >= first for t in times)
         ready = next((row for row, later in enumerate(is_later) if later), ready)
     yield from waiting[:ready]
     del waiting[:ready]

@@ -17,10 +17,11 @@ from hybridlog_storage.times import END, earlier, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
 
@@ -96,17 +97,17 @@ def _last_of(
         if channel.channel.topic in wanted
     }
 
-    def load(entry: ChunkEntry) -> StoredChunk:
+    def load(entry: Chunk) -> StoredChunk:
         chunk = session.segment(recording.id, entry.segment).read_chunk(entry.place)
         counters.chunks_read += 1
         counters.bytes_read += chunk.length + chunk.trailer
         return chunk
 
-    def read(entry: ChunkEntry) -> StoredChunk:
+    def read(entry: Chunk) -> StoredChunk:
         key = recording.id, entry.segment, entry.number
         return session.recent_chunks.get(key, partial(load, entry))
 
-    chunks = session.chunks_before(recording, list(channels), span)
+    chunks = session.chunks_before(recording, list(channels), span[1])
     found = last_message(chunks, channels, span[1], read)
     if found is None:
         return None
@@ -142,15 +143,15 @@ class Found:
 
 
 def last_message(
-    chunks: Iterable[tuple[ChunkEntry, int]],
+    chunks: Iterable[tuple[Chunk, int]],
     channels: Collection[int],
     latest: int,
-    read: Callable[[ChunkEntry], StoredChunk],
+    read: Callable[[Chunk], StoredChunk],
 ) -> Found | None:
     """The message with the greatest log time; of equal times, the one that arrived last.
 
     Args:
-        chunks: Chunks of one recording that may hold it, see `ChunkLists.before`.
+        chunks: Chunks of one recording that may hold it, see `Session.chunks_before`.
         channels: Ids of the channels in question.
         latest: The time, ns.
         read: Returns the content of a chunk.
@@ -163,7 +164,7 @@ def last_message(
         if best is not None and last < best.log_time:
             break
         chunk = read(entry)
-        others = not all(channel in channels for channel in entry.stats)
+        others = not all(channel in channels for channel in entry.place.channels)
         row = _last_row(chunk.batch, channels if others else None, latest)
         if row is not None:
             place = int(chunk.batch.log_time[row]), int(chunk.seq[row])

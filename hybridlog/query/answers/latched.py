@@ -16,6 +16,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 
 if TYPE_CHECKING:
+    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -156,10 +157,16 @@ class _LatchedScan:
 
 def _together(scans: Sequence[RecordingScan]) -> RecordingScan:
     """One scan of everything, which reads each chunk once."""
+    chunks: dict[tuple[int, int], Chunk] = {}
+    for chunk in (chunk for scan in scans for chunk in scan.chunks):
+        key = chunk.segment, chunk.number
+        known = chunks.setdefault(key, chunk)
+        first, last = min(known.first, chunk.first), max(known.last, chunk.last)
+        chunks[key] = known._replace(first=first, last=last)
     bounds = [scan.bounds for scan in scans if scan.bounds is not None]
     return RecordingScan(
         scans[0].recording,
         {channel: index for scan in scans for channel, index in scan.channels.items()},
         (min(begin for begin, _ in bounds), bounds[0][1]),
-        [*{(c.segment, c.number): c for scan in scans for c in scan.chunks}.values()],
+        [*chunks.values()],
     )

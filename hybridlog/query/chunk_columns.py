@@ -1,0 +1,152 @@
+"""The chunks of a segment that hold some channels, as columns from its chunk table."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hybridlog_storage.lazy import lazy
+from hybridlog_storage.runs import run_starts
+from hybridlog_storage.segment_reader import place_of
+from hybridlog_storage.times import BEGIN, END, placed
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.segment_reader import ChunkPlace
+
+
+class Chunk(NamedTuple):
+    """A chunk to read for some channels.
+
+    Attributes:
+        segment: Number of its segment.
+        place: Its position there.
+        first: Least log time of these channels in it, ns.
+        last: Greatest log time of these channels in it, ns.
+        messages: Number of their messages.
+    """
+
+    segment: int
+    place: ChunkPlace
+    first: int
+    last: int
+    messages: int
+
+    @property
+    def number(self) -> int:
+        """Its number in the segment."""
+        return self.place.number
+
+
+class ChunkColumns:
+    """Chunks of a segment with messages of some channels, in the order of the file.
+
+    Args:
+        segment: Number of the segment.
+        table: Its chunks.
+        channels: Channel ids; None for all.
+
+    Attributes:
+        number: int64[n], their numbers.
+        first: int64[n], least log time of the channels, ns.
+        last: int64[n], greatest log time, ns.
+    """
+
+    def __init__(
+        self, segment: int, table: ChunkTable, channels: Collection[int] | None = None
+    ) -> None:
+        self._segment = segment
+        self._table = table
+        parts = table.parts
+        if channels is None:
+            self._rows = np.arange(len(parts))
+        else:
+            ids = np.fromiter(channels, np.int64, len(channels))
+            self._rows = np.flatnonzero(np.isin(parts["channel"], ids))
+        chunk = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])[self._rows]
+        self._starts = run_starts(chunk) if len(chunk) else np.empty(0, np.intp)
+        self.number = chunk[self._starts]
+        parts = parts[self._rows]
+        if len(parts):
+            self.first = placed(np.minimum.reduceat(parts["first"], self._starts))
+            self.last = np.maximum.reduceat(parts["last"], self._starts)
+            self._messages = np.add.reduceat(parts["messages"].astype(np.int64), self._starts)
+        else:
+            self.first = self.last = self._messages = np.empty(0, np.int64)
+
+    def chunks(self, rows: NDArray[np.bool_] | None = None) -> list[Chunk]:
+        """Some of the chunks, or all."""
+        chosen = range(len(self.number)) if rows is None else np.flatnonzero(rows).tolist()
+        return [self._chunk(row) for row in chosen]
+
+    def _chunk(self, row: int) -> Chunk:
+        place = place_of(self._table, int(self.number[row]), self._bounds)
+        return Chunk(
+            self._segment,
+            place,
+            int(self.first[row]),
+            int(self.last[row]),
+            int(self._messages[row]),
+        )
+
+    @lazy
+    def _bounds(self) -> NDArray[np.int64]:
+        return self._table.part_bounds()
+
+    def within(
+        self,
+        bounds: tuple[int, int] | None,
+        clock: str = "log",
+        *,
+        stamps: NDArray[np.void] | None = None,
+        timed: Collection[int] = (),
+    ) -> NDArray[np.bool_]:
+        """Which chunks may have messages in a time range.
+
+        Args:
+            bounds: `[begin, end)`, ns; None for all times.
+            clock: `log`, `publish` or `header`: the time that `bounds` refers to.
+            stamps: Header stamps of the table's parts; None where they are unknown, and every
+                chunk may hold any.
+            timed: Ids of channels with publish times.
+        """
+        is_unknown = (clock == "header" and stamps is None) or (
+            clock == "publish" and self._table.is_flushed
+        )
+        if bounds is None or is_unknown or not len(self.number):
+            return np.ones(len(self.number), np.bool_)
+        begin, end = (max(min(bound, END), BEGIN) for bound in bounds)
+        times = stamps if stamps is not None and clock == "header" else self._table.parts
+        own = times[self._rows]
+        suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
+        inside = (placed(own[f"first{suffix}"]) < end) & (own[f"last{suffix}"] >= begin)
+        if clock == "header":
+            inside &= own["stamped"] > 0
+        elif clock == "publish":
+            inside &= np.isin(own["channel"], np.fromiter(timed, np.int64, len(timed)))
+        return np.logical_or.reduceat(inside, self._starts)
+
+    def before(self, latest: int) -> Iterator[tuple[Chunk, int]]:
+        """Chunks that begin by a time, ns, the latest first.
+
+        Yields:
+            A chunk, and the greatest log time that it or any later one may hold.
+        """
+        order, first, last_by = self._by_first
+        for place in reversed(range(bisect_right(first, latest))):
+            yield self._chunk(order[place]), last_by[place]
+
+    @lazy
+    def _by_first(self) -> tuple[list[int], list[int], list[int]]:
+        """Rows by the time at which they begin, these times, and the greatest time so far.
+
+        Lists, since single numbers are looked up: numpy takes ten times as long.
+        """
+        order = np.argsort(self.first, kind="stable")
+        last_by = np.maximum.accumulate(self.last[order])
+        return order.tolist(), self.first[order].tolist(), last_by.tolist()
