@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, overload
 
 import numpy as np
@@ -15,6 +16,7 @@ from hybridlog.query.answers.remarks import completeness
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
+from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.stamps import stamp_array
@@ -93,7 +95,7 @@ class Synced(Sequence[tuple["Message", ...]]):
         found: list[list[_Found]] = []
         known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
         places = sorted(set.intersection(*shared))
-        for place in places:
+        for place in sorted(set.intersection(*map(partial(_in_range, session), questions))):
             recording = snapshot.summaries[place].id
             columns = [
                 _times_of(session, replace(q, recordings=(recording,)), clock, self.counters)
@@ -241,6 +243,14 @@ def _joined(parts: Sequence[_Found]) -> _Found:
         np.concatenate([part.number for part in whole]),
         np.concatenate([part.is_alone for part in whole]),
     )
+
+
+def _in_range(session: Session, question: Question) -> set[int]:
+    """Places of the recordings that a question's range touches."""
+    try:
+        return set(RangeResolver(session, question).resolve().places.tolist())
+    except TimeError:
+        return set()
 
 
 def _times_of(session: Session, question: Question, clock: Clock, counters: Counters) -> _Times:

@@ -55,6 +55,7 @@ class Ranges(Sequence[Resolved]):
         during: Intervals of the question; None without.
 
     Attributes:
+        places: intp[n], positions of the recordings.
         first: int64[n], log time from which on each recording may have messages, ns.
         last: int64[n], log time after which it has none, ns.
     """
@@ -68,7 +69,7 @@ class Ranges(Sequence[Resolved]):
         during: Intervals | None,
     ) -> None:
         self._summaries = snapshot.summaries
-        self._places = places
+        self.places = places
         self._shared = shared
         self._each = each
         self._during = during
@@ -76,11 +77,11 @@ class Ranges(Sequence[Resolved]):
         self.last: NDArray[np.int64] = np.where(snapshot.is_open[places], END, snapshot.end[places])
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self.places)
 
     def __getitem__(self, row: int) -> Resolved:  # type: ignore[override]
         """The recording in a row."""
-        summary = self._summaries[self._places[row]]
+        summary = self._summaries[self.places[row]]
         bounds = self._shared if self._each is None else self._each[row]
         windows = None if self._during is None else self._during.of_recording(summary.id)
         return Resolved(summary, bounds, windows)

@@ -77,6 +77,9 @@ ASKED: dict[str, Work] = {
     "intervals of a day": lambda store: (
         store.topic("pose").where("data > 4.5").between(*day(4)).intervals()
     ),
+    "sync of a day": lambda store: [
+        *store.sync([store.topic(name).between(*day(4)) for name in ("pose", "imu")], clock="log")
+    ],
     "first of all": lambda store: store.topic("pose").first(),
     "last of all": lambda store: store.topic("pose").reverse().first(),
     "one recording": lambda store: store.query(["/pose"], ["day00004"]).count(),
