@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.entries import new_id, recording_metadata, sealed_event, text
 from hybridlog.index_writer import IndexTarget, IndexWriter, Lag
 from hybridlog.indexing import ChunkIndexer
-from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
 from hybridlog.tables.writer import TableWriter
@@ -242,8 +241,6 @@ class Capture:
         self._tables.discard()
         with suppress(HybridlogError):
             remove_files(self._directory, label)
-        with suppress(OSError):
-            tables.remove(self._directory, entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.

@@ -1126,10 +1126,10 @@ class Session:
 
     def _forget_tables(self, recording: RecordingEntry) -> None:
         """Look for the tables of a recording again, now that it has ended."""
-        for topic in {channel.topic for channel in recording.channels}:
-            self._tables_tried.discard((recording.id, topic))
-            if "tables" in vars(self):
-                self.tables.forget(recording, topic)
+        topics = {channel.topic for channel in recording.channels}
+        self._tables_tried -= {(recording.id, topic) for topic in topics}
+        if "tables" in vars(self):
+            self.tables.forget(recording, topics)
 
     # Closing.
 

@@ -75,12 +75,14 @@ class Columns:
         demand(seal[1] == b"%08x" % zlib.crc32(blank), "the checksum of a footer")
         file = pq.ParquetFile(pa.BufferReader(data))
         about = json.loads(file.metadata.metadata[b"hybridlog"])
-        demand(about["version"] == 1 and about["body"] == begin, "the body of a file")
-        demand(about["recording"] == self._recording, "a file of another recording")
+        demand(about["version"] == 2 and about["body"] == begin, "the body of a file")
+        (section,) = about["recordings"]
+        demand(section["id"] == self._recording, "a file of another recording")
         blocks = [data[at : min(at + (32 << 10), begin)] for at in range(0, begin, 32 << 10)]
         checksums = "".join(f"{zlib.crc32(block):08x}" for block in blocks)
         demand(checksums == about["checksums"], "the checksum of a block")
-        demand(about["topics"] == {listed["topic"]: listed["messages"]}, "the rows of a file")
+        rows = {listed["topic"]: [listed["messages"], 0, 0]}
+        demand(section["topics"] == rows, "the rows of a file")
         for group, chunks in enumerate(about["payloads"]["chunks"]):
             table = file.read_row_group(group)
             rows = [(segment, chunk) for segment, chunk, count in chunks for _ in range(count)]

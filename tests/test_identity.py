@@ -25,6 +25,7 @@ from hybridlog.maintenance.imports import ImportReport
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog.session import Session
+from hybridlog.tables.folders import files_of
 from hybridlog_storage import directory as directory_module
 from hybridlog_storage import files, journal
 from hybridlog_storage.database import Database
@@ -461,10 +462,14 @@ def content_of(store: Path, recording: str) -> dict[str, bytes]:
     directory = StoreDirectory(store)
     found = {}
     for label in directory.labels_of(recording):
-        for top in (directory.recording(label), store / "tables" / f"recording=r{recording}"):
-            for path in top.rglob("*"):
-                if path.is_file() and path.name != "writer.lock":
-                    found[str(path.relative_to(top))] = path.read_bytes()
+        top = directory.recording(label)
+        for path in top.rglob("*"):
+            if path.is_file() and path.name != "writer.lock":
+                found[str(path.relative_to(top))] = path.read_bytes()
+        for file in files_of(store):
+            for section in file.about.recordings:
+                if section.id == recording:
+                    found[str(file.path.relative_to(store))] = repr(section).encode()
     return found
 
 

@@ -96,7 +96,7 @@ def bring_up_to_date(
         if wanted is None or one.id in wanted
         if is_other or one.indexed_by != index or one.id in stale
     ]
-    has_strangers = wanted is None and (is_other or tables.are_more_than(directory, len(snapshot)))
+    has_strangers = wanted is None and (is_other or tables.are_left(directory, snapshot))
     if not behind and not has_strangers:
         return False
     known = state.of(None if has_strangers else [one.key for one in behind])

@@ -42,11 +42,12 @@ def remove(
     """
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
         announce_removal(directory, label)
+        tables.announce_removal(directory, entry.id)
         hidden = directory.hide(label)
         try:
             catalog.remove(entry.id)
             with suppress(OSError):  # the next connection removes them
-                tables.remove(directory, entry.id)
+                tables.remove(directory, entry.id, {c.type for c in entry.channels})
             if database is not None:
                 _clear(database, entry)
         finally:

@@ -104,7 +104,7 @@ def _repair_tables(directory: StoreDirectory, entry: RecordingEntry) -> list[Rep
     """Rebuild damaged tables."""
     if entry.status == "damaged":
         return []  # tables of lost data are valid again after its restoration
-    damaged = tables.damage(directory, entry)
+    damaged = tables.TableChecker(directory).damage(entry)
     if not damaged or not tables.make(directory, entry, damaged):
         return []
     return [Repaired(entry.label, f"table of {topic}", "made again") for topic in damaged]

@@ -10,21 +10,12 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from stat import S_ISDIR
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from hybridlog.maintenance.opening import put_again
-from hybridlog.tables.layout import (
-    IN_TABLES,
-    SMALL,
-    recording_folder,
-    small_file,
-    table_schema,
-    topic_folder,
-)
-from hybridlog_storage import files
+from hybridlog.tables.layout import type_prefix
 from hybridlog_storage.errors import CatalogError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
 
@@ -124,9 +115,9 @@ def sizes_of(
     if database is not None and places is not None:
         index = _index_bytes(entries, database, places)
     rows: list[Size] = []
+    tables = _table_bytes(directory.path, entries)
     for entry in entries:
         segments = _segment_bytes(directory, catalog, entry)
-        tables = _table_bytes(directory.path, entry)
         columns: Counter[str] = Counter()
         for file in entry.payloads:
             columns[file["topic"]] += file["bytes"]
@@ -142,7 +133,7 @@ def sizes_of(
                 payload[topic],
                 segments[topic],
                 columns[topic],
-                tables[topic],
+                tables.get((entry.id, topic), 0),
                 None if database is None else index.get((entry.id, topic), 0),
             )
             for topic in {"", *messages}
@@ -202,35 +193,19 @@ def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
     return np.bincount(parts["channel"], shares).astype(np.float64)
 
 
-def _table_bytes(root: Path, entry: RecordingEntry) -> Counter[str]:
-    """Bytes of the tables by topic; the rest under the empty name."""
-    found: Counter[str] = Counter()
-    place = recording_folder(root, entry.id)
-    try:
-        folders = files.names(place, depth=IN_TABLES)
-    except FileNotFoundError:
-        return found
-    own = {topic_folder(c.topic): c.topic for c in entry.channels}
-    small = _small_topics(entry, without={own[name] for name in folders if name in own})
-    for folder, about in folders.items():
-        inside = {folder: about}
-        if S_ISDIR(about.st_mode):
-            inside = files.names(place / folder, depth=IN_TABLES + 1)
-        for name, status in inside.items():
-            if folder == SMALL and name in small:
-                found.update(_divided(status.st_size, small[name]))
-            else:
-                found[own.get(folder, "")] += status.st_size
-    return found
+def _table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
+    """Bytes of the tables by recording and topic: their share of the rows of each file."""
+    from hybridlog.tables.folders import files_of
 
-
-def _small_topics(entry: RecordingEntry, without: set[str]) -> dict[str, Counter[str]]:
-    """Messages of the topics that share a file, by the name of the file."""
-    found: dict[str, Counter[str]] = defaultdict(Counter)
-    for c in entry.channels:
-        if c.topic not in without and c.stats.messages:
-            schema = table_schema(c.message_encoding, c.schema, c.metadata)
-            found[small_file(c.type, schema)][c.topic] += c.stats.messages
+    found: Counter[tuple[str, str]] = Counter()
+    types = {type_prefix(channel.type) for entry in entries for channel in entry.channels}
+    for file in files_of(root, types):
+        rows = {
+            (section.id, topic): counts.rows
+            for section in file.about.recordings
+            for topic, counts in section.topics.items()
+        }
+        found.update(_divided(file.size_bytes, rows))
     return found
 
 

@@ -11,19 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.payloads.contents import MovedContents, open_segment
-from hybridlog.tables.layout import (
-    IN_TABLES,
-    IN_TOPIC,
-    NO_TABLE,
-    OWN_FILE_ROWS,
-    PARTS,
-    TABLES,
-    parts_folder,
-    recording_folder,
-    table_schema,
-    topic_folder,
-)
-from hybridlog.tables.writer import TableWriter
+from hybridlog.tables.layout import PARTS, parts_folder, type_prefix
+from hybridlog.tables.writer import TableWriter, topics_of
 from hybridlog_storage import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
@@ -32,39 +21,32 @@ if TYPE_CHECKING:
 
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.snapshot import Snapshot
+    from hybridlog.tables.parquet_file import ParquetFileReader
     from hybridlog.tables.reader import Tables, TopicTable
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
 
 
-def topics_of(entry: RecordingEntry) -> set[str]:
-    """Topics of a recording that have messages."""
-    return {c.topic for c in entry.channels if c.stats.messages}
-
-
 def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
-    """Topics whose tables are missing, or differ from the catalog.
-
-    Topics with few rows share files; those of one file are missing together.
-    """
+    """Topics whose tables are missing, or differ from the catalog."""
     from hybridlog.tables.reader import Tables
 
     tables = Tables(directory.path)
-    return together(entry, {t for t in topics_of(entry) if tables.of(entry, t) is None})
+    return {t for t in _possible(entry) if tables.of(entry, t) is None}
 
 
-def together(entry: RecordingEntry, topics: Collection[str]) -> set[str]:
-    """Some topics, and those that share a file with one of them."""
-    messages = entry.messages_by_topic()
-    schemas: dict[str, set[str]] = {topic: set() for topic in topics_of(entry)}
-    for c in entry.channels:
-        if c.topic in schemas and messages[c.topic] < OWN_FILE_ROWS:
-            schemas[c.topic].add(table_schema(c.message_encoding, c.schema, c.metadata))
-    shared = {schema for topic in topics for schema in schemas.get(topic, ())}
-    return {t for t in schemas if t in topics or not shared.isdisjoint(schemas[t])}
+def _possible(entry: RecordingEntry) -> set[str]:
+    """Topics that have a table when all is well: those with one definition."""
+    from hybridlog.tables.reader import has_one_definition
+
+    by_topic: dict[str, list[ChannelEntry]] = {topic: [] for topic in topics_of(entry)}
+    for channel in entry.channels:
+        if channel.topic in by_topic:
+            by_topic[channel.topic].append(channel)
+    return {topic for topic, channels in by_topic.items() if has_one_definition(channels)}
 
 
 def make(
@@ -83,7 +65,7 @@ def make(
     """
     if entry.status == "open" or not directory.is_writable:
         return False
-    wanted = missing(directory, entry) if topics is None else together(entry, topics)
+    wanted = missing(directory, entry) if topics is None else set(topics)
     if not wanted:
         return True
     try:
@@ -110,8 +92,6 @@ def made_for(
 ) -> TopicTable | None:
     """The table of a topic for a question, created again if it is missing or damaged.
 
-    A topic for which no table can be made is noted, which prevents another attempt.
-
     Args:
         directory: The store.
         entry: The recording's entry in the catalog.
@@ -122,20 +102,11 @@ def made_for(
     found = tables.of(entry, topic)
     if found is not None or entry.status == "open" or not directory.is_writable:
         return found
-    note = recording_folder(directory.path, entry.id) / topic_folder(topic) / NO_TABLE
-    state = ",".join(f"{number}:{entry.digests[number]}" for number in sorted(entry.digests))
-    with suppress(OSError, StoreError):
-        if files.read_file(note, len(state) + 1, depth=IN_TOPIC) == state.encode():
-            return None
-    if not make(directory, entry, {topic}):
+    if topic not in _possible(entry) or not make(directory, entry, {topic}):
         return None
-    tables.forget(entry, topic)
+    tables.forget(entry, [topic])
     found = tables.of(entry, topic)
-    if found is None:
-        with suppress(OSError, StoreError):
-            files.make_folders(note.parent, depth=IN_TOPIC - 1)
-            files.write_file(note, state.encode(), depth=IN_TOPIC)
-    else:
+    if found is not None:
         report.tables.append((entry.label, topic))
     return found
 
@@ -169,49 +140,69 @@ def chunks_with(entry: RecordingEntry, table: ChunkTable, topics: Collection[str
     return found.tolist()
 
 
-def damage(directory: StoreDirectory, entry: RecordingEntry) -> dict[str, str]:
-    """Problems of the existing tables, by topic. Reads every byte of them."""
-    from hybridlog.tables.reader import Tables
+class TableChecker:
+    """Checks the tables of recordings; each file once.
 
-    tables = Tables(directory.path)
-    found: dict[str, str] = {}
-    checked: dict[object, str] = {}
-    for topic in sorted(topics_of(entry)):
-        try:
-            for file in tables.check(entry, topic).files:
-                if file.path not in checked:
-                    checked[file.path] = ""
-                    try:
-                        file.check()
-                    except StoreError as error:
-                        checked[file.path] = str(error)
-                if checked[file.path]:
-                    found[topic] = checked[file.path]
-        except FileNotFoundError:
-            pass  # a missing table is no problem
-        except StoreError as error:
-            found[topic] = str(error)
-    return found
+    Args:
+        directory: The store.
+    """
+
+    def __init__(self, directory: StoreDirectory) -> None:
+        from hybridlog.tables.reader import Tables
+
+        self._tables = Tables(directory.path)
+        self._checked: dict[int, str] = {}
+
+    def damage(self, entry: RecordingEntry) -> dict[str, str]:
+        """Problems of the existing tables, by topic. Reads every byte of them."""
+        found: dict[str, str] = {}
+        for topic in sorted(topics_of(entry)):
+            try:
+                problems = map(self._problem, self._tables.check(entry, topic).files)
+                problem = next(filter(None, problems), "")
+            except FileNotFoundError:
+                continue  # a missing table is no problem
+            except StoreError as error:
+                problem = str(error)
+            if problem:
+                found[topic] = problem
+        return found
+
+    def _problem(self, file: ParquetFileReader) -> str:
+        """The damage of a file; empty without any."""
+        if file.number not in self._checked:
+            try:
+                file.check()
+                self._checked[file.number] = ""
+            except StoreError as error:
+                self._checked[file.number] = str(error)
+        return self._checked[file.number]
 
 
-def remove(directory: StoreDirectory, recording: str) -> None:
+def announce_removal(directory: StoreDirectory, recording: str) -> None:
+    """Make a folder that is there until all tables of a recording are gone."""
+    with suppress(OSError):
+        files.make_folders(parts_folder(directory.path, recording), depth=files.IN_FOLDER)
+
+
+def remove(directory: StoreDirectory, recording: str, types: Collection[str] | None = None) -> None:
     """Remove all tables of a recording.
+
+    Args:
+        directory: The store.
+        recording: Id of the recording.
+        types: Types of its messages; None if unknown.
 
     Raises:
         OSError: a table cannot be removed.
     """
-    parts = parts_folder(directory.path, recording)
+    from hybridlog.tables.folders import TableFolders
+
+    announce_removal(directory, recording)
+    prefixes = [""] if types is None else [type_prefix(one) for one in types]
+    TableFolders(directory.path, recording).remove(prefixes)
     with suppress(FileNotFoundError):
-        files.remove_tree(parts, depth=files.IN_FOLDER)
-    folder = recording_folder(directory.path, recording)
-    try:
-        files.make_folders(parts, depth=files.IN_FOLDER)
-        files.rename(folder, parts / "removed", depth=IN_TABLES, new_depth=files.IN_RECORDING)
-    except FileNotFoundError:
-        pass
-    finally:
-        with suppress(FileNotFoundError):
-            files.remove_tree(parts, depth=files.IN_FOLDER)
+        files.remove_tree(parts_folder(directory.path, recording), depth=files.IN_FOLDER)
 
 
 def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
@@ -225,9 +216,10 @@ def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
             files.remove_tree(directory.path / PARTS / name, depth=files.IN_FOLDER)
 
 
-def are_more_than(directory: StoreDirectory, recordings: int) -> bool:
-    """True if there are tables of more recordings than these."""
-    return any(len(_names(directory, top)) > recordings for top in (TABLES, PARTS))
+def are_left(directory: StoreDirectory, snapshot: Snapshot) -> bool:
+    """True if the removal of the tables of a recording was not finished."""
+    names = _names(directory, PARTS)
+    return any(name.removeprefix("r") not in snapshot.by_id for name in names)
 
 
 def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> None:
@@ -237,12 +229,13 @@ def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> Non
         directory: The store.
         present: Keys of all recordings with a directory.
     """
-    for top, beginning in ((TABLES, "recording=r"), (PARTS, "r")):
-        for name in _names(directory, top):
-            recording = name.removeprefix(beginning)
-            if recording != name and recording[:16] not in present:
-                with suppress(OSError):
-                    remove(directory, recording)
+    from hybridlog.tables.folders import recordings_of
+
+    left = {name.removeprefix("r") for name in _names(directory, PARTS)}
+    for recording in sorted(left | recordings_of(directory.path)):
+        if recording[:16] not in present:
+            with suppress(OSError):
+                remove(directory, recording)
 
 
 def _names(directory: StoreDirectory, top: str) -> list[str]:

@@ -103,10 +103,12 @@ def verify(
     if not catalog.is_sound():
         result.findings.append(Finding("", "catalog", "the file is damaged", _REPAIR))
     index = None if database is None else _Index(database, count_all=labels is None)
+    checker = tables.TableChecker(directory)
     for label in directory.labels() if labels is None else labels:
         result.recordings += 1
         try:
-            _Check(directory, catalog, index, label, result).run(repairs, progress)
+            check = _Check(directory, catalog, index, label, result, checker=checker)
+            check.run(repairs, progress)
         except StoreError as error:
             cure = "restore its files, or remove its directory"
             result.findings.append(Finding(label, "recording", str(error), cure))
@@ -172,7 +174,10 @@ class _Check:
         index: _Index | None,
         label: str,
         result: Verification,
+        *,
+        checker: tables.TableChecker,
     ) -> None:
+        self._checker = checker
         self._directory = directory
         self._catalog = catalog
         self._indexed = index
@@ -370,7 +375,7 @@ class _Check:
                 self.found(f"collection {collection}", problem, cure)
 
     def _tables(self, entry: RecordingEntry) -> None:
-        for topic, problem in tables.damage(self._directory, entry).items():
+        for topic, problem in self._checker.damage(entry).items():
             self.found(f"table of {topic}", problem, _REPAIR)
 
 

@@ -13,7 +13,13 @@ from hybridlog.payloads.columns import TopicColumns, column_at, values_of
 from hybridlog.payloads.encodings import LEVEL, encodings_of
 from hybridlog.payloads.layout import IN_PAYLOADS, payload_file
 from hybridlog.payloads.zones import Zone
-from hybridlog.tables.layout import About, table_schema_of, topic_folder
+from hybridlog.tables.layout import (
+    About,
+    Section,
+    TopicCounts,
+    table_schema_of,
+    topic_folder,
+)
 from hybridlog.tables.parquet_file import ParquetFileWriter
 from hybridlog_storage import durability, files
 from hybridlog_storage.journal import PayloadFile
@@ -166,7 +172,6 @@ class TopicWriter:
         if file.tables:
             self._flush(file)
         assert file.writer is not None
-        schema = self._channel.schema
         payloads: dict[str, Any] = {
             "wire": self._channel.message_encoding,
             "arrays": file.columns,
@@ -176,15 +181,12 @@ class TopicWriter:
             "zones": file.zones,
             "is_ordered": file.is_ordered,
         }
+        topics = {self._channel.topic: TopicCounts(file.rows)}
         path = self._folder / file.name
         try:
             file.writer.close(
                 About(
-                    recording=self._recording,
-                    schema=table_schema_of(self._channel),
-                    type=schema.name if schema is not None else "",
-                    segments=file.segments,
-                    topics={self._channel.topic: file.rows},
+                    [Section(self._recording, 0, file.segments, topics)],
                     bounds=tuple(file.bounds),
                     payloads=payloads,
                 )

@@ -34,7 +34,7 @@ from hybridlog.schema.arrow_types import (
     with_values,
 )
 from hybridlog.tables.fields import LIMIT
-from hybridlog.tables.layout import OWN_COLUMNS, TOPIC_COLUMN, column_names
+from hybridlog.tables.layout import OWN_COLUMNS, column_names
 
 OWN: Final = pa.schema(
     [
@@ -50,7 +50,7 @@ OWN: Final = pa.schema(
     ]
 )
 """Columns of every view in addition to the fields."""
-_RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names, TOPIC_COLUMN})
+_RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
 _SHARED_ROWS: Final = 131_072  # as many as a row group has
 _types = pa.types
 Fields = Callable[["ViewColumn"], Any]

@@ -79,9 +79,8 @@ class RowSource(Protocol):
     def is_whole(self) -> bool:
         """True if it has all arrays; else some may be summaries."""
 
-    @property
-    def kinds(self) -> Sequence[Any]:
-        """Types of the fields that it holds."""
+    def kinds(self, paths: Paths) -> Sequence[Any]:
+        """Types of the fields that it holds, at least at some paths."""
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         """Read columns."""
@@ -135,7 +134,7 @@ class TopicOfRecording:
             return [
                 kind if source.is_whole else whole_message(kind)
                 for source in self.sources
-                for kind in source.kinds
+                for kind in source.kinds(None)
             ]
         return [
             channel.arrow_type()
@@ -148,10 +147,7 @@ class TopicOfRecording:
         """Its table; None if it can have none."""
         if any(True for _ in lost_spans(self.entry)):
             return None  # rows of lost messages must not answer
-        found = self.session.table(self.entry, self.topic)
-        if found is None or self.is_fixed or all(len(f.about.topics) == 1 for f in found.files):
-            return found
-        return None  # small topics without a definition share a file, and its types
+        return self.session.table(self.entry, self.topic)
 
     @lazy
     def sources(self) -> list[RowSource]:
@@ -224,15 +220,17 @@ class _TableRows:
         self.first = part.first[0] if is_known else None
         self.last = part.last[0] if is_known else None
 
-    @property
-    def kinds(self) -> Sequence[Any]:
-        return [self._table.fields(None)]
+    def kinds(self, paths: Paths) -> Sequence[Any]:
+        try:
+            return [self._table.fields(paths)]
+        except StoreError as error:
+            raise DamagedTableError(self._source, str(error)) from error
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.files.add(str(self._part.file.path))
         counts.row_groups += 1
-        about = self._part.file.about
-        wanted = {*own, "state"} if about.unreadable or about.reduced else own
+        is_whole = not (self._table.unreadable or self._table.reduced)
+        wanted = own if is_whole else {*own, "state"}
         try:
             ours, records = self._table.read(self._part, paths, wanted)
         except StoreError as error:
@@ -257,8 +255,11 @@ class _ChunkRows:
         self._place = place
         self.first, self.last = span or (place.first, place.last)
 
+    def kinds(self, paths: Paths) -> Sequence[Any]:
+        return self._kinds
+
     @lazy
-    def kinds(self) -> Sequence[Any]:
+    def _kinds(self) -> Sequence[Any]:
         return [rows.records.type for rows in self.read(None, (), ScanCounts())]
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:

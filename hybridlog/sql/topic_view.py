@@ -346,7 +346,7 @@ def _is_absent(leaf: ViewColumn, source: RowSource) -> bool:
     """True if a source has only summaries of an array."""
     if leaf.is_summary or source.is_whole:
         return False
-    kinds = (_type_at(kind, leaf.source) for kind in source.kinds)
+    kinds = (_type_at(kind, leaf.source) for kind in source.kinds(_paths([leaf])))
     return any(kind is not None and lacks(kind, leaf.kind) for kind in kinds)
 
 

@@ -1,8 +1,10 @@
 """Conversion of message fields to columns of a table, and back.
 
-Arrays over the limit become `{n, min, max, mean}`, as in the index; arrays of strings,
-bytes and messages become `{n}`. A message without fields becomes a boolean, because Parquet
-has no column for it. A column renamed from its field has the field's name in its metadata.
+An array has two columns: the list, null where it has more than `LIMIT` elements, and its
+summary, null where the list is there. Summaries are `{n, min, max, mean}`, as in the index;
+of strings, bytes and messages `{n}`. A message without fields becomes a boolean, because
+Parquet has no column for it. The columns follow from the types of the fields alone. A column
+renamed from its field has the field's name in its metadata.
 """
 
 # Where stubs for pyarrow are installed, they are incomplete for its buffers.
@@ -10,7 +12,7 @@ has no column for it. A column renamed from its field has the field's name in it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -30,10 +32,12 @@ from hybridlog.schema.arrow_types import (
     summary,
     with_values,
 )
-from hybridlog.tables.layout import ORIGINAL, RESERVED, column_names
+from hybridlog.tables.layout import ORIGINAL, RESERVED, SUMMARY, column_names
 
 LIMIT: Final = 32
 """Maximum number of elements of an array stored in full."""
+SUMMARY_FIELDS: Final = ("n", "min", "max", "mean")
+"""Fields of a summary of numbers."""
 
 
 class UnfitError(Exception):
@@ -41,9 +45,7 @@ class UnfitError(Exception):
 
 
 class FieldShape:
-    """Turns fields of one topic's messages into columns, consistently.
-
-    Once an array was too long, all later ones become summaries.
+    """Turns fields of messages into columns.
 
     Args:
         limit: Most elements of an array that is kept in full; None for no limit.
@@ -53,8 +55,7 @@ class FieldShape:
     def __init__(self, limit: int | None = LIMIT, reserved: Collection[str] = RESERVED) -> None:
         self._limit = limit
         self._reserved = reserved
-        self._summarised: set[tuple[str, ...]] = set()
-        self._plain: dict[tuple[str, ...], Any] = {}
+        self._plain: set[Any] = set()  # types of messages that are columns as they are
 
     def columns(self, records: Array) -> Array:
         """Fields as columns.
@@ -65,105 +66,152 @@ class FieldShape:
         Returns:
             A struct array; its fields are the columns.
         """
-        return self._struct(records, (), self._outer_names)
+        return self._struct(records, self._reserved)
 
-    def _outer_names(self, names: list[str]) -> Iterator[tuple[str, str]]:
-        return column_names(names, self._reserved)
-
-    def _column(self, array: Array, path: tuple[str, ...]) -> Array:
+    def _column(self, array: Array) -> Array:
         kind = array.type
         if pa.types.is_struct(kind):
             if kind.num_fields == 0:
                 return pa.array(np.ones(len(array), np.bool_), mask=missing_of(array))
-            return self._struct(array, path, _inner_names)
-        if is_array(kind) and self._is_long(array, path):
-            return summary(array)
+            return self._struct(array, ())
         if is_list(kind):
-            values = self._column(array.flatten(), path)
+            values = self._column(array.flatten())
             is_same = pa.types.is_list(kind) and values.type == kind.value_type
             return array if is_same else with_values(array, values)
         return array
 
-    def _struct(
-        self,
-        array: Array,
-        path: tuple[str, ...],
-        naming: Callable[[list[str]], Iterator[tuple[str, str]]],
-    ) -> Array:
+    def _struct(self, array: Array, reserved: Collection[str]) -> Array:
         kind = array.type
-        if self._plain.get(path) == kind:
+        if kind in self._plain:
             return array
-        columns, fields = {}, []
-        for number, (name, column) in enumerate(naming([field.name for field in kind])):
-            values = self._column(array.field(number), (*path, name))
-            columns[column] = values
-            fields.append(_named(column, name, values.type))
-        if kind == pa.struct(fields) and not any(map(_may_change, fields)):
-            self._plain[path] = kind
+        columns: list[Array] = []
+        about: list[tuple[str, bool]] = []
+        for number, field in enumerate(kind):
+            values = array.field(number)
+            if self._has_summary(field.type):
+                columns += self._split(values)
+                about += [(field.name, False), (f"{field.name}_summary", True)]
+            else:
+                columns.append(self._column(values))
+                about.append((field.name, False))
+        named = list(column_names([name for name, _ in about], reserved))
+        fields = [
+            _named(column, name, values.type, is_summary=is_summary)
+            for (name, column), (_, is_summary), values in zip(named, about, columns, strict=True)
+        ]
+        if kind == pa.struct(fields) and not any(field.metadata for field in fields):
+            self._plain.add(kind)
             return array
-        return structs(columns, len(array), missing_of(array), fields)
+        return structs(
+            {column: values for (_, column), values in zip(named, columns, strict=True)},
+            len(array),
+            missing_of(array),
+            fields,
+        )
 
-    def _is_long(self, array: Array, path: tuple[str, ...]) -> bool:
-        if self._limit is None:
+    def _has_summary(self, kind: Any) -> bool:
+        if self._limit is None or not is_array(kind):
             return False
-        if path not in self._summarised:
-            if not len(array) or int(lengths_of(array).max()) <= self._limit:
-                return False
-            self._summarised.add(path)
-        return True
+        return not pa.types.is_fixed_size_list(kind) or kind.list_size > self._limit
+
+    def _split(self, array: Array) -> tuple[Array, Array]:
+        """Arrays within the limit, and summaries of the others."""
+        assert self._limit is not None
+        is_long = _over(array, self._limit)
+        if not is_long.any():
+            return self._column(array), pa.nulls(len(array), summary(array.slice(0, 0)).type)
+        rows = np.flatnonzero(is_long)
+        short = array.take(pa.array(np.arange(len(array)), mask=is_long))
+        long = array if len(rows) == len(array) else array.take(pa.array(rows))
+        return self._column(short), without(summary(long), rows, len(array))
 
 
-def _may_change(field: Any) -> bool:
-    """True if a column may change its type later, or is renamed."""
-    kind = field.type
-    if field.metadata:
-        return True
-    if pa.types.is_struct(kind):
-        return any(map(_may_change, kind))
-    return is_array(kind)
+def _over(array: Array, limit: int) -> Any:
+    """bool[n], True for arrays with more elements, or with such an array among their elements."""
+    lengths = lengths_of(array)
+    found = lengths > limit
+    if is_list(array.type) and is_array(array.type.value_type):
+        inner = np.concatenate(([0], np.cumsum(_over(array.flatten(), limit), dtype=np.int64)))
+        ends = np.cumsum(lengths)
+        found |= inner[ends] > inner[ends - lengths]
+    return found
 
 
-def _inner_names(names: list[str]) -> Iterator[tuple[str, str]]:
-    return column_names(names, ())
-
-
-def _named(column: str, name: str, kind: Any) -> Any:
+def _named(column: str, name: str, kind: Any, *, is_summary: bool) -> Any:
+    if is_summary:
+        return pa.field(column, kind, metadata={SUMMARY: name.removesuffix("_summary")})
     return pa.field(column, kind, metadata={ORIGINAL: name} if column != name else None)
 
 
 def original_name(field: Any) -> str:
-    """Name of the field of a column."""
-    name = (field.metadata or {}).get(ORIGINAL)
+    """Name of the field of a column; of summaries, that of their array."""
+    about = field.metadata or {}
+    name = about.get(SUMMARY, about.get(ORIGINAL))
     return field.name if name is None else name.decode()
 
 
-def records_of(columns: Array) -> Array:
+def has_summaries(field: Any) -> bool:
+    """True for a column of summaries."""
+    return SUMMARY in (field.metadata or {})
+
+
+def records_of(
+    columns: Array,
+    is_summarised: Callable[[tuple[str, ...]], bool] = lambda _: False,
+    above: tuple[str, ...] = (),
+) -> Array:
     """Columns as fields of messages, under the names of the fields.
 
-    Summaries remain summaries.
+    Args:
+        columns: A struct array; its fields are the columns.
+        is_summarised: Returns whether the array at a path becomes summaries; else lists, of
+            which none is too long.
+        above: Path of the columns.
     """
     kind = columns.type
     if pa.types.is_struct(kind):
-        if not any(map(_is_renamed, kind)):
+        if not any(map(_is_changed, kind)):
             return columns
-        values = {
-            original_name(field): records_of(columns.field(number))
-            for number, field in enumerate(kind)
-        }
-        return structs(values, len(columns), missing_of(columns))
-    if is_list(kind) and _is_renamed(kind.value_field):
-        return with_values(columns, records_of(columns.flatten()))
+        found: dict[str, Array] = {}
+        for number, field in enumerate(kind):
+            name = original_name(field)
+            path = (*above, name)
+            values = records_of(columns.field(number), is_summarised, path)
+            if has_summaries(field):
+                if is_summarised(path):
+                    found[name] = _filled(values, found.get(name))
+                else:
+                    found.setdefault(name, values)
+            else:
+                found[name] = values
+        return structs(found, len(columns), missing_of(columns))
+    if is_list(kind) and _is_changed(kind.value_field):
+        return with_values(columns, records_of(columns.flatten(), is_summarised, above))
     return columns
 
 
-def _is_renamed(field: Any) -> bool:
-    """True if the name of a column, or of one inside it, differs from its field's."""
-    if original_name(field) != field.name:
+def _filled(summaries: Array, lists: Array | None) -> Array:
+    """Summaries, worked out from the list where that is there."""
+    if lists is None or lists.null_count == len(lists):
+        return summaries
+    whole = summary(lists)
+    kind = summaries.type
+    parts = [whole.field(whole.type.get_field_index(field.name)) for field in kind]
+    columns = {field.name: part.cast(field.type) for part, field in zip(parts, kind, strict=True)}
+    made = structs(columns, len(lists), missing_of(lists), list(kind))
+    rows = np.arange(len(lists))
+    rows[summaries.is_valid().to_numpy(zero_copy_only=False)] += len(lists)
+    return pa.concat_arrays([made, summaries]).take(pa.array(rows))
+
+
+def _is_changed(field: Any) -> bool:
+    """True if a column, or one inside it, is not its field under the same name."""
+    if field.metadata and (ORIGINAL in field.metadata or SUMMARY in field.metadata):
         return True
     kind = field.type
     if pa.types.is_struct(kind):
-        return any(map(_is_renamed, kind))
-    return is_list(kind) and _is_renamed(kind.value_field)
+        return any(map(_is_changed, kind))
+    return is_list(kind) and _is_changed(kind.value_field)
 
 
 def joined(pieces: Sequence[Array]) -> Array:

@@ -1,14 +1,14 @@
 """Names of tables: folders, files, columns and the metadata of a file.
 
 ```
-tables/recording=r<id>/topic=<collection>/<schema8>-<segment>.parquet
-tables/recording=r<id>/small/<type>~<schema8>.parquet
-tables.part/r<id>/      unfinished files; only finished ones get a name in `tables`
+tables/<type>~<shape8>/shared-<number>.parquet   several recordings
+tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
+tables.part/r<id>/                               unfinished files
+tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
 ```
 
-The folders are hive partitions. The id has a leading letter, because readers that infer
-types read `1e3` and `1000` as the same number. The schema is in the name of a file, which
-gives all files of one glob the same type.
+A folder has the rows of all ended recordings of one message type. All of its files have the
+same schema, of which `shape8` is a hash.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog_storage.catalog import schema_hash
 from hybridlog_storage.collection_names import collection_of
@@ -33,18 +33,18 @@ TABLES: Final = "tables"
 """Folder of the store that holds finished tables."""
 PARTS: Final = "tables.part"
 """Folder of the store that holds unfinished tables."""
-SMALL: Final = "small"
-"""Folder of a recording's tables that holds topics with few rows."""
 SUFFIX: Final = ".parquet"
-NO_TABLE: Final = "no-table"
-"""File in the folder of a topic that marks that no table can be made."""
-OWN_FILE_ROWS: Final = 1000
-"""Number of rows from which a topic has its own file."""
+SHARED: Final = "shared-"
+"""Beginning of the names of files that recordings share."""
 IN_TABLES: Final = 2
-"""Depth of a recording's folder below the store."""
-IN_TOPIC: Final = 4
+"""Depth of a folder of tables below the store."""
+IN_TYPE: Final = 3
 """Depth of a file of tables below the store."""
+IN_PARTS: Final = 4
+"""Depth of a table of a sealed segment below the store."""
 OWN_COLUMNS: Final = (
+    "recording",
+    "topic",
     "log_time",
     "t",
     "seq",
@@ -56,28 +56,18 @@ OWN_COLUMNS: Final = (
     "ref",
 )
 """Columns that every table has in addition to the fields of the messages."""
-TOPIC_COLUMN: Final = "topic"
-"""Column of a table of several topics."""
 STATES: Final = ("whole", "reduced", "unreadable", "expired")
 """Values of the column `state`."""
 ORIGINAL: Final = b"hybridlog.name"
 """Metadata of a column: the name of its field, if it differs."""
+SUMMARY: Final = b"hybridlog.summary"
+"""Metadata of a column: the name of the array whose summaries it has."""
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
-VERSION: Final = 1
-RESERVED: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN, "recording"})
+VERSION: Final = 2
+RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
-
-
-def recording_folder(root: Path, recording: str) -> Path:
-    """Folder of a recording's tables.
-
-    Args:
-        root: The store.
-        recording: Id of the recording.
-    """
-    return root / TABLES / f"recording=r{recording}"
 
 
 def parts_folder(root: Path, recording: str) -> Path:
@@ -85,8 +75,37 @@ def parts_folder(root: Path, recording: str) -> Path:
     return root / PARTS / f"r{recording}"
 
 
+def type_prefix(type_name: str) -> str:
+    """Beginning of the names of the folders of a message type."""
+    return f"{_ODD.sub('_', type_name)[:100] or 'untyped'}~"
+
+
+def shape_folder(type_name: str, schema: Any) -> str:
+    """Name of the folder of a message type.
+
+    Args:
+        type_name: Name of the type, possibly empty.
+        schema: The Arrow schema of its tables.
+    """
+    text = json.dumps([_described(column) for column in schema])
+    return type_prefix(type_name) + hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _described(column: Any) -> list[Any]:
+    """Name, names of ours, type and inner columns of a column."""
+    kind = column.type
+    known = column.metadata or {}
+    names = [column.name, *(known.get(key, b"").decode() for key in (ORIGINAL, SUMMARY))]
+    if not kind.num_fields:
+        return [names, str(kind), []]
+    inner = [_described(kind.field(number)) for number in range(kind.num_fields)]
+    if hasattr(kind, "value_field"):  # elements of lists have no name of their own
+        return [names, f"list {getattr(kind, 'list_size', '')}", [inner[0][1:]]]
+    return [names, "struct", inner]
+
+
 def topic_folder(topic: str) -> str:
-    """Name of the folder of a topic's tables."""
+    """Name of the folder of a topic's columns of payloads."""
     return f"topic={collection_of(topic)}"
 
 
@@ -107,22 +126,6 @@ def table_schema_of(channel: Channel) -> str:
     """The hash of `table_schema` for a channel."""
     schema = schema_hash(channel.schema) if channel.schema is not None else None
     return table_schema(channel.message_encoding, schema, channel.metadata)
-
-
-def topic_file(schema: str, segment: int, part: int = 0) -> str:
-    """Name of a file of one topic.
-
-    Args:
-        schema: See `table_schema`.
-        segment: The last segment with messages in it.
-        part: Number of such files so far: columns of one file have one type.
-    """
-    return f"{schema[:8]}-{segment:06d}{f'-{part}' if part else ''}{SUFFIX}"
-
-
-def small_file(type_name: str, schema: str) -> str:
-    """Name of a file of several topics of one type."""
-    return f"{_ODD.sub('_', type_name)[:100] or 'untyped'}~{schema[:8]}{SUFFIX}"
 
 
 def column_names(
@@ -151,34 +154,69 @@ def column_names(
         yield name, column
 
 
+class TopicCounts(NamedTuple):
+    """Rows of a topic of a recording in a file.
+
+    Attributes:
+        rows: All rows.
+        unreadable: Rows without fields, because their messages do not fit their definition.
+        reduced: Rows without fields, because their messages were reduced under pressure.
+    """
+
+    rows: int
+    unreadable: int = 0
+    reduced: int = 0
+
+    def plus(self, other: TopicCounts) -> TopicCounts:
+        """The counts of the rows of both."""
+        return TopicCounts(*map(sum, zip(self, other, strict=True)))
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """The rows of one recording in a file.
+
+    Attributes:
+        id: Id of the recording.
+        begin: Log time at which it begins, ns: recordings are in this order.
+        segments: Digest of each segment that has rows in the file, by its number as text.
+        topics: Rows of each topic, in the order of the file.
+    """
+
+    id: str
+    begin: int
+    segments: Mapping[str, str]
+    topics: Mapping[str, TopicCounts]
+
+    @property
+    def rows(self) -> int:
+        """Rows of all topics."""
+        return sum(counts.rows for counts in self.topics.values())
+
+    @property
+    def place(self) -> tuple[int, str]:
+        """Its place in the order of a file."""
+        return self.begin, self.id
+
+
 @dataclass(frozen=True, slots=True)
 class About:
     """The description of a file of tables, stored in the file itself.
 
     Attributes:
-        recording: Id of the recording.
-        schema: See `table_schema`.
-        type: Name of the type of the messages, possibly empty.
-        segments: Digest of each segment that has rows in the file, by its number as text.
-        topics: Rows of each topic, in the order of the file.
+        recordings: The recordings with rows in the file, in its order.
         bounds: For each row group: its rows, then log time and arrival number of its first and
             last row. The keys are zeros in a file of several topics.
-        unreadable: Rows without fields, because their messages do not fit their definition.
-        reduced: Rows without fields, because their messages were reduced under pressure.
+        span: First byte of the row groups, and the one after their end.
         body: Bytes before the footer.
         checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
         version: Version of the format.
         payloads: What a file of payloads needs besides; empty in a table.
     """
 
-    recording: str
-    schema: str
-    type: str
-    segments: Mapping[str, str]
-    topics: Mapping[str, int]
+    recordings: Sequence[Section]
     bounds: tuple[tuple[int, int, int, int, int], ...]
-    unreadable: int = 0
-    reduced: int = 0
+    span: tuple[int, int] = (0, 0)
     body: int = 0
     checksums: str = field(default="", repr=False)
     version: int = VERSION
@@ -186,8 +224,12 @@ class About:
 
     @property
     def rows(self) -> int:
-        """Rows of all topics."""
-        return sum(self.topics.values())
+        """Rows of all recordings."""
+        return sum(section.rows for section in self.recordings)
+
+    def section(self, recording: str) -> Section | None:
+        """The rows of a recording; None without any."""
+        return next((one for one in self.recordings if one.id == recording), None)
 
     def to_json(self) -> str:
         """The description as JSON text."""
@@ -205,13 +247,21 @@ class About:
             if values["version"] != VERSION:
                 raise StoreError("the table has another version")
             values["bounds"] = tuple(tuple(map(int, bound)) for bound in values["bounds"])
+            values["recordings"] = [_section(**one) for one in values["recordings"]]
             about = cls(**values)
+            begin, end = values["span"]
             is_sound = (
-                all(len(bound) == 5 for bound in about.bounds)
+                0 <= begin <= end <= values["body"]
+                and all(len(bound) == 5 for bound in about.bounds)
                 and sum(bound[0] for bound in about.bounds) == about.rows
             )
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise StoreError("the description of the table cannot be read") from error
         if not is_sound:
             raise StoreError("the description of the table contradicts itself")
         return about
+
+
+def _section(topics: Mapping[str, Sequence[int]], **others: Any) -> Section:
+    counts = {str(topic): TopicCounts(*map(int, found)) for topic, found in topics.items()}
+    return Section(topics=counts, **others)

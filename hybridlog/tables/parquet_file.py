@@ -17,16 +17,17 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hybridlog.schema.arrow_types import is_list
-from hybridlog.tables.layout import ABOUT, IN_TOPIC, About
+from hybridlog.tables.layout import ABOUT, IN_TYPE, About
 from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
@@ -46,6 +47,25 @@ _SEALED_BY: Final = "hybridlog.footer"
 _NUMBERS: Final = count()
 
 
+class KeptBytes(NamedTuple):
+    """The row groups of the file that a new one replaces.
+
+    They keep their place in the new file, where nothing refers to them: DuckDB reads the
+    footer, and opens the file again by its name for the rows.
+
+    Attributes:
+        offset: Where they lie.
+        data: The bytes.
+    """
+
+    offset: int
+    data: bytes
+
+
+class NoRoomError(Exception):
+    """Row groups do not fit in front of the kept ones."""
+
+
 class ParquetFileWriter:
     """Writes one file of a table.
 
@@ -56,6 +76,10 @@ class ParquetFileWriter:
         encodings: Encoding of columns, by their dotted paths: `dictionary` or a name of
             Parquet's. Those of the other columns follow from the example rows.
         level: Level of zstd.
+        is_all: True if the example rows are all rows of the file. Then floats without NaN
+            have statistics: DuckDB answers wrongly from those of floats with NaN among them.
+        kept: Row groups of the file that this one replaces.
+        in_front: True to write the new row groups in front of the kept ones.
 
     Raises:
         OSError: the file cannot be created.
@@ -69,6 +93,9 @@ class ParquetFileWriter:
         depth: int,
         encodings: Mapping[str, str] | None = None,
         level: int = 1,
+        is_all: bool = False,
+        kept: KeptBytes | None = None,
+        in_front: bool = False,
     ) -> None:
         self.path = path
         self._depth = depth
@@ -78,20 +105,27 @@ class ParquetFileWriter:
         for leaf, kind in leaves:
             if _runs(leaf, kind):
                 chosen.setdefault(leaf, "DELTA_BINARY_PACKED")
-        for leaf, array in _leaf_values(sample):
+        for leaf, array in _leaf_values(sample.slice(0, _SAMPLE)):
             if leaf not in chosen and _repeats(array):
                 chosen[leaf] = DICTIONARY
+        ordered = {leaf for leaf, kind in leaves if _is_ordered(kind)}
+        if is_all:
+            ordered |= {leaf for leaf, array in _leaf_values(sample) if _has_no_nan(array)}
         try:
+            self._file = pa.PythonFile(self._sink, mode="w")
             self._writer = pq.ParquetWriter(
-                pa.PythonFile(self._sink, mode="w"),
+                self._file,
                 sample.schema,
                 compression="zstd",
                 compression_level=level,
                 use_dictionary=[leaf for leaf, how in chosen.items() if how == DICTIONARY],
                 column_encoding={leaf: how for leaf, how in chosen.items() if how != DICTIONARY},
-                # DuckDB answers wrongly from statistics of floats with NaN among them.
-                write_statistics=[leaf for leaf, kind in leaves if _has_statistics(kind)],
+                write_statistics=[leaf for leaf, _ in leaves if leaf in ordered],
             )
+            self._behind = kept if in_front else None
+            if kept is not None and not in_front:
+                self._put(kept)
+            self._begin = self._file.tell()
         except BaseException:
             self.discard()
             raise
@@ -104,27 +138,39 @@ class ParquetFileWriter:
         """
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
 
-    def close(self, about: About) -> None:
+    def close(self, about: About, *, sync: bool = False) -> None:
         """Finish the file.
 
         Args:
             about: The description of the file, without `body` and `checksums`.
+            sync: True to force it to the disk.
 
         Raises:
             OSError: the file cannot be written.
+            NoRoomError: the row groups do not fit in front of the kept ones.
             StoreError: some text in it looks like the checksum of a footer.
         """
         try:
+            span = self._begin, self._file.tell()
+            if self._behind is not None:
+                if span[1] > self._behind.offset:
+                    raise NoRoomError
+                self._put(self._behind)
             body, checksums = self._sink.end_body()
-            about = replace(about, body=body, checksums=checksums)
+            about = replace(about, span=span, body=body, checksums=checksums)
             self._writer.add_key_value_metadata(
                 {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
             )
             self._writer.close()
-            self._sink.finish()
+            self._sink.finish(sync=sync)
         except BaseException:
             self.discard()
             raise
+
+    def _put(self, kept: KeptBytes) -> None:
+        """Write kept bytes at their place."""
+        self._file.write(bytes(kept.offset - self._file.tell()))
+        self._file.write(kept.data)
 
     def discard(self) -> None:
         """Delete the unfinished file."""
@@ -174,7 +220,7 @@ class _Sink:
         self._footer = bytearray()
         return self._position, "".join(self._checksums)
 
-    def finish(self) -> None:
+    def finish(self, *, sync: bool) -> None:
         """Seal the footer, and write all remaining bytes."""
         assert self._footer is not None
         marks = [found.start(1) for found in _SEAL.finditer(self._footer)]
@@ -184,6 +230,8 @@ class _Sink:
         self._footer[at : at + 8] = _checksum(self._footer).encode()
         self._waiting += self._footer
         self._flush()
+        if sync:
+            files.system.sync(self._fd)
         os.close(self._fd)
         self._fd = -1
 
@@ -220,15 +268,13 @@ class ParquetFileReader:
         StoreError: the file cannot be read, or is damaged.
     """
 
-    def __init__(self, path: Path, *, depth: int = IN_TOPIC) -> None:
+    def __init__(self, path: Path, *, depth: int = IN_TYPE) -> None:
         self.path = path
         self.number = next(_NUMBERS)
         """Unique number of this reader."""
         self._lock = threading.Lock()
-        self._fd = -1
         try:
-            self._fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
-            self._source = _Source(self._fd)
+            self._source = _Source(path, depth)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
             self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
             self._source.trust(self.about)
@@ -247,9 +293,9 @@ class ParquetFileReader:
         except (OSError, StoreError, pa.ArrowException, KeyError) as error:
             raise self._damaged(error) from error
 
-    def __del__(self) -> None:
-        if self._fd >= 0:
-            os.close(self._fd)
+    def release(self) -> None:
+        """Close the file until it is read again."""
+        self._source.release()
 
     @property
     def size_bytes(self) -> int:
@@ -270,6 +316,38 @@ class ParquetFileReader:
         """Stored bytes of some columns of a row group."""
         found = self._parquet.metadata.row_group(group)
         return sum(found.column(leaf).total_compressed_size for leaf in leaves)
+
+    def nulls(self, group: int, leaf: int) -> int | None:
+        """Number of nulls in a column of a row group; None if unknown."""
+        found = self._parquet.metadata.row_group(group).column(leaf).statistics
+        return found.null_count if found is not None and found.has_null_count else None
+
+    def values(self, group: int, leaf: int) -> int:
+        """Number of values in a column of a row group, nulls included."""
+        return int(self._parquet.metadata.row_group(group).column(leaf).num_values)
+
+    def kept(self) -> KeptBytes:
+        """The bytes of its row groups.
+
+        Raises:
+            StoreError: they are damaged.
+        """
+        begin, end = self.about.span
+        try:
+            return KeptBytes(begin, self._source.checked(begin, end))
+        except (OSError, StoreError) as error:
+            raise self._damaged(error) from error
+
+    def table(self) -> pa.Table:
+        """All rows.
+
+        Raises:
+            StoreError: they are damaged.
+        """
+        leaves = range(len(list(leaf_paths(self.schema))))
+        groups = [self.read(group, leaves) for group in range(self.groups)]
+        table = pa.concat_tables(groups) if groups else self.schema.empty_table()
+        return table.replace_schema_metadata(None)
 
     def read(self, group: int, leaves: Sequence[int]) -> pa.Table:
         """Some columns of a row group.
@@ -299,15 +377,17 @@ class ParquetFileReader:
         Raises:
             StoreError: a part is damaged.
         """
-        leaves = range(len(list(leaf_paths(self.schema))))
         try:
             self._source.check()
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
-        for group in range(self.groups):
-            self.read(group, leaves)
+        self.table()
 
-    def _damaged(self, error: Exception) -> StoreError:
+    def _damaged(self, error: Exception) -> HybridlogError:
+        if isinstance(error, OSError):
+            shortage = exhausted(error.errno, f"reading {self.path}")
+            if shortage is not None:
+                return shortage
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         return StoreError(f"The table {self.path} is damaged: {reason}.")
 
@@ -315,11 +395,17 @@ class ParquetFileReader:
 class _Source:
     """Provides Parquet's bytes, after verifying the checksum of each block."""
 
-    def __init__(self, fd: int) -> None:
+    def __init__(self, path: Path, depth: int) -> None:
         self.closed = False
-        self._fd = fd
+        self._path = path
+        self._depth = depth
+        self._lock = threading.Lock()
+        self._fd = -1
         self._position = 0
-        self.size = os.fstat(fd).st_size
+        self._same: tuple[int, int, int] | None = None
+        with self._lock:
+            self._open()
+        self.size = os.fstat(self._fd).st_size
         self._checksums: list[bytes] = []
         tail = self._raw(self.size - _TAIL, _TAIL) if self.size > 2 * _TAIL else b""
         length = int.from_bytes(tail[:4], "little") + _TAIL
@@ -345,7 +431,7 @@ class _Source:
     def check(self) -> None:
         """Read and verify the whole body."""
         for at in range(0, self._body, 64 * BLOCK):
-            self._checked(at, min(at + 64 * BLOCK, self._body))
+            self.checked(at, min(at + 64 * BLOCK, self._body))
 
     def read(self, size: int = -1) -> bytes:
         """Read from the current position."""
@@ -355,10 +441,11 @@ class _Source:
         if begin >= self._body:
             return self.footer[begin - self._body : end - self._body]
         if end <= self._body:
-            return self._checked(begin, end)
-        return self._checked(begin, self._body) + self.footer[: end - self._body]
+            return self.checked(begin, end)
+        return self.checked(begin, self._body) + self.footer[: end - self._body]
 
-    def _checked(self, begin: int, end: int) -> bytes:
+    def checked(self, begin: int, end: int) -> bytes:
+        """Bytes of the body, verified."""
         first, last = begin // BLOCK, -(-end // BLOCK)
         start = first * BLOCK
         data = self._raw(start, min(last * BLOCK, self._body) - start)
@@ -370,8 +457,31 @@ class _Source:
                 raise StoreError(f"the checksum of the block at byte {number * BLOCK} differs")
         return data[begin - start : end - start]
 
+    def __del__(self) -> None:
+        self.release()
+
+    def release(self) -> None:
+        """Close the file until it is read again."""
+        with self._lock:
+            if self._fd >= 0:
+                os.close(self._fd)
+            self._fd = -1
+
+    def _open(self) -> None:
+        self._fd = files.open_file(self._path, os.O_RDONLY | os.O_NONBLOCK, depth=self._depth)
+        about = os.fstat(self._fd)
+        same = about.st_ino, about.st_size, about.st_mtime_ns
+        if self._same is not None and same != self._same:
+            os.close(self._fd)
+            self._fd = -1
+            raise StoreError("it was replaced")
+        self._same = same
+
     def _raw(self, offset: int, size: int) -> bytes:
-        data = os.pread(self._fd, size, offset)
+        with self._lock:
+            if self._fd < 0:
+                self._open()
+            data = os.pread(self._fd, size, offset)
         if len(data) != size:
             raise StoreError("it was truncated")
         return data
@@ -394,8 +504,13 @@ class _Source:
         """Do nothing: the file remains open as long as its reader."""
 
 
-def _has_statistics(kind: pa.DataType) -> bool:
+def _is_ordered(kind: pa.DataType) -> bool:
+    """True for types whose least and greatest values every reader understands."""
     return not (pa.types.is_floating(kind) or pa.types.is_binary(kind))
+
+
+def _has_no_nan(array: pa.Array[Any]) -> bool:
+    return pa.types.is_floating(array.type) and not pc.any(pc.is_nan(array)).as_py()
 
 
 def leaves_of(schema: pa.Schema) -> Iterator[tuple[tuple[str, ...], pa.DataType]]:
@@ -427,10 +542,9 @@ def _walk(top: pa.Field) -> Iterator[tuple[tuple[str, ...], str, pa.DataType]]:
 
 
 def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
-    """The first values of each column, in Parquet's order."""
+    """The values of each column, in Parquet's order."""
     for top, column in zip(table.schema, table.columns, strict=True):
-        head = column.slice(0, _SAMPLE)
-        array = head.combine_chunks()
+        array = column.combine_chunks()
         if isinstance(array, pa.ChunkedArray):
             array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.nulls(0, top.type)
         yield from _inner_values(top.name, array)

@@ -1,9 +1,11 @@
 """Reads tables of topics that the catalog confirms.
 
-A table is valid if its files belong to this recording, topic and type. Every segment with
-rows in it must have the catalog's digest, and the number of rows must be the catalog's
-number of messages. All bytes read are verified by checksum. An invalid table is ignored,
-and other engines answer.
+A table is valid if every segment with rows in it has the catalog's digest, and the number of
+rows is the catalog's number of messages. All bytes read are verified by checksum. An invalid
+table is ignored, and other engines answer.
+
+A file is opened once for all recordings and topics in it. A recording that is not found is a
+reason to look at the folders again.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
+from stat import S_ISDIR
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -24,23 +26,32 @@ import pyarrow.compute as pc
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import is_list
 from hybridlog.schema.column import ranges
-from hybridlog.tables.fields import UnfitError, alike, original_name, records_of
+from hybridlog.tables.fields import (
+    SUMMARY_FIELDS,
+    UnfitError,
+    alike,
+    has_summaries,
+    original_name,
+    records_of,
+)
 from hybridlog.tables.layout import (
-    IN_TOPIC,
+    IN_PARTS,
+    IN_TABLES,
     ORIGINAL,
     OWN_COLUMNS,
-    SMALL,
+    SHARED,
     SUFFIX,
-    TOPIC_COLUMN,
-    recording_folder,
-    small_file,
+    TABLES,
+    Section,
+    TopicCounts,
+    parts_folder,
     table_schema,
-    topic_file,
-    topic_folder,
+    type_prefix,
 )
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import files
-from hybridlog_storage.errors import StoreError, exhausted
+from hybridlog_storage.errors import StoreError, unreadable
+from hybridlog_storage.lazy import lazy
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
 
@@ -53,8 +64,10 @@ if TYPE_CHECKING:
 MAX_BYTES: Final = 64 << 20
 """Maximum memory of decoded columns."""
 _OPEN_FILES: Final = 256
-_TYPES: Final = 64  # of which a table remembers what they are
-_OWN: Final = frozenset({*OWN_COLUMNS, TOPIC_COLUMN})
+_TYPES: Final = 64  # sets of fields whose types are kept for a file
+_MAX_RUNNING: Final = 16  # recordings in progress whose tables are kept open
+_MAX_FOUND: Final = 65_536  # tables that are kept
+_OWN: Final = frozenset(OWN_COLUMNS)
 _FIRST, _LAST = (-(1 << 63), -(1 << 63)), ((1 << 63) - 1, (1 << 63) - 1)
 
 _Key = tuple[int, int]
@@ -70,8 +83,8 @@ class TableRows:
         seq: int64[n], arrival numbers.
         own: Columns of the table itself, by name: `pub`, `stamp`, `channel`, `state`,
             `error`, `ref`.
-        records: Fields of the messages, a struct each, under their own names. Arrays over the
-            limit are `{n, min, max, mean}`.
+        records: Fields of the messages, a struct each, under their own names. If one array of
+            a field is over the limit, all of its arrays are `{n, min, max, mean}`.
     """
 
     t: NDArray[np.int64]
@@ -125,7 +138,7 @@ class TablePart(NamedTuple):
         last: Key of the last row, or an upper bound of it.
     """
 
-    file: ParquetFileReader
+    file: ColumnFile
     group: int
     begin: int
     rows: int
@@ -140,11 +153,90 @@ class _Leaf(NamedTuple):
         top: Name of the table's column that contains it.
         is_own: True for a column of the table itself, not of a field.
         names: Names of the fields on the path to it.
+        array: Names of the fields on the path to the array whose summary it is part of.
     """
 
     top: str
     is_own: bool
     names: tuple[str, ...]
+    array: tuple[str, ...] | None = None
+
+
+class ColumnFile(ParquetFileReader):
+    """A file of tables, and what is known of its columns."""
+
+    @lazy
+    def leaves(self) -> list[_Leaf]:
+        """Its columns in Parquet's order."""
+        return [leaf for top in self.schema for leaf in _leaves(top)]
+
+    @lazy
+    def summaries(self) -> dict[tuple[str, ...], int]:
+        """Paths of arrays with summaries, and the number of a column of each."""
+        return {leaf.array: n for n, leaf in enumerate(self.leaves) if leaf.array is not None}
+
+    @lazy
+    def chosen(self) -> dict[tuple[Any, Any], list[int]]:
+        """Numbers of columns that were chosen, by fields and columns of ours."""
+        return {}
+
+    def choose(self, paths: Collection[str] | None, own: Collection[str]) -> list[int]:
+        """Numbers of the columns for some fields."""
+        key = None if paths is None else frozenset(paths), frozenset(own)
+        found = self.chosen.get(key)
+        if found is None:
+            wanted = None if paths is None else list(map(_names, paths))
+            found = [
+                number
+                for number, leaf in enumerate(self.leaves)
+                if (leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted))
+            ]
+            # A summary tells whether the array is there.
+            known = {self.leaves[number].array for number in found}
+            for array, number in self.summaries.items():
+                if array not in known and any(p[: len(array)] == array for p in wanted or ()):
+                    found.append(number)
+            found.sort()
+            if len(self.chosen) >= _TYPES:
+                self.chosen.clear()
+            self.chosen[key] = found
+        return found
+
+    def _is_wanted(self, leaf: _Leaf, wanted: Sequence[tuple[str, ...]] | None) -> bool:
+        if wanted is None or any(leaf.names[: len(path)] == path for path in wanted):
+            return True
+        # A summary is worked out from the array where that is there.
+        return any(
+            leaf.names[: len(path) - 1] == path[:-1] and path[:-1] in self.summaries
+            for path in wanted
+            if leaf.array is None and path[-1] in SUMMARY_FIELDS
+        )
+
+    def sections(self) -> Iterator[tuple[int, Section]]:
+        """The recordings in it, each with its first row."""
+        before = 0
+        for section in self.about.recordings:
+            yield before, section
+            before += section.rows
+
+    def parts(self, begin: int, rows: int) -> Iterator[TablePart]:
+        """Row groups with some rows of one topic."""
+        before = 0
+        for group, (count, *keys) in enumerate(self.about.bounds):
+            low, high = max(begin, before), min(begin + rows, before + count)
+            if low < high:
+                is_known = any(keys)
+                first = (keys[0], keys[1]) if is_known else _FIRST
+                last = (keys[2], keys[3]) if is_known else _LAST
+                yield TablePart(self, group, low - before, high - low, first, last)
+            before += count
+
+    def all_parts(self) -> list[TablePart]:
+        """All rows, as if they were of one topic."""
+        return [
+            TablePart(self, group, 0, bound[0], _FIRST, _LAST)
+            for group, bound in enumerate(self.about.bounds)
+        ]
 
 
 class TopicTable:
@@ -153,6 +245,7 @@ class TopicTable:
     Args:
         topic: Full name.
         parts: Its rows.
+        counts: Numbers of its rows.
         cache: Cache of decoded columns.
 
     Attributes:
@@ -163,16 +256,20 @@ class TopicTable:
         files: The files with its rows.
     """
 
-    def __init__(self, topic: str, parts: Sequence[TablePart], cache: _Cache) -> None:
+    def __init__(
+        self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, cache: _Cache
+    ) -> None:
         self.topic = topic
-        self.rows = sum(part.rows for part in parts)
+        self.rows, self.unreadable, self.reduced = counts
         self.files = list({part.file.number: part.file for part in parts}.values())
-        self.unreadable = sum(file.about.unreadable for file in self.files)
-        self.reduced = sum(file.about.reduced for file in self.files)
         self._cache = cache
-        self._runs = list(_runs(parts))
-        self._leaves = {file.number: cache.leaves(file) for file in self.files}
+        self._parts = parts
         self._types: dict[frozenset[str] | None, Any] = {}
+        self._summarised: dict[tuple[str, ...], bool] = {}
+
+    @lazy
+    def _runs(self) -> list[list[TablePart]]:
+        return list(_runs(self._parts))
 
     def fields(self, paths: Collection[str] | None = None) -> Any:
         """Type of `TableRows.records`.
@@ -188,15 +285,24 @@ class TopicTable:
     @property
     def has_fields(self) -> bool:
         """True if the messages have any field."""
-        return any(not leaf.is_own for leaves in self._leaves.values() for leaf in leaves)
+        return any(not leaf.is_own for file in self.files for leaf in file.leaves)
 
     def has(self, path: str) -> bool:
         """True if every file has the field: an array is a summary in some, a list in others."""
         names = _names(path)
         return all(
-            any(not leaf.is_own and leaf.names[: len(names)] == names for leaf in leaves)
-            for leaves in self._leaves.values()
+            any(
+                not leaf.is_own
+                and leaf.names[: len(names)] == names
+                and (leaf.array is None or len(names) <= len(leaf.array) or self._is_summary(names))
+                for leaf in file.leaves
+            )
+            for file in self.files
         )
+
+    def _is_summary(self, names: tuple[str, ...]) -> bool:
+        """True for a part of a summary of an array that is over the limit in some row."""
+        return self._is_summarised(names[:-1])
 
     def size(self, paths: Collection[str] | None = None, own: Collection[str] = ()) -> int:
         """Stored bytes to read for some fields.
@@ -206,11 +312,7 @@ class TopicTable:
             own: Columns of the table itself.
         """
         own = {"t", "seq", *own}
-        return sum(
-            part.file.size(part.group, self._chosen(part.file, paths, own))
-            for run in self._runs
-            for part in run
-        )
+        return sum(part.file.size(part.group, part.file.choose(paths, own)) for part in self._parts)
 
     def scan(
         self,
@@ -289,30 +391,44 @@ class TopicTable:
             StoreError: the data read is damaged.
         """
         check_wanted()
-        leaves = self._leaves[part.file.number]
+        leaves = part.file.leaves
         by_top: dict[str, list[int]] = {}
-        for number in self._chosen(part.file, paths, own):
+        for number in part.file.choose(paths, own):
             by_top.setdefault(leaves[number].top, []).append(number)
-        columns = {
-            top: self._cache.get(part.file, part.group, top, tuple(numbers)).slice(
-                part.begin, part.rows
-            )
-            for top, numbers in by_top.items()
-        }
+        columns = {top: self._column(part, top, numbers) for top, numbers in by_top.items()}
         ours = {name: columns.pop(name) for name in own if name in columns}
         named = [part.file.schema.field(top) for top in columns]
-        return ours, _records(list(columns.values()), named, part.rows)
+        return ours, self._records(list(columns.values()), named, part.rows)
 
-    def _chosen(
-        self, file: ParquetFileReader, paths: Collection[str] | None, own: Collection[str]
-    ) -> list[int]:
-        """Numbers of the columns for these fields."""
-        wanted = None if paths is None else list(map(_names, paths))
-        return [
-            number
-            for number, leaf in enumerate(self._leaves[file.number])
-            if (leaf.top in own if leaf.is_own else _is_wanted(leaf.names, wanted))
-        ]
+    def _column(self, part: TablePart, top: str, leaves: Sequence[int]) -> Any:
+        column = self._cache.get(part.file, part.group, top, tuple(leaves))
+        return column.slice(part.begin, part.rows)
+
+    def _records(self, columns: list[Any], named: Sequence[Any], rows: int) -> Any:
+        """Columns as fields of messages, under their own names."""
+        if not columns:
+            return structs({}, rows)
+        pairs = zip(named, columns, strict=True)
+        fields = [field.with_type(column.type) for field, column in pairs]
+        array = pa.StructArray.from_arrays(columns, fields=fields)
+        return records_of(array, self._is_summarised)
+
+    def _is_summarised(self, array: tuple[str, ...]) -> bool:
+        """True if an array is over the limit in some row."""
+        if array not in self._summarised:
+            self._summarised[array] = any(self._has_summary(part, array) for part in self._parts)
+        return self._summarised[array]
+
+    def _has_summary(self, part: TablePart, array: tuple[str, ...]) -> bool:
+        leaf = part.file.summaries.get(array)
+        if leaf is None:
+            return False
+        nulls = part.file.nulls(part.group, leaf)
+        if nulls is not None and nulls == part.file.values(part.group, leaf):
+            return False
+        top = part.file.leaves[leaf].top
+        column = self._column(part, top, [leaf])
+        return _has_values(column)
 
     def empty(self, paths: Collection[str] | None) -> Any:
         """An empty array with the common type of the rows of all files.
@@ -330,13 +446,13 @@ class TopicTable:
     def _find_type(self, paths: Collection[str] | None) -> Any:
         found = []
         for file in self.files:
-            leaves = self._leaves[file.number]
-            chosen = {leaves[number] for number in self._chosen(file, paths, ())}
-            tops = list(dict.fromkeys(leaf.top for leaf in leaves if leaf in chosen))
+            leaves = [file.leaves[number] for number in file.choose(paths, ())]
+            chosen = {(leaf.top, leaf.names) for leaf in leaves}
+            tops = list(dict.fromkeys(leaf.top for leaf in leaves))
             fields = [_only(file.schema.field(top), chosen, (), top) for top in tops]
             kept = [field for field in fields if field is not None]
             columns = [pa.nulls(0, field.type) for field in kept]
-            found.append(_records(columns, kept, 0))
+            found.append(self._records(columns, kept, 0))
         first = alike(found, by_type=True)[0]
         return first.slice(0, 0)
 
@@ -347,17 +463,18 @@ class _Cache:
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes = most_bytes
         self._columns: OrderedDict[tuple[int, int, str, tuple[int, ...]], Any] = OrderedDict()
-        self._leaves: dict[int, list[_Leaf]] = {}
+        self._open: OrderedDict[int, ColumnFile] = OrderedDict()
         self._size = 0
         self._lock = threading.Lock()
 
-    def get(self, file: ParquetFileReader, group: int, top: str, leaves: tuple[int, ...]) -> Any:
+    def get(self, file: ColumnFile, group: int, top: str, leaves: tuple[int, ...]) -> Any:
         """A column of a row group, or the requested parts of it."""
         key = file.number, group, top, leaves
         with self._lock:
             if key in self._columns:
                 self._columns.move_to_end(key)
                 return self._columns[key]
+        self.opened(file)
         column = file.read(group, leaves).column(0).combine_chunks()
         if isinstance(column, pa.ChunkedArray):
             column = pa.concat_arrays(column.chunks)
@@ -369,30 +486,99 @@ class _Cache:
                     self._size -= self._columns.popitem(last=False)[1].nbytes
         return column
 
-    def leaves(self, file: ParquetFileReader) -> list[_Leaf]:
-        """The columns of a file; the tables of several topics may be in one."""
+    def opened(self, file: ColumnFile) -> None:
+        """Close files that were not read lately, if too many are open."""
         with self._lock:
-            found = self._leaves.get(file.number)
-        if found is None:
-            found = list(_leaves(file.schema))
-            with self._lock:
-                if len(self._leaves) >= _OPEN_FILES:
-                    self._leaves.clear()
-                self._leaves[file.number] = found
-        return found
+            self._open[file.number] = file
+            self._open.move_to_end(file.number)
+            while len(self._open) > files.most_open(_OPEN_FILES):
+                self._open.popitem(last=False)[1].release()
 
     def clear(self) -> None:
         with self._lock:
             self._columns.clear()
-            self._leaves.clear()
+            self._open.clear()
             self._size = 0
 
 
-class _SmallFile(NamedTuple):
-    """A file of several topics, and the first row of each."""
+class _Rows(NamedTuple):
+    """The rows of a recording in a file.
 
-    file: ParquetFileReader
-    first_rows: dict[str, int]
+    Attributes:
+        file: The file.
+        begin: Its first row.
+        section: Digests and topics.
+    """
+
+    file: ColumnFile
+    begin: int
+    section: Section
+
+    def of(self, topic: str) -> Iterator[TablePart]:
+        """The rows of a topic."""
+        before = self.begin
+        for name, counts in self.section.topics.items():
+            if name == topic:
+                yield from self.file.parts(before, counts.rows)
+            before += counts.rows
+
+
+class _Folder:
+    """The files of a folder.
+
+    Args:
+        path: The folder.
+        depth: Parts of its path that lie inside the store.
+        cache: Knows the open files.
+    """
+
+    def __init__(self, path: Path, depth: int, cache: _Cache) -> None:
+        self._path = path
+        self._depth = depth
+        self._cache = cache
+        self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
+        self._rows: dict[str, list[_Rows]] = {}
+        self.damaged: list[str] = []
+
+    def rows(self, recording: str) -> list[_Rows]:
+        """The rows of a recording."""
+        return self._rows.get(recording, [])
+
+    def look(self, recording: str | None) -> None:
+        """Open files that are new or were replaced.
+
+        Args:
+            recording: Files of long topics of other recordings are not opened; None for all.
+        """
+        try:
+            names = files.names(self._path, depth=self._depth)
+            found = {name: about for name, about in names.items() if name.endswith(SUFFIX)}
+        except FileNotFoundError:
+            found = {}
+        except OSError as error:
+            raise unreadable(error, self._path) from error
+        before, self._files, self.damaged = self._files, {}, []
+        for name, status in sorted(found.items()):
+            same = status.st_ino, status.st_size, status.st_mtime_ns
+            known = before.get(name)
+            if known is not None and known[0] == same:
+                self._files[name] = known
+            elif recording is None or name.startswith((SHARED, f"{recording}-")):
+                self._files[name] = same, self._opened(name)
+            if name in self._files and self._files[name][1] is None:
+                self.damaged.append(str(self._path / name))
+        self._rows = defaultdict(list)
+        for file in (file for _, file in self._files.values() if file is not None):
+            for begin, section in file.sections():
+                self._rows[section.id].append(_Rows(file, begin, section))
+
+    def _opened(self, name: str) -> ColumnFile | None:
+        try:
+            file = ColumnFile(self._path / name, depth=self._depth + 1)
+        except (FileNotFoundError, StoreError):
+            return None
+        self._cache.opened(file)
+        return file
 
 
 class Tables:
@@ -407,19 +593,20 @@ class Tables:
         self._root = root
         self._cache = _Cache(most_bytes)
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
-        self._small: OrderedDict[Path, _SmallFile] = OrderedDict()
+        self._folders: dict[str, _Folder] = {}
+        self._by_type: dict[str, list[_Folder]] = {}
+        self._sealed: OrderedDict[str, dict[str, _Folder]] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
-        # Files of running recordings, by name: each question finds the same ones and a few more.
-        self._sealed: OrderedDict[tuple[str, str], dict[str, list[TablePart]]] = OrderedDict()
         self._generation = 0
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def invalidate(self) -> None:
         """Forget all files, columns and invalid tables."""
         with self._lock:
             self._generation += 1
             self._found.clear()
-            self._small.clear()
+            self._folders.clear()
+            self._by_type.clear()
             self._sealed.clear()
             self._channels = None
         self._cache.clear()
@@ -435,7 +622,6 @@ class Tables:
         with self._lock:
             generation = self._generation
             if key in self._found:
-                self._found.move_to_end(key)
                 return self._found[key]
         found = None
         with suppress(FileNotFoundError, StoreError):
@@ -443,11 +629,13 @@ class Tables:
         self._remember(key, found, generation)
         return found
 
-    def forget(self, recording: RecordingEntry, topic: str) -> None:
-        """Look for the table again at the next request."""
+    def forget(self, recording: RecordingEntry, topics: Collection[str]) -> None:
+        """Look for tables of a recording again."""
         with self._lock:
-            self._found.pop((recording.id, topic), None)
-            self._small.clear()
+            for topic in topics:
+                self._found.pop((recording.id, topic), None)
+            types = {channel.type for channel in recording.channels if channel.topic in topics}
+            self._look(types, recording.id)
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """Ignore the table from now on, because it was found to be damaged."""
@@ -457,8 +645,16 @@ class Tables:
         with self._lock:
             if generation == self._generation:
                 self._found[key] = found
-                while len(self._found) > files.most_open(_OPEN_FILES):
+                while len(self._found) > _MAX_FOUND:
                     self._found.popitem(last=False)
+
+    def whole(self, file: ColumnFile) -> TopicTable:
+        """All rows of a file, as if they were of one topic."""
+        counts = TopicCounts(0)
+        for section in file.about.recordings:
+            for own in section.topics.values():
+                counts = counts.plus(own)
+        return TopicTable("", file.all_parts(), counts, self._cache)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording.
@@ -467,35 +663,52 @@ class Tables:
             FileNotFoundError: no table exists.
             StoreError: the table is damaged, or the catalog does not confirm it.
         """
-        if recording.status == "open":
-            raise FileNotFoundError
         channels = self._channels_of(recording, topic)
-        schemas = {
-            table_schema(c.message_encoding, c.schema, c.metadata): c.type
-            for c in channels
-            if c.stats.messages
-        }
-        if len(schemas) != 1:
+        if recording.status == "open" or not has_one_definition(channels):
             raise FileNotFoundError
-        ((schema, type_name),) = schemas.items()
-        folder = recording_folder(self._root, recording.id)
-        parts = list(self._own_parts(folder / topic_folder(topic)))
-        if not parts:
-            parts = list(self._small_parts(folder / SMALL / small_file(type_name, schema), topic))
-        if not parts:
+        with self._lock:
+            types = {channel.type for channel in channels}
+            rows = [rows for folder in self._of_types(types) for rows in folder.rows(recording.id)]
+            if not any(topic in one.section.topics for one in rows):
+                folders = self._look(types, recording.id)
+                rows = [rows for folder in folders for rows in folder.rows(recording.id)]
+            damaged = [path for folder in self._of_types(types) for path in folder.damaged]
+        table = self._table(recording, topic, rows)
+        if table is None:
+            if damaged:
+                raise StoreError(f"The table {damaged[0]} is damaged.")
             raise FileNotFoundError
-        table = TopicTable(topic, parts, self._cache)
-        for file in table.files:
-            _confirm(file, recording, topic, schema)
         messages = sum(channel.stats.messages for channel in channels)
         if table.rows != messages:
             raise StoreError(
                 f"The tables of {topic} have {table.rows} messages, the segments {messages}."
             )
-        try:
-            table.fields()
-        except UnfitError as error:
-            raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
+        return table
+
+    def _table(
+        self, recording: RecordingEntry, topic: str, found: Sequence[_Rows]
+    ) -> TopicTable | None:
+        """The table of a topic from some files; None without rows of it.
+
+        Raises:
+            StoreError: the catalog does not confirm it.
+        """
+        own = [rows for rows in found if topic in rows.section.topics]
+        if not own:
+            return None
+        counts = TopicCounts(0)
+        parts: list[TablePart] = []
+        for rows in own:
+            if not rows.section.segments.items() <= recording.digests.items():
+                raise StoreError(f"Segments of the table {rows.file.path} are missing.")
+            counts = counts.plus(rows.section.topics[topic])
+            parts += rows.of(topic)
+        table = TopicTable(topic, parts, counts, self._cache)
+        if len(table.files) > 1:
+            try:
+                table.fields()
+            except UnfitError as error:
+                raise StoreError(f"The tables of {topic} have no common type: {error}.") from error
         return table
 
     def of_sealed(
@@ -511,31 +724,28 @@ class Tables:
         Returns:
             The table, and the segments of which it has all rows; None without a valid one.
         """
-        schemas = {
-            table_schema(c.message_encoding, c.schema, c.metadata)
-            for c in self._channels_of(recording, topic)
-        }
-        if len(schemas) != 1:
-            return None
-        folder = recording_folder(self._root, recording.id)
-        key = recording.id, topic
-        with self._lock:
-            known = self._sealed.pop(key, {})
-        try:
-            found = list(self._own_parts(folder / topic_folder(topic), known))
-            for part in found:
-                _confirm(part.file, recording, topic, *schemas)
-        except (FileNotFoundError, StoreError):
+        channels = self._channels_of(recording, topic)
+        if not has_one_definition(channels):
             return None
         with self._lock:
-            self._sealed[key] = known
-            while sum(map(len, self._sealed.values())) > files.most_open(_OPEN_FILES):
+            known = self._sealed.setdefault(recording.id, {})
+            place = parts_folder(self._root, recording.id)
+            prefixes = tuple(type_prefix(channel.type) for channel in channels)
+            folders = _matching(place, IN_PARTS - 2, prefixes, known, self._cache)
+            for folder in folders:
+                folder.look(None)
+            rows = [rows for folder in folders for rows in folder.rows(recording.id)]
+            while len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)
-        segments = frozenset(int(number) for part in found for number in part.file.about.segments)
-        rows = sum(part.rows for part in found)
-        if not found or rows != sum(messages.get(number, 0) for number in segments):
+        try:
+            table = self._table(recording, topic, rows)
+        except StoreError:
+            return None
+        own = [one.section for one in rows if topic in one.section.topics]
+        segments = frozenset(int(number) for section in own for number in section.segments)
+        if table is None or table.rows != sum(messages.get(number, 0) for number in segments):
             return None  # its files are just getting their names
-        return TopicTable(topic, found, self._cache), segments
+        return table, segments
 
     def _channels_of(self, recording: RecordingEntry, topic: str) -> list[ChannelEntry]:
         """The channels of a topic; those of the recording asked about last are at hand."""
@@ -547,79 +757,55 @@ class Tables:
             found = self._channels = recording, dict(by_topic)
         return found[1].get(topic, [])
 
-    def _own_parts(
-        self, folder: Path, known: dict[str, list[TablePart]] | None = None
-    ) -> Iterator[TablePart]:
-        """Row groups of the files of one topic.
+    def _of_types(self, types: Collection[str]) -> list[_Folder]:
+        """The known folders of some message types."""
+        return [folder for one in types for folder in self._by_type.get(one, ())]
 
-        Args:
-            folder: Its folder.
-            known: Row groups of files that are open already, by name; gets the others.
-        """
-        try:
-            found = files.names(folder, depth=IN_TOPIC - 1)
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            problem = f"The tables in {folder} cannot be read: {error}."
-            raise (exhausted(error.errno, f"reading {folder}") or StoreError(problem)) from error
-        for name in sorted(found):
-            if not name.endswith(SUFFIX):
-                continue
-            if known is not None and name in known:
-                yield from known[name]
-                continue
-            file = ParquetFileReader(folder / name)
-            segment = max(map(int, file.about.segments), default=0)
-            if not name.startswith(topic_file(file.about.schema, segment).removesuffix(SUFFIX)):
-                raise StoreError(f"The table {folder / name} has the name of another one.")
-            parts = [
-                TablePart(file, group, 0, rows, (keys[0], keys[1]), (keys[2], keys[3]))
-                for group, (rows, *keys) in enumerate(file.about.bounds)
-            ]
-            if known is not None:
-                known[name] = parts
-            yield from parts
-
-    def _small_parts(self, path: Path, topic: str) -> Iterator[TablePart]:
-        """Rows of a topic in a file of several topics."""
-        file, first_rows = self._small_file(path)
-        if topic not in first_rows:
-            return
-        begin = first_rows[topic]
-        end, before = begin + file.about.topics[topic], 0
-        for group, (count, *_) in enumerate(file.about.bounds):
-            low, high = max(begin, before), min(end, before + count)
-            if low < high:
-                yield TablePart(file, group, low - before, high - low, _FIRST, _LAST)
-            before += count
-
-    def _small_file(self, path: Path) -> _SmallFile:
-        with self._lock:
-            if path in self._small:
-                return self._small[path]
-        file = ParquetFileReader(path)
-        counts = file.about.topics
-        begins = accumulate(counts.values(), initial=0)
-        found = _SmallFile(file, dict(zip(counts, begins, strict=False)))
-        with self._lock:
-            self._small[path] = found
-            while len(self._small) > files.most_open(_OPEN_FILES):
-                self._small.popitem(last=False)
-        return found
+    def _look(self, types: Collection[str], recording: str) -> list[_Folder]:
+        """Look at the folders of some message types again."""
+        for one in types:
+            place, prefixes = self._root / TABLES, (type_prefix(one),)
+            found = _matching(place, IN_TABLES - 1, prefixes, self._folders, self._cache)
+            self._by_type[one] = found
+        folders = self._of_types(types)
+        for folder in folders:
+            folder.look(recording)
+        return folders
 
 
-def _confirm(file: ParquetFileReader, recording: RecordingEntry, topic: str, schema: str) -> None:
-    """Compare the description of a file with the catalog.
+def _matching(
+    place: Path, depth: int, prefixes: tuple[str, ...], known: dict[str, _Folder], cache: _Cache
+) -> list[_Folder]:
+    """Folders whose names begin in one of several ways; new ones are added to the known ones."""
+    try:
+        names = files.names(place, depth=depth)
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise unreadable(error, place) from error
+    for name in sorted(names):
+        if name.startswith(prefixes) and name not in known and S_ISDIR(names[name].st_mode):
+            known[name] = _Folder(place / name, depth + 1, cache)
+    return [folder for name, folder in known.items() if name.startswith(prefixes)]
 
-    Raises:
-        StoreError: they differ.
-    """
-    about = file.about
-    if about.recording != recording.id or topic not in about.topics or about.schema != schema:
-        raise StoreError(f"The table {file.path} belongs to other data.")
-    if not about.segments.items() <= recording.digests.items():
-        raise StoreError(f"Segments of the table {file.path} are missing.")
+
+def has_one_definition(channels: Sequence[ChannelEntry]) -> bool:
+    """True if the messages of some channels have one definition: only then do tables answer."""
+    found = {
+        table_schema(channel.message_encoding, channel.schema, channel.metadata)
+        for channel in channels
+        if channel.stats.messages
+    }
+    return len(found) == 1
+
+
+def _has_values(column: Any) -> bool:
+    """True if a value inside a column is not null."""
+    if pa.types.is_struct(column.type):
+        return any(map(_has_values, column.flatten()))
+    if is_list(column.type):
+        return _has_values(column.flatten())
+    return bool(column.null_count < len(column))
 
 
 def _runs(parts: Sequence[TablePart]) -> Iterator[list[TablePart]]:
@@ -668,26 +854,34 @@ def _in_order(parts: Sequence[TableRows]) -> TableRows:
     return rows.take(np.lexsort((seq, t)))
 
 
-def _leaves(schema: Any) -> Iterator[_Leaf]:
-    for top in schema:
-        is_own = top.name in _OWN
-        for names, _ in leaves_of(pa.schema([_renamed(top)])):
-            yield _Leaf(top.name, is_own, names)
+def _leaves(top: Any) -> Iterator[_Leaf]:
+    if top.name in _OWN:
+        for names, _ in leaves_of(pa.schema([top])):
+            yield _Leaf(top.name, True, names)
+        return
+    for names, array in _inner_leaves(top, ()):
+        yield _Leaf(top.name, False, names, array)
 
 
-def _renamed(field: Any) -> Any:
-    """A column under the name of its field, including all columns inside it."""
+def _inner_leaves(
+    field: Any, above: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], tuple[str, ...] | None]]:
+    """Paths of the leaves of a column, and of the array whose summary it is."""
+    names = (*above, original_name(field))
     kind = field.type
-    if pa.types.is_struct(kind):
-        kind = pa.struct([_renamed(kind.field(number)) for number in range(kind.num_fields)])
-    elif pa.types.is_list(kind) or pa.types.is_large_list(kind):
-        kind = pa.list_(_renamed(kind.value_field))
-    elif pa.types.is_fixed_size_list(kind):
-        kind = pa.list_(_renamed(kind.value_field), kind.list_size)
-    return pa.field(original_name(field), kind)
+    while is_list(kind):
+        kind = kind.value_type
+    if not pa.types.is_struct(kind):
+        yield names, None
+        return
+    for number in range(kind.num_fields):
+        for inner, array in _inner_leaves(kind.field(number), names):
+            yield inner, names if has_summaries(field) else array
 
 
-def _only(field: Any, chosen: Collection[_Leaf], above: tuple[str, ...], top: str) -> Any | None:
+def _only(
+    field: Any, chosen: Collection[tuple[str, tuple[str, ...]]], above: tuple[str, ...], top: str
+) -> Any | None:
     """A column with only the chosen parts; None if no part is chosen."""
     names = (*above, original_name(field))
     kind = field.type
@@ -706,20 +900,8 @@ def _only(field: Any, chosen: Collection[_Leaf], above: tuple[str, ...], top: st
             return field.with_type(pa.list_(value, kind.list_size))
         large = pa.types.is_large_list(kind)
         return field.with_type(pa.large_list(value) if large else pa.list_(value))
-    return field if _Leaf(top, False, names) in chosen else None
-
-
-def _records(columns: list[Any], named: Sequence[Any], rows: int) -> Any:
-    """Columns as fields of messages, under their own names."""
-    if not columns:
-        return structs({}, rows)
-    fields = [field.with_type(column.type) for field, column in zip(named, columns, strict=True)]
-    return records_of(pa.StructArray.from_arrays(columns, fields=fields))
+    return field if (top, names) in chosen else None
 
 
 def _names(path: str) -> tuple[str, ...]:
     return tuple(path.replace("[]", "").split("."))
-
-
-def _is_wanted(names: tuple[str, ...], wanted: Sequence[tuple[str, ...]] | None) -> bool:
-    return wanted is None or any(names[: len(path)] == path for path in wanted)

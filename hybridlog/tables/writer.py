@@ -2,8 +2,8 @@
 
 Payloads of small messages are collected and decoded by columns, 8 MiB at a time. Rows
 remain in memory until their segment is sealed, or until there are too many. Then they
-become row groups of an unfinished file. A file gets its name once the segment is sealed and
-all of its messages are written.
+become row groups of an unfinished file of their topic. Topics with few rows wait until the
+recording has ended, and go to files that recordings share.
 
 Tables are derived. After any failure the recording continues, and a topic has no table.
 """
@@ -15,8 +15,9 @@ import logging
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,22 +27,20 @@ from hybridlog.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.tables.layout import (
-    IN_TOPIC,
-    OWN_FILE_ROWS,
-    SMALL,
+    IN_PARTS,
     SUFFIX,
-    TOPIC_COLUMN,
     About,
+    Section,
+    TopicCounts,
     parts_folder,
-    recording_folder,
-    small_file,
+    shape_folder,
     table_schema_of,
-    topic_file,
-    topic_folder,
+    type_prefix,
 )
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog_storage import files
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.messages import ORIGINAL_ENCODING
 from hybridlog_storage.messages import REDUCED as REDUCED_ENCODING
 
 if TYPE_CHECKING:
@@ -62,26 +61,32 @@ _ENOUGH = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
 _ROWS = 1 << 18  # messages collected
 _PENDING = 48 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
+LONG_ROWS = 10_000
+"""Number of rows from which a topic has files of its own."""
+LONG_BYTES = 1 << 20
+"""Bytes of rows in memory from which a topic has files of its own."""
 _RESERVE = 256 << 20  # bytes of the disk reserved for segments
 _OPEN_FILES = 128  # maximum number of unfinished files
 _log = logging.getLogger(__name__)
 
 
 class _Topic:
-    """Messages of one topic and schema.
+    """Messages of one topic and definition.
 
     Args:
+        recording: Id of the recording.
         channel: One of its channels.
-        schema: See `table_schema`.
     """
 
-    def __init__(self, channel: Channel, schema: str) -> None:
+    def __init__(self, recording: str, channel: Channel) -> None:
         from hybridlog.tables.fields import FieldShape
 
+        self.recording = recording
         self.name = channel.topic
-        self.schema = schema
         self.type = channel.schema.name if channel.schema is not None else ""
         self.shape: FieldShape = FieldShape()
+        self.kind = _defined_fields(channel, self.shape)
+        """Type of the columns of fields, as far as the definition fixes it."""
         self.is_wanted = True
         self.rows = 0
         self.pieces: list[Piece] = []
@@ -90,8 +95,8 @@ class _Topic:
         """Bytes of the rows in memory."""
         self.files: dict[int, list[_File]] = {}
         """Unfinished files of segments that are not closed yet."""
-        self.finished: Counter[int] = Counter()
-        """Number of finished files, by the segments in their names."""
+        self.finished: list[tuple[str, Path]] = []
+        """Folders and paths of finished files."""
         self.has_failed = False
 
     def add(self, piece: Piece) -> None:
@@ -112,96 +117,17 @@ class _Topic:
         self.is_wanted = False
         self.pieces.clear()
         self.size = 0
+        self.finished.clear()
         for unfinished in self.files.values():
             for file in unfinished:
                 file.discard()
         self.files.clear()
 
-
-class _File:
-    """An unfinished file of one topic, or of several topics of one type."""
-
-    def __init__(self, path: Path, has_publish_time: Mapping[int, bool]) -> None:
-        self.path = path
-        self.segments: set[int] = set()
-        self.topics: dict[str, int] = {}
-        self.bounds: list[tuple[int, int, int, int, int]] = []
-        self.unreadable = 0
-        self.reduced = 0
-        self._has_publish_time = has_publish_time
-        self._writer: ParquetFileWriter | None = None
-        self._schema: Any = None
-
-    def write(self, topic: str, pieces: list[Piece]) -> None:
-        """Write rows of a topic, in order of log time and arrival, as row groups.
+    def table(self, pieces: list[Piece], has_publish_time: Mapping[int, bool]) -> Any:
+        """Rows in order of log time and arrival.
 
         Raises:
-            OSError: the rows cannot be written.
-            UnfitError: the type of their fields differs from the file's.
-        """
-        table = self._table(topic, pieces)
-        if self._schema is not None and table.schema != self._schema:
-            table = self._fitting(table)
-        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
-        for begin, end in self._write(table):
-            first, last = ((int(time[row]), int(seq[row])) for row in (begin, end - 1))
-            self.bounds.append((end - begin, *first, *last))
-        self._count(topic, pieces)
-
-    def write_together(self, topics: Mapping[str, list[Piece]]) -> None:
-        """Write the rows of several topics, one topic after the other.
-
-        Raises:
-            OSError: the rows cannot be written.
             UnfitError: their fields have no common type.
-        """
-        import pyarrow as pa
-
-        from hybridlog.tables.fields import alike
-
-        with_fields = [p for pieces in topics.values() for p in pieces if p.fields is not None]
-        for piece, fields in zip(with_fields, alike([p.fields for p in with_fields]), strict=True):
-            piece.fields = fields
-        kind = with_fields[0].fields.type if with_fields else None
-        tables = [
-            self._table(name, pieces, kind, with_topic=True) for name, pieces in topics.items()
-        ]
-        for begin, end in self._write(pa.concat_tables(tables)):
-            self.bounds.append((end - begin, 0, 0, 0, 0))
-        for name, pieces in topics.items():
-            self._count(name, pieces)
-
-    def _count(self, topic: str, pieces: list[Piece]) -> None:
-        """Count rows of a topic that were written."""
-        self.topics[topic] = self.topics.get(topic, 0) + sum(piece.rows for piece in pieces)
-        self.segments.update(piece.segment for piece in pieces)
-        for piece in pieces:
-            self.reduced += piece.rows if piece.state == REDUCED else 0
-            self.unreadable += sum(len(rows) for rows, _ in piece.errors)
-
-    def _write(self, table: Any) -> Iterator[tuple[int, int]]:
-        """Write row groups; yields the first row of each, and the row after its end."""
-        from hybridlog.tables.parquet_file import ParquetFileWriter
-
-        if self._writer is None:
-            self._writer = ParquetFileWriter(self.path, table, depth=files.IN_RECORDING)
-            self._schema = table.schema
-        step = _rows_of_group(table)
-        for begin in range(0, table.num_rows, step):
-            end = min(begin + step, table.num_rows)
-            self._writer.write(table.slice(begin, end - begin))
-            yield begin, end
-
-    def _table(
-        self, topic: str, pieces: list[Piece], kind: Any = None, *, with_topic: bool = False
-    ) -> Any:
-        """Rows of a topic in order.
-
-        Args:
-            topic: The topic.
-            pieces: Its rows.
-            kind: Type of their fields; None for their common type.
-            with_topic: True to make the topic a column.
         """
         import pyarrow as pa
 
@@ -213,19 +139,19 @@ class _File:
             [piece.rows for piece in pieces],
         )
         with_fields = [piece.fields for piece in pieces if piece.fields is not None]
+        kind = self.kind if self.kind is not None or not with_fields else with_fields[0].type
         fields = None
-        if kind is None and with_fields:
-            kind = with_fields[0].type
         if kind is not None:
-            fields = joined(
-                [
-                    pa.nulls(piece.rows, kind) if piece.fields is None else piece.fields
-                    for piece in pieces
-                ]
-            )
-        columns = own_columns(pieces, messages, segment, fields, self._has_publish_time)
-        if with_topic:
-            columns[TOPIC_COLUMN] = pa.repeat(pa.scalar(topic), len(segment))
+            found = [
+                pa.nulls(piece.rows, kind) if piece.fields is None else piece.fields
+                for piece in pieces
+            ]
+            fields = joined([pa.nulls(0, kind), *found])
+        columns = {
+            name: pa.repeat(pa.scalar(value), len(segment))
+            for name, value in (("recording", self.recording), ("topic", self.name))
+        }
+        columns |= own_columns(pieces, messages, segment, fields, has_publish_time)
         known = list(map(pa.field, columns, [column.type for column in columns.values()]))
         arrays = list(columns.values())
         if fields is not None:
@@ -235,22 +161,90 @@ class _File:
         order = _order(messages.log_time, messages.seq)
         return table if order is None else table.take(pa.array(order))
 
+
+def _defined_fields(channel: Channel, shape: FieldShape) -> Any:
+    """Type of the columns of the fields that a definition fixes; None without any."""
+    encoding = channel.message_encoding
+    if encoding == REDUCED_ENCODING:
+        encoding = channel.metadata.get(ORIGINAL_ENCODING, "")
+    codec = codec_for(replace(channel, message_encoding=encoding))
+    if not codec.indexed:
+        return None
+    none = np.empty(0, np.int64)
+    kind = shape.columns(codec.arrow(b"", none, none, None).records).type
+    return kind if kind.num_fields else None
+
+
+def _counts(pieces: Sequence[Piece]) -> TopicCounts:
+    return TopicCounts(
+        sum(piece.rows for piece in pieces),
+        sum(len(rows) for piece in pieces for rows, _ in piece.errors),
+        sum(piece.rows for piece in pieces if piece.state == REDUCED),
+    )
+
+
+class _File:
+    """An unfinished file of one topic."""
+
+    def __init__(self, path: Path, topic: _Topic, has_publish_time: Mapping[int, bool]) -> None:
+        self.path = path
+        self.schema: Any = None
+        self._topic = topic
+        self._segments: set[int] = set()
+        self._counts = TopicCounts(0)
+        self._bounds: list[tuple[int, int, int, int, int]] = []
+        self._has_publish_time = has_publish_time
+        self._writer: ParquetFileWriter | None = None
+
+    def write(self, pieces: list[Piece], *, is_all: bool) -> None:
+        """Write rows as row groups.
+
+        Args:
+            pieces: The rows.
+            is_all: True if no more rows follow.
+
+        Raises:
+            OSError: the rows cannot be written.
+            UnfitError: the type of their fields differs from the file's.
+        """
+        from hybridlog.tables.parquet_file import ParquetFileWriter
+
+        table = self._topic.table(pieces, self._has_publish_time)
+        if self._writer is None:
+            self.schema = table.schema
+            self._writer = ParquetFileWriter(
+                self.path, table, depth=files.IN_RECORDING, is_all=is_all
+            )
+        elif table.schema != self.schema:
+            table = self._fitting(table)
+        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
+        step = _rows_of_group(table)
+        for begin in range(0, table.num_rows, step):
+            end = min(begin + step, table.num_rows)
+            self._writer.write(table.slice(begin, end - begin))
+            first, last = ((int(time[row]), int(seq[row])) for row in (begin, end - 1))
+            self._bounds.append((end - begin, *first, *last))
+        self._segments.update(piece.segment for piece in pieces)
+        self._counts = self._counts.plus(_counts(pieces))
+
     def _fitting(self, table: Any) -> Any:
         """Rows with the columns of the file."""
         import pyarrow as pa
 
         from hybridlog.tables.fields import UnfitError, joined
 
-        kind = pa.struct(list(self._schema))
+        kind = pa.struct(list(self.schema))
         fitting = joined([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
         if fitting.type != kind:
             raise UnfitError("the file has other columns")
-        return pa.Table.from_struct_array(fitting).cast(self._schema)
+        return pa.Table.from_struct_array(fitting).cast(self.schema)
 
-    def close(self, about: About) -> None:
+    def close(self, digests: Mapping[int, str]) -> None:
         """Finish the file."""
         assert self._writer is not None
-        self._writer.close(about)
+        segments = {str(number): digests[number] for number in sorted(self._segments)}
+        section = Section(self._topic.recording, 0, segments, {self._topic.name: self._counts})
+        self._writer.close(About([section], tuple(self._bounds)))
 
     def discard(self) -> None:
         """Delete the unfinished file."""
@@ -265,9 +259,7 @@ class TableWriter:
         root: The store.
         recording: Id of the recording.
         topics: The topics with tables; None for all.
-        is_new: True if the recording has no tables yet. Files of a new recording get their
-            names as soon as their segments are closed. Otherwise all files of a topic are
-            replaced at the end.
+        is_new: True if the recording has no tables yet.
     """
 
     def __init__(
@@ -302,7 +294,6 @@ class TableWriter:
         self._seen: Counter[int] = Counter()  # messages of each segment
         self._sealed: dict[int, tuple[str, int]] = {}  # digest and messages
         self._cut: dict[int, str] = {}  # digests of the closed segments
-        self._finished: dict[str, list[tuple[Path, str]]] = {}  # by folder, until the end
         self._lock = threading.Lock()  # protects the sealed segments
 
     @property
@@ -445,7 +436,8 @@ class TableWriter:
             schema = table_schema_of(channel)
             topic = self._topics.get((channel.topic, schema))
             if topic is None:
-                topic = self._topics[channel.topic, schema] = _Topic(channel, schema)
+                topic = _Topic(self._recording, channel)
+                self._topics[channel.topic, schema] = topic
                 topic.is_wanted = self._wanted is None or channel.topic in self._wanted
             is_reduced = channel.message_encoding == REDUCED_ENCODING
             found = self._of_channel[number] = topic, codec_for(channel), is_reduced
@@ -531,14 +523,14 @@ class TableWriter:
         unfinished = topic.files.setdefault(segment, [])
         if unfinished:
             try:
-                unfinished[-1].write(topic.name, pieces)
+                unfinished[-1].write(pieces, is_all=False)
             except UnfitError:
                 pass
             else:
                 return 0
-        file = _File(self._new_part(), self._has_publish_time)
+        file = _File(self._new_part(), topic, self._has_publish_time)
         unfinished.append(file)
-        file.write(topic.name, pieces)
+        file.write(pieces, is_all=segment in self._cut)
         return 1
 
     def _new_part(self) -> Path:
@@ -576,8 +568,8 @@ class TableWriter:
         self._cut[segment] = digest
         for topic in self._topics.values():
             with self._only(topic):
-                rows = sum(piece.rows for piece in topic.pieces if piece.segment in self._cut)
-                if rows >= OWN_FILE_ROWS or segment in topic.files:
+                pieces = [piece for piece in topic.pieces if piece.segment in self._cut]
+                if _are_long(pieces) or segment in topic.files:
                     self._write(topic, segment, topic.take(self._cut))
                 self._finish(topic)
 
@@ -585,57 +577,66 @@ class TableWriter:
         """Finish a topic's files of closed segments."""
         for segment in sorted(topic.files.keys() & self._cut.keys()):
             for file in topic.files.pop(segment):
-                name = topic_file(topic.schema, segment, topic.finished[segment])
-                self._end(file, topic.schema, topic.type)
-                topic.finished[segment] += 1
-                self._publish(topic_folder(topic.name), file.path, name)
-
-    def _end(self, file: _File, schema: str, type_name: str) -> None:
-        file.close(
-            About(
-                self._recording,
-                schema,
-                type_name,
-                {str(segment): self._cut[segment] for segment in sorted(file.segments)},
-                file.topics,
-                tuple(file.bounds),
-                file.unreadable,
-                file.reduced,
-            )
-        )
-
-    def _publish(self, folder: str, path: Path, name: str) -> None:
-        """Give a finished file its name now, or record the name for the end."""
-        if not self._is_new:
-            self._finished.setdefault(folder, []).append((path, name))
-            return
-        place = recording_folder(self._root, self._recording) / folder
-        files.make_folders(place, depth=IN_TOPIC - 1)
-        files.rename(path, place / name, depth=files.IN_RECORDING, new_depth=IN_TOPIC)
+                file.close(self._cut)
+                folder = shape_folder(topic.type, file.schema)
+                place = self._parts / folder / file.path.name
+                files.make_folders(place.parent, depth=IN_PARTS - 1)
+                files.rename(file.path, place, depth=files.IN_RECORDING, new_depth=IN_PARTS)
+                topic.finished.append((folder, place))
 
     def _close(self, entry: RecordingEntry) -> None:
+        from hybridlog.tables.folders import Addition, TableFolders
+
         self._decode()
         for number in sorted(self._seen.keys() - self._cut.keys()):
             digest = entry.digests.get(str(number))
             if digest is not None:
                 self._cut_segment(number, digest)
         incomplete = self._incomplete(entry)
-        for topic in self._topics.values():
+        waiting: dict[str, list[tuple[_Topic, Any, list[Piece]]]] = {}
+        additions: dict[str, Addition] = {}
+        for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
             if topic.name in incomplete:
                 topic.give_up()
-            elif topic.finished and topic.pieces:
-                with self._only(topic):
-                    pieces = topic.take(self._cut)
-                    last = max((piece.segment for piece in pieces), default=0)
-                    self._write(topic, last, pieces)
+            with self._only(topic):
+                pieces = topic.take(self._cut)
+                if _are_long(pieces):
+                    self._write(topic, max(self._cut), pieces)
                     self._finish(topic)
-        self._write_small()
-        folder = recording_folder(self._root, self._recording)
-        for name in incomplete:
-            with suppress(FileNotFoundError):
-                files.remove_tree(folder / topic_folder(name), depth=IN_TOPIC - 1)
-        for name, finished in self._finished.items():
-            self._exchange(folder / name, finished)
+                elif pieces:
+                    table = topic.table(pieces, self._has_publish_time)
+                    folder = shape_folder(topic.type, table.schema)
+                    waiting.setdefault(folder, []).append((topic, table, pieces))
+            for folder, path in topic.finished:
+                additions.setdefault(folder, Addition()).files.append(path)
+        for folder, found in waiting.items():
+            addition = additions.setdefault(folder, Addition())
+            addition.section, addition.rows = self._together(entry, found)
+        replaced: set[str] = set()
+        if not self._is_new:
+            replaced = topics_of(entry) if self._wanted is None else {*self._wanted, *incomplete}
+        if additions or replaced:
+            self._check_room()
+            types = {type_prefix(c.type) for c in entry.channels if c.topic in replaced}
+            self._has_parts = True
+            folders = TableFolders(self._root, self._recording, entry.digests)
+            folders.add(additions, replaced, types)
+
+    def _together(
+        self, entry: RecordingEntry, found: Sequence[tuple[_Topic, Any, list[Piece]]]
+    ) -> tuple[Section, Any]:
+        """Rows of topics of one shape, one topic after the other."""
+        import pyarrow as pa
+
+        counts: dict[str, TopicCounts] = {}
+        segments: set[int] = set()
+        for topic, _, pieces in found:
+            counts[topic.name] = _counts(pieces).plus(counts.get(topic.name, TopicCounts(0)))
+            segments.update(piece.segment for piece in pieces)
+        begin = min((first for _, first, _ in entry.spans), default=entry.created)
+        digests = {str(number): self._cut[number] for number in sorted(segments)}
+        section = Section(self._recording, begin, digests, counts)
+        return section, pa.concat_tables([table for _, table, _ in found])
 
     def _incomplete(self, entry: RecordingEntry) -> set[str]:
         """Topics that can have no table."""
@@ -649,42 +650,16 @@ class TableWriter:
         messages = entry.messages_by_topic()
         return failed | {name for name in rows if rows[name] != messages[name]}
 
-    def _write_small(self) -> None:
-        """Write topics with few rows, those of one type into one file."""
-        by_schema: dict[str, list[_Topic]] = {}
-        for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
-            if topic.pieces:
-                by_schema.setdefault(topic.schema, []).append(topic)
-        for schema, topics in by_schema.items():
-            self._check_room()
-            file = _File(self._new_part(), self._has_publish_time)
-            try:
-                file.write_together({topic.name: topic.take(self._cut) for topic in topics})
-            except (OSError, MemoryError):
-                raise
-            except Exception as error:
-                _log.warning("no table of %s: %s", topics[0].type, error or repr(error))
-                file.discard()
-                continue
-            self._end(file, schema, topics[0].type)
-            self._publish(SMALL, file.path, small_file(topics[0].type, schema))
 
-    def _exchange(self, place: Path, finished: list[tuple[Path, str]]) -> None:
-        """Replace existing files with finished ones."""
-        files.make_folders(place, depth=IN_TOPIC - 1)
-        target = place
-        if place.name != SMALL:
-            self._numbers += 1
-            target = self._parts / f"new-{self._numbers}"
-            files.make_folder(target, depth=files.IN_RECORDING)
-        for path, name in finished:
-            if target == place:
-                files.remove_tree(target / name, depth=IN_TOPIC)
-            files.rename(path, target / name, depth=files.IN_RECORDING, new_depth=IN_TOPIC)
-        if target != place:
-            old = self._parts / f"old-{self._numbers}"
-            files.rename(place, old, depth=IN_TOPIC - 1, new_depth=files.IN_RECORDING)
-            files.rename(target, place, depth=files.IN_RECORDING, new_depth=IN_TOPIC - 1)
+def topics_of(entry: RecordingEntry) -> set[str]:
+    """Topics of a recording that have messages."""
+    return {c.topic for c in entry.channels if c.stats.messages}
+
+
+def _are_long(pieces: Sequence[Piece]) -> bool:
+    """True if rows of a topic have a file of their own."""
+    rows, size = sum(piece.rows for piece in pieces), sum(piece.size for piece in pieces)
+    return rows >= LONG_ROWS or size >= LONG_BYTES
 
 
 def _order(log_time: NDArray[np.int64], seq: NDArray[np.int64]) -> NDArray[np.intp] | None:

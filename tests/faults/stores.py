@@ -21,7 +21,8 @@ import hybridlog as hl
 from hybridlog.losses import losses_of
 from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
-from hybridlog.tables.layout import PARTS, TABLES
+from hybridlog.tables.folders import recordings_of
+from hybridlog.tables.layout import PARTS
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.catalog import _crc as crc_of
 from hybridlog_storage.collection_names import CATALOG_PREFIX
@@ -319,9 +320,9 @@ def _files(path: Path) -> frozenset[str]:
 
 def _check_tables(store: hl.Store) -> None:
     """None is of a recording that is gone, and nothing is unfinished."""
-    ids = {f"recording=r{entry.id}" for entry in store.recordings()}
+    ids = {entry.id for entry in store.recordings()}
     path = store.directory.path
-    there = {p.name for p in (path / TABLES).glob("*")}
+    there = recordings_of(path)
     _check(there <= ids, f"there are tables of {there - ids}")
     unfinished = [str(p) for p in (path / PARTS).glob("*/**/*")]
     _check(not unfinished, f"unfinished tables are left: {unfinished}")

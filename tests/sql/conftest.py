@@ -85,6 +85,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, uri: str) -> Path:
     logs = first_log(folder / "first.mcap"), second_log(folder / "second.mcap")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, "GROUP_ROWS", 300)
+        patch.setattr(writer, "LONG_ROWS", 1000)
         with hl.open(folder / "store", create=True, mongo=uri) as opened:
             opened.record(logs[0], name="first", tags={"site": "hall"}, settings=CHUNKS)
             opened.record(logs[1], name="second", settings=CHUNKS)

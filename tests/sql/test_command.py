@@ -83,7 +83,9 @@ def test_files(root: Path, tmp_path: Path) -> None:
 
 
 def test_tables_and_notes(root: Path) -> None:
-    done = run(root, "select recording, count(*) n from large group by all", "-F", "table")
+    done = run(
+        root, "select recording, count(*) n from large group by all order by all", "-F", "table"
+    )
     assert [line.split() for line in done.stdout.splitlines()] == [
         ["recording", "n"],
         ["first", str(LARGE)],

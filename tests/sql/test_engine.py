@@ -19,6 +19,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
+from hybridlog.tables import writer
 from hybridlog.tables.parquet_file import ParquetFileReader
 from hybridlog_storage.errors import (
     MissingDependencyError,
@@ -205,11 +206,14 @@ def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def large_file(store: hl.Store) -> Path:
-    (path,) = (store.directory.path / "tables").glob("*/topic=large/*.parquet")
+    (path,) = (store.directory.path / "tables").glob(f"*/{store.entry('first').id}-*.parquet")
     return path
 
 
-def test_missing_and_damaged_tables_are_made_again(own: hl.Store) -> None:
+def test_missing_and_damaged_tables_are_made_again(
+    own: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "LONG_ROWS", 1000)
     query = "select count(*), sum(i8), sum(covariance_summary.n) from large"
     wanted = own.sql(query).rows()
     path = large_file(own)

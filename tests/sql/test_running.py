@@ -12,6 +12,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live import LiveRecording
+from hybridlog.tables import writer
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.open_segment import OpenSegment
@@ -28,8 +29,11 @@ ROWS = "select count(*), count(distinct seq), min(i8), max(i8), sum(covariance[1
 
 
 @pytest.fixture
-def reader(tmp_path: Path, server: str) -> Iterator[tuple[LiveRecording, hl.Store]]:
+def reader(
+    tmp_path: Path, server: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[LiveRecording, hl.Store]]:
     """A recording that goes on, and the store opened a second time."""
+    monkeypatch.setattr(writer, "LONG_ROWS", 1000)
     folder = tmp_path / "store"
     mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
     with hl.open(folder, create=True, mongo=mongo) as store:

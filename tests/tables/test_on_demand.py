@@ -79,8 +79,8 @@ def test_a_topic_without_a_table_is_tried_once(
     made: list[set[str]] = []
     monkeypatch.setattr(making, "make", lambda _, __, topics: made.append(topics) or True)
     shutil.rmtree(store.directory.path / "tables")
+    store.refresh()
     for _ in range(2):
-        store.refresh()
         assert store.topic("/imu").where("x > 1").count() > 0
     assert made == [{"/imu"}]
 

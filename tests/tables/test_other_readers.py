@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,45 +15,63 @@ import duckdb
 import pandas as pd
 import polars as pl
 import pyarrow.dataset as ds
+import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
+from hybridlog.tables import writer as writing
+from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
-from tests.tables.logs import BASE, SECOND, Decoded, decoded, varied, write_log
+from tests.tables.logs import (
+    BASE,
+    SECOND,
+    STATE,
+    Decoded,
+    decoded,
+    payload,
+    varied,
+    write_log,
+)
 
 Row = tuple[Any, ...]
 COLUMNS = ("t", "seq", "stamp", "i8", "u64", "f64", "name", "yes")
 
 
-def glob_of(store: hl.Store) -> str:
-    return str(store.directory.path / "tables/*/topic=large/*.parquet")
+def glob_of(store: hl.Store, type_name: str = "test_State") -> str:
+    return str(store.directory.path / f"tables/{type_name}~*/*.parquet")
 
 
-def with_duckdb(store: hl.Store) -> list[Row]:
-    query = f"select {', '.join(COLUMNS)} from read_parquet(?) order by t, seq"
-    return duckdb.connect().execute(query, [glob_of(store)]).fetchall()
+def with_duckdb(files: str, columns: tuple[str, ...], topic: str) -> list[Row]:
+    query = f"select {', '.join(columns)} from read_parquet(?) where topic = ? order by t, seq"
+    return duckdb.connect().execute(query, [files, topic]).fetchall()
 
 
-def with_polars(store: hl.Store) -> list[Row]:
-    frame = pl.scan_parquet(glob_of(store), hive_partitioning=True).select(COLUMNS)
-    return frame.sort("t", "seq").collect().rows()
+def with_polars(files: str, columns: tuple[str, ...], topic: str) -> list[Row]:
+    frame = pl.scan_parquet(files).filter(pl.col("topic") == topic)
+    return frame.sort("t", "seq").select(columns).collect().rows()
 
 
-def with_pandas(store: hl.Store) -> list[Row]:
-    (path,) = Path(store.directory.path).glob("tables/*/topic=large/*.parquet")
-    frame = pd.read_parquet(path, columns=list(COLUMNS), dtype_backend="pyarrow")
-    rows = frame.sort_values(["t", "seq"]).itertuples(index=False)
+def with_pandas(files: str, columns: tuple[str, ...], topic: str) -> list[Row]:
+    (folder,) = {path.parent for path in Path("/").glob(files[1:])}
+    frame = pd.read_parquet(
+        folder,
+        columns=[*columns, "topic"],
+        filters=[("topic", "==", topic)],
+        dtype_backend="pyarrow",
+    )
+    rows = frame.sort_values(["t", "seq"])[list(columns)].itertuples(index=False)
     return [tuple(None if value is pd.NA else value for value in row) for row in rows]
 
 
-def with_pyarrow(store: hl.Store) -> list[Row]:
-    found = ds.dataset(store.directory.path / "tables", partitioning="hive")
-    table = found.to_table(list(COLUMNS), filter=ds.field("topic") == "large")
-    columns = table.sort_by([("t", "ascending"), ("seq", "ascending")]).to_pydict()
-    return list(zip(*columns.values(), strict=True))
+def with_pyarrow(files: str, columns: tuple[str, ...], topic: str) -> list[Row]:
+    (folder,) = {path.parent for path in Path("/").glob(files[1:])}
+    table = ds.dataset(folder).to_table(list(columns), filter=ds.field("topic") == topic)
+    found = table.sort_by([("t", "ascending"), ("seq", "ascending")]).to_pydict()
+    return list(zip(*found.values(), strict=True))
 
 
 READERS = [with_duckdb, with_polars, with_pandas, with_pyarrow]
+Reader = Callable[[str, tuple[str, ...], str], list[Row]]
 
 
 def row_of(message: Decoded) -> Row:
@@ -69,10 +89,11 @@ def equal(one: Row, other: Row) -> bool:
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_rows(recorded: hl.Store, read: Callable[[hl.Store], list[Row]]) -> None:
-    want = [row_of(message) for message in decoded(recorded, "log", "/large")]
-    have = read(recorded)
-    assert len(have) == len(want) == 1200
+@pytest.mark.parametrize("topic", ["/large", "/small/two"])
+def test_rows(recorded: hl.Store, read: Reader, topic: str) -> None:
+    want = [row_of(message) for message in decoded(recorded, "log", topic)]
+    have = read(glob_of(recorded), COLUMNS, topic)
+    assert len(have) == len(want) > 0
     assert all(map(equal, have, want))
 
 
@@ -90,7 +111,8 @@ QUESTIONS: list[tuple[str, Callable[[Any], bool]]] = [
     ("Name_2 < -1000", lambda m: m.Name < -1000),
     ("header.frame_id = 'map'", lambda _: True),
     ("nine[2] > 700", lambda m: m.nine[1] > 700),
-    ("covariance.n = 36 and covariance.max = 0.25", lambda _: True),
+    ("covariance_summary.n = 36 and covariance_summary.max = 0.25", lambda _: True),
+    ("covariance is null and many_summary is null", lambda _: True),
     ("len(points) > 2", lambda m: len(m.points) > 2),
     ("points[1].X_2 = 0.5", lambda m: len(m.points) > 0),
     ("list_contains(words, 'x')", lambda m: "x" in m.words),
@@ -98,64 +120,171 @@ QUESTIONS: list[tuple[str, Callable[[Any], bool]]] = [
 ]
 
 
-@pytest.mark.parametrize(("where", "holds"), QUESTIONS)
-def test_duckdb_finds_what_there_is(
-    recorded: hl.Store, where: str, holds: Callable[[Any], bool]
-) -> None:
-    # NaN is greater than all numbers in DuckDB.
-    where = where.replace("f64 > 1.0", "f64 > 1.0 and not isnan(f64)")
-    query = f"select count(*) from read_parquet(?) where {where}"
-    (count,) = duckdb.connect().execute(query, [glob_of(recorded)]).fetchone() or (None,)
-    assert count == sum(holds(m.value) for m in decoded(recorded, "log", "/large"))
+def test_duckdb_finds_what_there_is(recorded: hl.Store) -> None:
+    (entry,) = recorded.recordings()
+    messages = decoded(recorded, "log", "/large")
+    connection = duckdb.connect()
+    for where, holds in QUESTIONS:
+        # NaN is greater than all numbers in DuckDB.
+        asked = where.replace("f64 > 1.0", "f64 > 1.0 and not isnan(f64)")
+        query = (
+            "select count(*) from read_parquet(?) "
+            f"where topic = '/large' and recording = ? and {asked}"
+        )
+        (count,) = connection.execute(query, [glob_of(recorded), entry.id]).fetchone() or (None,)
+        assert count == sum(holds(message.value) for message in messages), where
 
 
 def test_polars_finds_what_there_is(recorded: hl.Store) -> None:
-    frame = pl.scan_parquet(glob_of(recorded))
+    frame = pl.scan_parquet(glob_of(recorded)).filter(pl.col("topic") == "/large")
     found = frame.filter((pl.col("f64") > 1.0) & ~pl.col("f64").is_nan()).collect()
     want = [m for m in decoded(recorded, "log", "/large") if m.value.f64 > 1.0]
     assert found["seq"].to_list() == [m.seq for m in want]
 
 
-def test_partitions(recorded: hl.Store) -> None:
-    (entry,) = recorded.recordings()
-    everything = str(recorded.directory.path / "tables/*/topic=*/*.parquet")
-    query = "select distinct recording, topic from read_parquet(?, hive_partitioning = true)"
-    assert duckdb.connect().execute(query, [everything]).fetchall() == [(f"r{entry.id}", "large")]
-    frame = pl.scan_parquet(everything, hive_partitioning=True)
-    assert frame.select("recording").unique().collect().rows() == [(f"r{entry.id}",)]
+def test_floats_have_statistics_where_there_is_no_nan(store: hl.Store, tmp_path: Path) -> None:
+    """DuckDB 2.0 answers `b > 2.0` wrongly from those of floats with NaN."""
+    for name, make in (("a", payload), ("b", varied)):
+        said = [(BASE + n, "/a", make(n)) for n in range(60)]
+        store.record(write_log(tmp_path / f"{name}.mcap", said), name=name)
+        (path,) = (store.directory.path / "tables").glob("*/*.parquet")
+        group = pq.read_metadata(path).row_group(0)
+        columns = {c.path_in_schema: c for c in map(group.column, range(group.num_columns))}
+        assert columns["topic"].statistics.min == "/a"
+        assert columns["recording"].statistics.has_min_max
+        assert columns["i8"].statistics.has_min_max
+        found = columns["f64"].statistics
+        assert (found is not None and found.has_min_max) == (name == "a")
 
 
-def test_ids_that_look_like_numbers_are_told_apart(recorded: hl.Store, tmp_path: Path) -> None:
-    """`1e3` and `1000` would be one for readers that infer the type of a partition."""
-    (path,) = Path(recorded.directory.path).glob("tables/*/topic=large/*.parquet")
-    for recording in ("r1e3", "r1000", "r0x10"):
-        place = tmp_path / f"hive/recording={recording}/topic=large"
-        place.mkdir(parents=True)
-        (place / "a.parquet").write_bytes(path.read_bytes())
-    files = str(tmp_path / "hive/*/*/*.parquet")
-    frame = pl.scan_parquet(files, hive_partitioning=True)
-    assert frame.select("recording").unique().collect().height == 3
-    query = "select count(distinct recording) from read_parquet(?, hive_partitioning = true)"
-    assert duckdb.connect().execute(query, [files]).fetchone() == (3,)
+KINDS = {
+    "test_State": ["/large", "/small", "/changed", "/mixed"],
+    "x_Other": ["/changed"],
+    "x_Two": ["/two"],
+    "untyped": ["/json"],
+}
 
 
-def test_small_topics(recorded: hl.Store) -> None:
-    path = str(recorded.directory.path / "tables/*/small/*.parquet")
-    query = "select t, seq, u64 from read_parquet(?) where topic = '/small/two' order by t, seq"
-    want = [(m.t, m.seq, m.value.u64) for m in decoded(recorded, "log", "/small/two")]
-    assert duckdb.connect().execute(query, [path]).fetchall() == want
-    frame = pl.scan_parquet(path).filter(pl.col("topic") == "/small/two")
-    assert frame.select("t", "seq", "u64").collect().rows() == want
+@pytest.fixture
+def many(store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> hl.Store:
+    """Recordings with large and small topics, changed types, odd messages."""
+    monkeypatch.setattr(writing, "LONG_ROWS", 500)
+    other = Schema("x/Other", "ros1msg", b"float32 x\n")
+    definitions = (b"float64 a\n", b"float64 a\nint32 b\n")
+    for number in range(4):
+        large = [(BASE + n, "/large", varied(n)) for n in range(600 if number % 2 else 50)]
+        mixed = [(BASE + n, "/mixed", payload(n, many=[n] * (n % 50))) for n in range(60)]
+        bad = [(BASE + n, "/small", varied(n)[: -1 if n % 4 == 0 else None]) for n in range(40)]
+        said = large + mixed + bad
+        said += [
+            (BASE + n, "/changed", b"\0\0\0?" if number == 2 else payload(n)) for n in range(30)
+        ]
+        said += [(BASE + n, "/two", bytes([0] * [8, 12][number % 2])) for n in range(20)]
+        said += [(BASE + n, "/json", json.dumps({"n": n}).encode()) for n in range(10)]
+        schemas = {
+            "/changed": ("ros1", other if number == 2 else STATE),
+            "/two": ("ros1", Schema("x/Two", "ros1msg", definitions[number % 2])),
+            "/json": ("json", Schema("", "jsonschema", b"{}")),
+        }
+        said.sort(key=lambda one: one[0])
+        store.record(
+            write_log(tmp_path / f"{number}.mcap", said, schemas), name=str(number), again=True
+        )
+    return store
 
 
-def test_several_recordings_are_one_table(recorded: hl.Store, tmp_path: Path) -> None:
-    said = [(BASE + SECOND + n, "/large", varied(n)) for n in range(1000)]
-    recorded.record(write_log(tmp_path / "more.mcap", said), name="more")
-    query = "select count(*) from read_parquet(?) where i8 = 1"
-    messages = [m for name in ("log", "more") for m in decoded(recorded, name, "/large")]
-    want = sum(m.value.i8 == 1 for m in messages)
-    assert duckdb.connect().execute(query, [glob_of(recorded)]).fetchone() == (want,)
-    assert ds.dataset(recorded.directory.path / "tables").count_rows() == 2800
+def counts_of(store: hl.Store) -> dict[tuple[str, str], int]:
+    """What hybridlog counts, by recording and topic."""
+    return {
+        (entry.id, topic): store.query([topic], [entry.id]).count()
+        for entry in store.recordings()
+        for topic in {channel.topic for channel in entry.channels}
+    }
+
+
+def folders_of(store: hl.Store) -> list[Path]:
+    return sorted((store.directory.path / "tables").glob("*~*"))
+
+
+def count_duckdb(folder: Path) -> list[Row]:
+    query = "select recording, topic, count(*) from read_parquet(?) group by all"
+    return duckdb.connect().execute(query, [str(folder / "*.parquet")]).fetchall()
+
+
+def count_polars(folder: Path) -> list[Row]:
+    frame = pl.scan_parquet(folder / "*.parquet")
+    return frame.group_by("recording", "topic").agg(pl.len()).collect().rows()
+
+
+def count_pandas(folder: Path) -> list[Row]:
+    frame = pd.read_parquet(folder, columns=["recording", "topic"])
+    return [(*key, int(n)) for key, n in frame.value_counts().items()]  # type: ignore[misc]
+
+
+def count_pyarrow(folder: Path) -> list[Row]:
+    table = ds.dataset(folder).to_table(["recording", "topic"])
+    found = table.group_by(["recording", "topic"]).aggregate([([], "count_all")]).to_pydict()
+    return list(zip(*(found[name] for name in ("recording", "topic", "count_all")), strict=True))
+
+
+COUNTERS = [count_duckdb, count_polars, count_pandas, count_pyarrow]
+
+
+@pytest.mark.parametrize("count", COUNTERS)
+def test_readers_count_as_hybridlog_does(
+    many: hl.Store, count: Callable[[Path], list[Row]]
+) -> None:
+    found: Counter[tuple[str, str]] = Counter()
+    for folder in folders_of(many):
+        for recording, topic, rows in count(folder):
+            found[recording, topic] += rows
+    assert found == counts_of(many)
+    assert {folder.name.split("~")[0] for folder in folders_of(many)} == KINDS.keys()
+
+
+def test_each_folder_has_one_schema(many: hl.Store) -> None:
+    folders = folders_of(many)
+    assert len(folders) == 5  # a type with two definitions has two
+    for folder in folders:
+        schemas = {str(pq.read_schema(path)) for path in folder.iterdir()}
+        assert len(schemas) == 1
+    assert any(len(list(folder.iterdir())) > 2 for folder in folders)
+
+
+def test_states_and_arrays(many: hl.Store) -> None:
+    query = "select state, count(*), count(i8), count(error) from read_parquet(?) group by 1"
+    found = {row[0]: row[1:] for row in duckdb.execute(query, [glob_of(many)]).fetchall()}
+    assert found["unreadable"] == (40, 0, 40)
+    assert found["whole"][0] == found["whole"][1]
+    query = (
+        "select count(*), count(many), count(many_summary), "
+        "count(*) filter (coalesce(len(many), many_summary.n) > 20) "
+        "from read_parquet(?) where topic = '/mixed'"
+    )
+    whole = sum(n % 50 <= 32 for n in range(60)) * 4
+    more = sum(n % 50 > 20 for n in range(60)) * 4
+    found_arrays = duckdb.execute(query, [glob_of(many)]).fetchone()
+    assert found_arrays == (240, whole, 240 - whole, more)
+
+
+def test_reduced_messages_have_null_fields(store: hl.Store) -> None:
+    from hybridlog.schema.codecs import codec_for
+    from hybridlog.schema.reduced_codec import reduce, reduced_channel
+
+    own = Channel("/a", "ros1", STATE)
+    with store.start("live") as recording:
+        recording.write(own, varied(1), log_time=BASE)
+        small = reduce(codec_for(own), varied(2))
+        recording.write(reduced_channel(own), small, log_time=BASE + 1)
+    query = "select state, i8 is null from read_parquet(?) order by t"
+    rows = duckdb.execute(query, [glob_of(store)]).fetchall()
+    assert rows == [("whole", False), ("reduced", True)]
+
+
+def test_compacted_and_dropped_recordings_stay(many: hl.Store) -> None:
+    before = {folder.name: sorted(count_duckdb(folder)) for folder in folders_of(many)}
+    many.compact(drop_mcap=True)
+    assert {folder.name: sorted(count_duckdb(folder)) for folder in folders_of(many)} == before
 
 
 @needs_data
@@ -175,14 +304,16 @@ def test_real_logs(store: hl.Store, log: str, topic: str, path: str) -> None:
         for name in path.split("."):
             value = getattr(value, name)
         want.append((message.t, value))
-    files = str(store.directory.path / f"tables/*/topic={topic[1:].replace('/', '__')}/*.parquet")
-    query = f"select t, {path} from read_parquet(?) order by t, seq"
-    assert duckdb.connect().execute(query, [files]).fetchall() == want
+    (entry,) = store.recordings()
+    (type_name,) = {channel.type for channel in entry.channels if channel.topic == topic}
+    files = glob_of(store, type_name.replace("/", "_"))
+    query = f"select t, {path} from read_parquet(?) where topic = ? order by t, seq"
+    assert duckdb.connect().execute(query, [files, topic]).fetchall() == want
     column = pl.col(path.split(".", maxsplit=1)[0])
     for name in path.split(".")[1:]:
         column = column.struct.field(name)
-    frame = pl.scan_parquet(files).sort("t", "seq").select("t", column.alias("value"))
-    assert frame.collect().rows() == want
+    frame = pl.scan_parquet(files).filter(pl.col("topic") == topic).sort("t", "seq")
+    assert frame.select("t", column.alias("value")).collect().rows() == want
 
 
 def test_no_reader_needs_hybridlog(recorded: hl.Store) -> None:
@@ -192,8 +323,57 @@ def test_no_reader_needs_hybridlog(recorded: hl.Store) -> None:
         "assert not any(name.startswith('hybridlog') for name in sys.modules)\n"
         "print(table.num_rows)\n"
     )
-    (path,) = Path(recorded.directory.path).glob("tables/*/topic=large/*.parquet")
+    (path,) = Path(recorded.directory.path).glob("tables/*/*.parquet")
     done = subprocess.run(
         [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
     )
-    assert done.stdout == "1200\n"
+    assert done.stdout == "1800\n"
+
+
+READ_ON = """
+import json, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from tests.tables.test_other_readers import COUNTERS
+folder = Path(sys.argv[1])
+print("ready", flush=True)
+for number, _ in enumerate(sys.stdin):
+    rows = COUNTERS[number % 4](folder)
+    print(json.dumps(sorted(rows)), flush=True)
+"""
+
+
+def test_readings_beside_merges(store: hl.Store, tmp_path: Path) -> None:
+    """300 readings while recordings come and go: each has all rows of each recording, or none."""
+    said = [(BASE + n, "/a", varied(n)) for n in range(40)]
+    log = write_log(tmp_path / "log.mcap", said)
+    store.record(log, name="first")
+    (folder,) = folders_of(store)
+    root = str(Path(__file__).parents[2])
+    with subprocess.Popen(
+        [sys.executable, "-c", READ_ON, str(folder), root],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as reader:
+        assert reader.stdin is not None
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "ready\n"
+        asked = 0
+        for number in range(30):
+            reader.stdin.write("\n" * 10)  # it reads while this goes on
+            reader.stdin.flush()
+            asked += 10
+            store.record(log, name=f"more{number}", again=True)
+            if number % 3 == 2:
+                store.remove(f"more{number - 1}")
+        reader.stdin.close()
+        found = [json.loads(line) for line in reader.stdout]
+    assert len(found) == asked == 300
+    first = store.entry("first").id
+    seen = set()
+    for rows in found:
+        assert all(row[1:] == ["/a", 40] for row in rows), rows
+        assert first in {row[0] for row in rows}
+        seen.add(len(rows))
+    assert len(seen) > 3

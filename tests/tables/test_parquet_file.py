@@ -12,7 +12,14 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.tables import parquet_file
-from hybridlog.tables.layout import About, column_names, small_file, topic_file
+from hybridlog.tables.layout import (
+    About,
+    Section,
+    TopicCounts,
+    column_names,
+    shape_folder,
+    type_prefix,
+)
 from hybridlog.tables.parquet_file import ParquetFileReader, ParquetFileWriter, leaves_of
 from hybridlog_storage.errors import StoreError
 
@@ -36,14 +43,8 @@ def write(path: Path, table: pa.Table, groups: int = 2, **about: str) -> About:
     writer = ParquetFileWriter(path, table, depth=1)
     for _ in range(groups):
         writer.write(table)
-    said = About(
-        "id",
-        about.get("schema", "schema"),
-        "type",
-        {"0": "digest"},
-        {"/a": rows * groups},
-        ((rows, 0, 0, rows - 1, 1),) * groups,
-    )
+    section = Section("id", 0, {"0": about.get("digest", "d")}, {"/a": TopicCounts(rows * groups)})
+    said = About([section], ((rows, 0, 0, rows - 1, 1),) * groups)
     writer.close(said)
     return said
 
@@ -67,7 +68,7 @@ def test_a_discarded_file_is_let_go_in_silence(path: Path, table: pa.Table) -> N
 def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
     said = write(path, table)
     reader = ParquetFileReader(path)
-    assert reader.about.topics == said.topics
+    assert reader.about.recordings == said.recordings
     assert reader.groups == 2
     names = [names for names, _ in leaves_of(reader.schema)]
     assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",)]
@@ -138,7 +139,7 @@ def test_a_foreign_file_is_no_table(path: Path, table: pa.Table) -> None:
 
 def test_text_that_looks_like_a_checksum_makes_no_file(path: Path, table: pa.Table) -> None:
     with pytest.raises(StoreError, match="looks like"):
-        write(path, table, schema="hybridlog-footer:00000000")
+        write(path, table, digest="hybridlog-footer:00000000")
     assert not path.exists()
 
 
@@ -157,21 +158,31 @@ def test_no_float_has_statistics(path: Path, table: pa.Table) -> None:
     }
 
 
-def test_no_float_of_any_table_has_statistics(recorded: hl.Store) -> None:
-    seen = 0
-    for path in (recorded.directory.path / "tables").glob("*/*/*.parquet"):
-        metadata = pq.read_metadata(path)
-        for number in range(metadata.num_row_groups):
-            for leaf in range(metadata.num_columns):
-                column = metadata.row_group(number).column(leaf)
-                is_float = column.physical_type in {"FLOAT", "DOUBLE"}
-                assert not (is_float and column.is_stats_set)
-                seen += is_float
-    assert seen >= 10
+def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
+    """A reader that knows the footer of the file before may read from the new one."""
+    kept, before = None, None
+    sizes = []
+    for number in range(1, 12):
+        table = pa.table({"x": np.random.default_rng(number).random(1000 * number)})
+        in_front = kept is not None and len(kept.data) * 1.3 < kept.offset
+        writer = ParquetFileWriter(path, table, depth=1, kept=kept, in_front=in_front)
+        writer.write(table)
+        section = Section("id", 0, {}, {"/a": TopicCounts(table.num_rows)})
+        writer.close(About([section], ((table.num_rows, 0, 0, 0, 0),)))
+        assert pq.read_table(path).equals(table)
+        if before is not None:
+            metadata, old = before
+            assert pq.ParquetFile(path, metadata=metadata).read().equals(old)
+        reader = ParquetFileReader(path)
+        reader.check()
+        kept, before = reader.kept(), (pq.read_metadata(path), table)
+        sizes.append(reader.size_bytes / len(kept.data))
+        path.unlink()
+    assert max(sizes) < 3.5
 
 
 def test_encodings(recorded: hl.Store) -> None:
-    (path,) = (recorded.directory.path / "tables").glob("*/topic=large/*.parquet")
+    (path,) = (recorded.directory.path / "tables").glob("*/*.parquet")
     group = pq.read_metadata(path).row_group(0)
     found = {c.path_in_schema: c for c in map(group.column, range(group.num_columns))}
     for name in ("t", "log_time", "seq", "pub", "stamp", "header.seq", "header.stamp", "ref.off"):
@@ -207,15 +218,35 @@ def test_names_of_columns(names: list[str], columns: list[str]) -> None:
 
 
 def test_names_of_files() -> None:
-    assert topic_file("0123456789", 7) == "01234567-000007.parquet"
-    assert topic_file("0123456789", 7, 2) == "01234567-000007-2.parquet"
-    assert small_file("std_msgs/msg/String", "abcdef0123") == "std_msgs_msg_String~abcdef01.parquet"
-    assert small_file("../../x", "abcdef0123") == "______x~abcdef01.parquet"
-    assert small_file("", "abcdef0123") == "untyped~abcdef01.parquet"
+    assert type_prefix("std_msgs/msg/String") == "std_msgs_msg_String~"
+    assert type_prefix("../../x") == "______x~"
+    assert type_prefix("") == "untyped~"
+
+
+def test_a_folder_is_named_by_its_exact_schema(tmp_path: Path) -> None:
+    inner = pa.struct([("x", pa.float64()), ("y", pa.list_(pa.int8()))])
+    columns = [("a", pa.int64()), ("s", inner), ("f", pa.list_(pa.int8(), 3))]
+    name = shape_folder("T", pa.schema(columns))
+    assert name.startswith("T~")
+    assert len(name) == 10
+    others = [
+        [("b", pa.int64()), *columns[1:]],
+        [("a", pa.int32()), *columns[1:]],
+        columns[:2],
+        [*columns[:2], ("f", pa.list_(pa.int8(), 4))],
+        [*columns[:2], ("f", pa.list_(pa.int8()))],
+        [columns[0], ("s", pa.struct([("x", pa.float64()), ("y", pa.list_(pa.int16()))]))],
+        [pa.field("a", pa.int64(), metadata={b"hybridlog.name": b"A"}), *columns[1:]],
+    ]
+    names = {shape_folder("T", pa.schema(other)) for other in [columns, *others]}
+    assert len(names) == 8
+    # A file has the schema of which it is named.
+    pq.write_table(pa.schema(columns).empty_table(), tmp_path / "a.parquet")
+    assert shape_folder("T", pq.read_schema(tmp_path / "a.parquet")) == name
 
 
 @pytest.mark.parametrize(
-    "text", [b"", b"{}", b"[]", b"null", b'{"version": 2}', b'{"version": 1}', b"\xff"]
+    "text", [b"", b"{}", b"[]", b"null", b'{"version": 3}', b'{"version": 2}', b"\xff"]
 )
 def test_descriptions_that_are_none(text: bytes) -> None:
     with pytest.raises(StoreError):

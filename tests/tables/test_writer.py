@@ -15,8 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
+from hybridlog.maintenance import tables as making
 from hybridlog.tables import writer as writing
-from hybridlog.tables.layout import OWN_COLUMNS, PARTS, TABLES, recording_folder
+from hybridlog.tables.folders import TableFolders
+from hybridlog.tables.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
 from hybridlog.tables.reader import TableRows, Tables
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import files
@@ -51,6 +53,10 @@ INT32 = Schema("std_msgs/Int32", "ros1msg", b"int32 data")
 
 def tables_of(store: hl.Store) -> Path:
     return store.directory.path / TABLES
+
+
+def files_of(store: hl.Store) -> list[Path]:
+    return sorted(tables_of(store).glob("*~*/*.parquet"))
 
 
 def topics_of(entry: RecordingEntry) -> list[str]:
@@ -167,78 +173,91 @@ def test_where_a_message_lies(recorded: hl.Store) -> None:
 
 
 def test_topics_of_few_rows_share_a_file_a_type(recorded: hl.Store) -> None:
-    folder = recording_folder(recorded.directory.path, recorded.recordings()[0].id)
-    assert len(list(folder.glob("topic=large/*.parquet"))) == 1
-    (small,) = folder.glob("small/*.parquet")
-    assert small.name.startswith("test_State~")
-    topics = pq.read_table(small).column("topic").to_pylist()
-    assert topics == ["/small/one"] * 300 + ["/small/two"] * 300
-    assert {p.name for p in folder.iterdir()} == {"small", "topic=large"}
+    (path,) = files_of(recorded)
+    (entry,) = recorded.recordings()
+    assert path.parent.name.startswith("test_State~")
+    assert path.name == "shared-000000.parquet"
+    table = pq.read_table(path, columns=["recording", "topic"])
+    assert set(table.column("recording").to_pylist()) == {entry.id}
+    topics = table.column("topic").to_pylist()
+    assert topics == ["/large"] * 1200 + ["/small/one"] * 300 + ["/small/two"] * 300
     assert not (recorded.directory.path / PARTS / f"r{recorded.recordings()[0].id}").exists()
 
 
 def test_names_of_ours_and_twins_get_other_names(recorded: hl.Store) -> None:
-    (path,) = tables_of(recorded).glob("*/topic=large/*.parquet")
+    (path,) = files_of(recorded)
     schema = pq.read_schema(path)
     assert {"t", "t_", "state", "state_", "name", "Name_2"} <= set(schema.names)
     assert schema.field("t_").metadata[b"hybridlog.name"] == b"t"
     assert schema.field("Name_2").metadata[b"hybridlog.name"] == b"Name"
     inner = schema.field("points").type.value_type
-    assert [inner.field(n).name for n in range(3)] == ["x", "X_2", "data"]
+    assert [inner.field(n).name for n in range(4)] == ["x", "X_2", "data", "data_summary"]
     assert schema.field("nothing").type == pa.bool_()
     assert schema.field("u64").type == pa.uint64()
 
 
-def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store) -> None:
+def test_a_segment_has_its_tables_once_it_is_sealed(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Below the unfinished tables, until the recording has ended."""
+    monkeypatch.setattr(writing, "LONG_ROWS", 300)
     settings = SegmentSettings(chunk_size=4096, segment_size=300_000)
     # Chunks are flushed when they are full: partly filled ones make segments of few rows.
     with store.start("live", settings=settings, flush_interval_s=60) as recording:
-        folder = recording_folder(store.directory.path, recording.id)
+        parts = parts_folder(store.directory.path, recording.id)
         own = channel("/state")
         until = time.monotonic() + 120
         for n in itertools.count(1):
             recording.write(own, varied(n), log_time=BASE + n)
             if n % 500 == 0:  # the tables are made beside it
-                if len(list(folder.glob("topic=state/*.parquet"))) >= 2:
+                if len(list(parts.glob("test_State~*/*.parquet"))) >= 2:
                     break
                 assert time.monotonic() < until
                 time.sleep(0.1)
+        assert not files_of(store)
     compared = compare(store)
     assert compared == n
     (entry,) = store.recordings()
-    assert len(list(folder.glob("topic=state/*.parquet"))) == entry.segments
+    assert not parts.exists()
+    names = [path.name for path in files_of(store) if path.name.startswith(entry.id)]
+    assert entry.segments - 1 <= len(names) <= entry.segments
     assert store.verify().findings == []
 
 
-def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path) -> None:
+def test_few_rows_a_segment_wait_for_more(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A topic of one message a second has no file a segment."""
+    monkeypatch.setattr(writing, "LONG_ROWS", 1000)
     said = [(BASE + n, "/slow" if n % 20 == 0 else "/fast", varied(n)) for n in range(12_000)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 18)
     store.record(tmp_path / "log.mcap", name="log", settings=settings)
     (entry,) = store.recordings()
     assert entry.segments >= 4
-    folder = recording_folder(store.directory.path, entry.id)
-    assert len(list(folder.glob("topic=fast/*.parquet"))) == entry.segments
-    assert len(list(folder.glob("small/*.parquet"))) == 1
+    names = [path.name for path in files_of(store)]
+    assert len(names) >= 4
+    assert [name for name in names if not name.startswith(entry.id)] == ["shared-000000.parquet"]
     assert compare(store) == 12_000
 
 
-def test_a_topic_with_a_file_gets_another_for_its_last_rows(
-    store: hl.Store, tmp_path: Path
+def test_a_topic_with_files_shares_one_for_its_last_rows(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(writing, "LONG_ROWS", 1000)
     said = [(BASE + n, "/a" if n < 1100 else "/b", varied(n)) for n in range(3000)]
     said += [(BASE + 3000 + n, "/a", varied(n)) for n in range(5)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    store.record(tmp_path / "log.mcap", name="log", settings=settings)
+    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
     assert compare(store) == 3005
-    assert len(list(tables_of(store).glob("*/topic=a/*.parquet"))) >= 2
-    assert not list(tables_of(store).glob("*/small/*"))
+    table = Tables(store.directory.path).of(entry, "/a")
+    assert table is not None
+    assert len(table.files) == 2
 
 
 def test_an_array_that_becomes_long(store: hl.Store, tmp_path: Path) -> None:
-    """Whole where it is short; once it was too long, a summary in all rows."""
+    """Whole in the rows where it is short, a summary in the others."""
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
     said = [
         (BASE + n, "/a", payload(n, many=[1.0, float(n)] * (1 if n < 2500 else 20)))
@@ -247,11 +266,11 @@ def test_an_array_that_becomes_long(store: hl.Store, tmp_path: Path) -> None:
     write_log(tmp_path / "log.mcap", said)
     store.record(tmp_path / "log.mcap", name="log", settings=settings)
     assert compare(store) == 5000
-    kinds = {
-        str(pq.read_schema(path).field("many").type)[:4]
-        for path in tables_of(store).glob("*/topic=a/*.parquet")
-    }
-    assert kinds == {"list", "stru"}
+    found = pq.read_table(files_of(store), columns=["t", "many", "many_summary"]).sort_by("t")
+    assert found.column("many").to_pylist()[2499:2501] == [[1.0, 2499.0], None]
+    short, long = found.column("many_summary").to_pylist()[2499:2501]
+    assert short is None
+    assert long == {"n": 40, "min": 1.0, "max": 2500.0, "mean": 1250.5}
 
 
 @pytest.mark.parametrize("count", [40, 1200])
@@ -289,8 +308,10 @@ def test_a_topic_of_two_types_has_two_files_and_no_answer(
     with store.start("live") as recording:
         recording.write(channel("/a"), varied(1), log_time=BASE)
         recording.write(channel("/a", INT32), b"\1\0\0\0", log_time=BASE + 1)
-    folder = recording_folder(store.directory.path, recording.id)
-    assert len(list(folder.glob("small/*.parquet"))) == 2
+    assert {path.parent.name.split("~")[0] for path in files_of(store)} == {
+        "test_State",
+        "std_msgs_Int32",
+    }
     (entry,) = store.recordings()
     assert Tables(store.directory.path).of(entry, "/a") is None
 
@@ -340,7 +361,7 @@ def test_chunks_that_come_late_are_put_in_their_place(
     entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
     assert entry.segments > 1
     chunks = chunks_of(store, entry)
-    files.remove_tree(recording_folder(store.directory.path, entry.id), depth=2)
+    making.remove(store.directory, entry.id)
     writer = TableWriter(store.directory.path, entry.id)
     late = chunks[3::5]
     counts = Counter(number for c, _ in chunks for number in [c.segment] * len(c.batch))
@@ -387,7 +408,7 @@ def test_whatever_fails_the_recording_goes_on(
     if place == "add":
         monkeypatch.setattr(TableWriter, "_collect", fail)
     elif place == "publish":
-        monkeypatch.setattr(TableWriter, "_publish", fail)
+        monkeypatch.setattr(TableFolders, "_change", fail)
     else:
         from hybridlog.tables.parquet_file import ParquetFileWriter
 
@@ -397,7 +418,6 @@ def test_whatever_fails_the_recording_goes_on(
     assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
     monkeypatch.undo()
     assert not list(store.directory.path.glob("**/*.parquet"))
-    assert not list((store.directory.path / TABLES).glob("*/*/*"))
     assert store.topic("/large").count() == 1470
     assert store.verify().findings == []
 

@@ -73,7 +73,11 @@ class TablesEngine:
         if table is None:
             return None
         own = ("ref",) if need is Need.SELECTION else ()
-        wanted = _wanted(table, part, fields if need is Need.VALUES else ())
+        try:
+            wanted = _wanted(table, part, fields if need is Need.VALUES else ())
+        except StoreError:
+            self._session.reject_table(part.recording, part.topic)
+            return None
         return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
 
     def _believed(

@@ -1,0 +1,378 @@
+"""Changes of the folders of finished tables.
+
+All changes are made under a lock on the folder `tables`. A shared file is replaced by one
+rename, so readers find the old rows or the new ones.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+
+from hybridlog.tables.layout import (
+    IN_TABLES,
+    IN_TYPE,
+    SHARED,
+    SUFFIX,
+    TABLES,
+    About,
+    Section,
+    parts_folder,
+)
+from hybridlog.tables.parquet_file import (
+    KeptBytes,
+    NoRoomError,
+    ParquetFileReader,
+    ParquetFileWriter,
+)
+from hybridlog_storage import files
+from hybridlog_storage.errors import StoreError
+
+MAX_SHARED_ROWS: Final = 50_000
+"""Maximum number of rows of several recordings in one file."""
+MAX_SHARED_BYTES: Final = 4 << 20
+"""Size from which a shared file gets no more recordings."""
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Addition:
+    """Rows of one recording for a folder.
+
+    Attributes:
+        rows: Rows for a shared file, by topic, with all columns; empty for none.
+        section: What they are; None without such rows.
+        files: Finished files of long topics.
+    """
+
+    rows: Any = None
+    section: Section | None = None
+    files: list[Path] = field(default_factory=list)
+
+
+class TableFolders:
+    """Adds and removes tables of one recording, which this process has locked for writing.
+
+    Args:
+        root: The store.
+        recording: Id of the recording.
+        digests: Digests of its segments; rows of others go.
+    """
+
+    def __init__(
+        self, root: Path, recording: str, digests: Mapping[str, str] | None = None
+    ) -> None:
+        self._root = root
+        self._recording = recording
+        self._digests = digests or {}
+        self._numbers = 0
+
+    def add(
+        self,
+        additions: Mapping[str, Addition],
+        replaced: Collection[str] = (),
+        prefixes: Collection[str] = (),
+    ) -> None:
+        """Add tables, in place of older ones of the same topics.
+
+        Args:
+            additions: New tables by folder.
+            replaced: Topics whose older tables go.
+            prefixes: Beginnings of the names of folders that may have such tables.
+
+        Raises:
+            OSError: a file cannot be written.
+        """
+        files.make_folders(self._root / TABLES, depth=1)
+        with locked(self._root):
+            others = [name for name in _folders(self._root) if name.startswith(tuple(prefixes))]
+            for name in dict.fromkeys([*additions, *others]):
+                if name in additions:
+                    files.make_folders(self._root / TABLES / name, depth=IN_TABLES)
+                try:
+                    addition = additions.get(name, Addition())
+                    self._change(name, addition, replaced.__contains__ if prefixes else None)
+                except (OSError, MemoryError):
+                    raise
+                except Exception as error:
+                    _log.warning("no table in %s: %s", name, error or repr(error))
+
+    def remove(self, prefixes: Collection[str] = ("",)) -> None:
+        """Remove all tables of the recording.
+
+        Args:
+            prefixes: Beginnings of the names of folders that may have tables of it.
+
+        Raises:
+            OSError: one cannot be removed.
+        """
+        with suppress(FileNotFoundError), locked(self._root):
+            for name in _folders(self._root):
+                if name.startswith(tuple(prefixes)):
+                    self._change(name, Addition(), _all)
+
+    def _change(self, folder: str, addition: Addition, goes: Callable[[str], bool] | None) -> None:
+        """Remove and add tables in a folder; an empty one is removed.
+
+        Args:
+            folder: Its name.
+            addition: What is added.
+            goes: Returns whether older rows of a topic go; None if there are none.
+        """
+        place = self._root / TABLES / folder
+        names = [n for n in files.names(place, depth=IN_TABLES) if n.endswith(SUFFIX)]
+        shared = sorted(name for name in names if name.startswith(SHARED))
+        waiting, old = addition, []
+        if goes is not None:
+            old = self._own_files(place, names, goes)
+            for name in shared:
+                reader = _reader(place / name)
+                if reader is not None and reader.about.section(self._recording) is not None:
+                    self._rewrite(place / name, reader, waiting, goes)
+                    waiting = Addition()
+        if waiting.section is not None:
+            self._merge(place, shared, waiting)
+        self._publish(place, addition.files, [name for name in names if name not in old], old)
+        with suppress(OSError), files.folder(place.parent, IN_TABLES - 1) as fd:
+            files.system.rmdir(folder, folder=fd)
+
+    def _own_files(
+        self, place: Path, names: Iterable[str], goes: Callable[[str], bool]
+    ) -> list[str]:
+        """Files of long topics that are to go; damaged ones are among them."""
+        found = []
+        for name in sorted(names):
+            if name.startswith(f"{self._recording}-"):
+                try:
+                    about = ParquetFileReader(place / name).about
+                    topics = [topic for one in about.recordings for topic in one.topics]
+                except (OSError, StoreError):
+                    found.append(name)
+                    continue
+                if all(map(goes, topics)):
+                    found.append(name)
+        return found
+
+    def _merge(self, place: Path, shared: Sequence[str], addition: Addition) -> None:
+        """Add rows to the newest shared file, or to a new one."""
+        assert addition.section is not None
+        number = 0
+        if shared:
+            path = place / shared[-1]
+            reader = _reader(path)
+            number = int(path.stem.removeprefix(SHARED)) + (reader is not None)
+            if (
+                reader is not None
+                and reader.size_bytes < MAX_SHARED_BYTES
+                and reader.about.rows + addition.section.rows <= MAX_SHARED_ROWS
+            ):
+                self._rewrite(path, reader, addition, lambda _: False)
+                return
+        path = place / f"{SHARED}{number:06d}{SUFFIX}"
+        self._write(path, [addition.section], [addition.rows])
+
+    def _rewrite(
+        self,
+        path: Path,
+        reader: ParquetFileReader,
+        addition: Addition,
+        goes: Callable[[str], bool],
+    ) -> None:
+        """Replace a shared file by one with other rows of the recording."""
+        try:
+            table = reader.table()
+        except StoreError as error:
+            # Its other recordings get their tables again when they are asked about.
+            _log.info("%s", error)
+            files.unlink(path, depth=IN_TYPE)
+            if addition.section is not None:
+                self._write(path, [addition.section], [addition.rows])
+            return
+        sections: list[Section] = []
+        tables: list[Any] = []
+        before = 0
+        section, rows = addition.section, addition.rows
+        for one in reader.about.recordings:
+            own = table.slice(before, one.rows)
+            before += one.rows
+            if one.id == self._recording:
+                is_stale = not one.segments.items() <= self._digests.items()
+                one, own = _without(one, own, _all if is_stale else goes)  # noqa: PLW2901
+                if section is not None:
+                    one, own = _joined(one, own, section, rows)  # noqa: PLW2901
+                    section = None
+                if not one.topics:
+                    continue
+            elif section is not None and section.place < one.place:
+                sections.append(section)
+                tables.append(rows)
+                section = None
+            sections.append(one)
+            tables.append(own)
+        if section is not None:
+            sections.append(section)
+            tables.append(rows)
+        if sections:
+            self._write(path, sections, tables, reader)
+        else:
+            files.unlink(path, depth=IN_TYPE)
+
+    def _write(
+        self,
+        path: Path,
+        sections: Sequence[Section],
+        tables: Sequence[Any],
+        before: ParquetFileReader | None = None,
+    ) -> None:
+        """Write a shared file, and give it its name by one rename.
+
+        Args:
+            path: The file.
+            sections: What it has.
+            tables: The rows of each.
+            before: The file that it replaces.
+        """
+        table = pa.concat_tables([one.cast(tables[0].schema) for one in tables])
+        kept = None if before is None else before.kept()
+        in_front = False
+        if kept is not None and before is not None:
+            size = len(kept.data) * table.num_rows / max(before.about.rows, 1)
+            in_front = size < kept.offset
+        try:
+            part = self._part(sections, table, kept, in_front=in_front)
+        except NoRoomError:
+            part = self._part(sections, table, kept, in_front=False)
+        files.rename(part, path, depth=files.IN_RECORDING, new_depth=IN_TYPE)
+
+    def _part(
+        self, sections: Sequence[Section], table: Any, kept: KeptBytes | None, *, in_front: bool
+    ) -> Path:
+        """A finished file without its name."""
+        parts = parts_folder(self._root, self._recording)
+        files.make_folders(parts, depth=files.IN_FOLDER)
+        self._numbers += 1
+        part = parts / f"{SHARED}{self._numbers}{SUFFIX}"
+        files.remove_tree(part, depth=files.IN_RECORDING)
+        writer = ParquetFileWriter(
+            part,
+            table,
+            depth=files.IN_RECORDING,
+            is_all=True,
+            kept=kept,
+            in_front=in_front,
+        )
+        try:
+            writer.write(table)
+            writer.close(About(sections, ((table.num_rows, 0, 0, 0, 0),)), sync=True)
+        except BaseException:
+            writer.discard()
+            raise
+        return part
+
+    def _publish(
+        self, place: Path, parts: Sequence[Path], names: Collection[str], old: Sequence[str]
+    ) -> None:
+        """Give finished files their names: first those of the files that they replace."""
+        taken, number, free = set(names), 0, list(old)
+        for part in parts:
+            if free:
+                name = free.pop(0)
+            else:
+                while (name := f"{self._recording}-{number}{SUFFIX}") in taken:
+                    number += 1
+            taken.add(name)
+            depth = len(part.parts) - len(self._root.parts)
+            files.rename(part, place / name, depth=depth, new_depth=IN_TYPE)
+        for name in free:
+            files.remove_tree(place / name, depth=IN_TYPE)
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """Lock the tables of a store for changes.
+
+    Raises:
+        FileNotFoundError: there are none.
+    """
+    with files.folder(root / TABLES, 1) as fd:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+
+
+def _folders(root: Path) -> list[str]:
+    """Names of the folders of tables."""
+    return sorted(name for name in files.names(root / TABLES, depth=1) if "~" in name)
+
+
+def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ParquetFileReader]:
+    """The tables in some folders; those that cannot be read are left out.
+
+    Args:
+        root: The store.
+        prefixes: Beginnings of the names of the folders.
+    """
+    with suppress(OSError):
+        for folder in _folders(root):
+            if folder.startswith(tuple(prefixes)):
+                for name in sorted(files.names(root / TABLES / folder, depth=IN_TABLES)):
+                    with suppress(OSError, StoreError):
+                        yield ParquetFileReader(root / TABLES / folder / name)
+
+
+def recordings_of(root: Path) -> set[str]:
+    """Ids of all recordings with tables."""
+    return {section.id for file in files_of(root) for section in file.about.recordings}
+
+
+def _reader(path: Path) -> ParquetFileReader | None:
+    """A shared file; one that cannot be read is removed, since all of it can be made again."""
+    try:
+        return ParquetFileReader(path)
+    except FileNotFoundError:
+        return None
+    except StoreError as error:
+        if isinstance(error.__cause__, PermissionError):
+            raise error.__cause__ from error
+        _log.info("%s", error)
+        files.remove_tree(path, depth=IN_TYPE)
+        return None
+
+
+def _all(_: str) -> bool:
+    return True
+
+
+def _without(section: Section, rows: Any, goes: Callable[[str], bool]) -> tuple[Section, Any]:
+    """The rows of a recording without those of some topics."""
+    kept, tables, before = {}, [], 0
+    for topic, counts in section.topics.items():
+        if not goes(topic):
+            kept[topic] = counts
+            tables.append(rows.slice(before, counts.rows))
+        before += counts.rows
+    return replace(section, topics=kept), pa.concat_tables([rows.slice(0, 0), *tables])
+
+
+def _joined(one: Section, rows: Any, other: Section, others: Any) -> tuple[Section, Any]:
+    """Rows of one recording, of other topics each, by topic."""
+    pieces: dict[str, Any] = {}
+    for section, table in ((one, rows), (other, others)):
+        before = 0
+        for topic, counts in section.topics.items():
+            pieces[topic] = counts, table.slice(before, counts.rows)
+            before += counts.rows
+    order = sorted(pieces)
+    section = replace(
+        one,
+        segments={**one.segments, **other.segments},
+        topics={topic: pieces[topic][0] for topic in order},
+    )
+    schema = others.schema
+    return section, pa.concat_tables([pieces[topic][1].cast(schema) for topic in order])
