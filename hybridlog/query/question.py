@@ -199,6 +199,8 @@ class Part:
         whole = self.span
         if whole is None:
             return 0.0
+        if self.is_unbounded:
+            return 1.0
         cut = np.clip(self.log_windows, *whole)
         return float((cut[:, 1] - cut[:, 0]).sum()) / (whole[1] - whole[0])
 

@@ -15,6 +15,7 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -176,6 +177,32 @@ class ColumnFile(ParquetFileReader):
         return {leaf.array: n for n, leaf in enumerate(self.leaves) if leaf.array is not None}
 
     @lazy
+    def paths(self) -> set[tuple[str, ...]]:
+        """Paths of fields that the messages have."""
+        names = [leaf.array or leaf.names for leaf in self.leaves if not leaf.is_own]
+        return {path[:end] for path in names for end in range(1, len(path) + 1)}
+
+    @lazy
+    def summary_paths(self) -> set[tuple[str, ...]]:
+        """Paths of the numbers of summaries."""
+        return {leaf.names for leaf in self.leaves if leaf.array is not None}
+
+    @lazy
+    def sizes(self) -> dict[tuple[Any, ...], int]:
+        """Stored bytes of columns that were asked about."""
+        return {}
+
+    def stored(self, group: int, paths: Collection[str] | None, own: Collection[str]) -> int:
+        """Stored bytes of some fields in a row group."""
+        key = group, None if paths is None else frozenset(paths), frozenset(own)
+        found = self.sizes.get(key)
+        if found is None:
+            if len(self.sizes) >= _TYPES:
+                self.sizes.clear()
+            found = self.sizes[key] = self.size(group, self.choose(paths, own))
+        return found
+
+    @lazy
     def chosen(self) -> dict[tuple[Any, Any], list[int]]:
         """Numbers of columns that were chosen, by fields and columns of ours."""
         return {}
@@ -230,6 +257,14 @@ class ColumnFile(ParquetFileReader):
                 last = (keys[2], keys[3]) if is_known else _LAST
                 yield TablePart(self, group, low - before, high - low, first, last)
             before += count
+
+    @lazy
+    def counts(self) -> TopicCounts:
+        """Counts of all its rows."""
+        topics = [section.topics.values() for section in self.about.recordings]
+        return TopicCounts(
+            *np.array([*chain(*topics)], np.int64).reshape(-1, 3).sum(axis=0).tolist()
+        )
 
     def all_parts(self) -> list[TablePart]:
         """All rows, as if they were of one topic."""
@@ -291,18 +326,9 @@ class TopicTable:
         """True if every file has the field: an array is a summary in some, a list in others."""
         names = _names(path)
         return all(
-            any(
-                not leaf.is_own
-                and leaf.names[: len(names)] == names
-                and (leaf.array is None or len(names) <= len(leaf.array) or self._is_summary(names))
-                for leaf in file.leaves
-            )
+            names in file.paths or (names in file.summary_paths and self._is_summarised(names[:-1]))
             for file in self.files
         )
-
-    def _is_summary(self, names: tuple[str, ...]) -> bool:
-        """True for a part of a summary of an array that is over the limit in some row."""
-        return self._is_summarised(names[:-1])
 
     def size(self, paths: Collection[str] | None = None, own: Collection[str] = ()) -> int:
         """Stored bytes to read for some fields.
@@ -312,7 +338,7 @@ class TopicTable:
             own: Columns of the table itself.
         """
         own = {"t", "seq", *own}
-        return sum(part.file.size(part.group, part.file.choose(paths, own)) for part in self._parts)
+        return sum(part.file.stored(part.group, paths, own) for part in self._parts)
 
     def scan(
         self,
@@ -650,11 +676,7 @@ class Tables:
 
     def whole(self, file: ColumnFile) -> TopicTable:
         """All rows of a file, as if they were of one topic."""
-        counts = TopicCounts(0)
-        for section in file.about.recordings:
-            for own in section.topics.values():
-                counts = counts.plus(own)
-        return TopicTable("", file.all_parts(), counts, self._cache)
+        return TopicTable("", file.all_parts(), file.counts, self._cache)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording.

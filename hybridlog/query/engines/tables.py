@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -108,9 +109,44 @@ class TablesEngine:
             UndecidedError: the columns of a table cannot decide.
             StoreError: a table is damaged.
         """
+        self._count_by_file(parts)
         found = [*map(self.check, parts)]
         self._tell_unreadable(parts)
         return sum(found)
+
+    def _count_by_file(self, parts: Sequence[Part]) -> None:
+        """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
+        by_file: dict[int, list[tuple[Part, TopicTable]]] = defaultdict(list)
+        for part in parts:
+            if part in self._counts or part.predicate is None or not part.is_unbounded:
+                continue
+            if any(map(is_meta, part.predicate.fields())):
+                continue  # known of the part, not of a row
+            table = self._table_of(part)
+            if table is not None and len(table.files) == 1:
+                by_file[table.files[0].number].append((part, table))
+        for together in by_file.values():
+            if len(together) > 1:
+                with suppress(UndecidedError, StoreError):  # then part by part
+                    self._count_in_file(together)
+
+    def _count_in_file(self, together: Sequence[tuple[Part, TopicTable]]) -> None:
+        part, table = together[0]
+        types = part.field_types
+        whole = self._session.tables.whole(table.files[0])
+        matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
+        for rows, holds in self._rows(part, whole=whole):
+            before.append(before[-1] + len(rows))
+            for found, mask in ((matched, holds), (unreadable, rows.is_unreadable())):
+                found.append(found[-1][-1] + np.cumsum(mask))
+        sums, bad = np.concatenate(matched), np.concatenate(unreadable)
+        for part, table in together:
+            if part.field_types == types:
+                spans = [(before[one.group] + one.begin, one.rows) for one in table.parts]
+                self._counts[part] = _Count(
+                    sum(int(sums[begin + rows] - sums[begin]) for begin, rows in spans),
+                    sum(int(bad[begin + rows] - bad[begin]) for begin, rows in spans),
+                )
 
     def check(self, part: Part) -> int:
         """The count of one part; confirms that the columns can decide."""
@@ -169,15 +205,25 @@ class TablesEngine:
         return offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
 
     def _rows(
-        self, part: Part, fields: Collection[str] | None = (), own: Collection[str] = ()
+        self,
+        part: Part,
+        fields: Collection[str] | None = (),
+        own: Collection[str] = (),
+        whole: TopicTable | None = None,
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of the part's time, with the outcome for each.
+
+        Args:
+            part: The part.
+            fields: Fields to read.
+            own: Columns of the table itself.
+            whole: All rows of its file, in place of its table.
 
         Raises:
             UndecidedError: the columns cannot decide.
             StoreError: the table is damaged or missing.
         """
-        table = self._table_of(part)
+        table = whole or self._table_of(part)
         if table is None:
             raise StoreError(f"The table of {part.topic} is missing.")
         spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
@@ -193,7 +239,8 @@ class TablesEngine:
             for rows in table.scan(paths, own=columns, spans=spans):
                 yield rows, self._holds(part, rows) & ~rows.is_unreadable()
         except StoreError:
-            self._session.reject_table(part.recording, part.topic)
+            if whole is None:
+                self._session.reject_table(part.recording, part.topic)
             raise
 
     def _holds(self, part: Part, rows: TableRows) -> NDArray[np.bool_]:
