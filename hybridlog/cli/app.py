@@ -27,6 +27,7 @@ COMMANDS: Final = (
     "import",
     "trigger",
     "schema",
+    "tables",
     "fetch",
     "intervals",
     "changes",

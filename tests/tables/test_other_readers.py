@@ -21,6 +21,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.tables import writer as writing
 from hybridlog_storage.messages import Channel, Schema
+from tests.cli.within import answer
 from tests.data import DATA, needs_data
 from tests.tables.logs import (
     BASE,
@@ -377,3 +378,27 @@ def test_readings_beside_merges(store: hl.Store, tmp_path: Path) -> None:
         assert first in {row[0] for row in rows}
         seen.add(len(rows))
     assert len(seen) > 3
+
+
+def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
+    """A statement for each type of the topic; together they have all of its rows."""
+
+    def shown(*arguments: str) -> str:
+        return answer("tables", *arguments, store=many.directory.path).out
+
+    for topic in ("/large", "/small", "/changed", "/two"):
+        items = json.loads(shown("-t", topic, "--json"))
+        assert len(items) == (2 if topic in {"/changed", "/two"} else 1)
+        rows = 0
+        for item in items:
+            found = duckdb.sql(item["statement"])
+            assert len(found) == item["rows"]
+            rows += len(found)
+        assert rows == many.topic(topic).count()
+    lines = shown("-t", "small").splitlines()
+    files = [line for line in lines if line.endswith(".parquet")]
+    assert all(Path(file).is_file() for file in files)
+    (statement,) = (line for line in lines if line.startswith("select"))
+    assert len(duckdb.sql(statement)) == 160
+    one = json.loads(shown("-t", "/large", "-r", "1", "--json"))
+    assert [item["rows"] for item in one] == [600]

@@ -1,0 +1,85 @@
+"""`hybridlog tables`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.query_options import query_of
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.errors import TopicError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from hybridlog.choice import Choice
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.store import Store
+
+
+@click.command()
+@options.one_topic
+@options.store
+@options.choice
+@options.mongo
+@options.as_json
+def command(
+    *, topic: str, store: Path | None, choice: Choice, mongo: str | None, as_json: bool
+) -> None:
+    """Show the Parquet files of a topic, and SQL that reads them with DuckDB."""
+    with opened_store(store, mongo, quiet=as_json) as opened:
+        channels = query_of(opened, [topic], choice).channels()
+        ended = [one for one in channels if one.recording.status not in UNFINISHED]
+        for one in ended:  # made again where they are missing
+            opened.session.table(one.recording, one.channel.topic)
+        found = _found(opened, ended)
+        others = len({one.recording.id for one in channels}) - len(
+            {one.recording.id for one in ended}
+        )
+    if as_json:
+        output.print_json(found)
+        return
+    if not found:
+        raise TopicError(f"No chosen recording that has ended has a table of {topic}.")
+    for item in found:
+        for name in item["files"]:
+            output.say(name)
+        output.say()
+        output.say(f"{item['statement']};")
+        output.say()
+    if others:
+        output.note(f"Tables of {others} unfinished recordings follow when they end.")
+
+
+def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
+    """Folders with rows of a topic in some recordings: files, rows, statement."""
+    from hybridlog.tables.folders import files_of
+    from hybridlog.tables.layout import type_prefix
+
+    topics = {one.channel.topic for one in channels}
+    recordings = {one.recording.id for one in channels}
+    schemas = [one.channel.schema for one in channels]
+    prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
+    folders: dict[Path, dict[str, Any]] = {}
+    for file in files_of(store.directory.path, prefixes) if prefixes else ():
+        rows = sum(
+            counts.rows
+            for section in file.about.recordings
+            for name, counts in section.topics.items()
+            if section.id in recordings and name in topics
+        )
+        if rows:
+            folder = file.path.parent
+            found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
+            found["rows"] += rows
+            found["files"].append(str(file.path))
+    (name,) = topics or {""}
+    for folder, found in folders.items():
+        files, quoted = (text.replace("'", "''") for text in (f"{folder}/*.parquet", name))
+        # The only text in it is quoted, and nothing is run here.
+        found["statement"] = f"select * from '{files}' where topic = '{quoted}'"  # noqa: S608
+    return list(folders.values())
