@@ -197,6 +197,7 @@ class Session:
         self._places: TopicPlaces | None = None
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
+        self._by_topic: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._contents: dict[Path, MovedContents] = {}
         self._columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
@@ -794,6 +795,19 @@ class Session:
             self._channels[recording.id] = recording, found
         return found
 
+    def channels_of(
+        self, recording: RecordingEntry, topics: Collection[str]
+    ) -> list[RecordedChannel]:
+        """The channels of some topics in a recording, as of `channels`."""
+        known = self._by_topic.get(recording.id)
+        if known is None or known[0] is not recording:
+            by_topic: dict[str, list[RecordedChannel]] = {}
+            for channel in self.channels(recording):
+                by_topic.setdefault(channel.channel.topic, []).append(channel)
+            known = self._by_topic[recording.id] = recording, by_topic
+        found = [channel for topic in topics for channel in known[1].get(topic, ())]
+        return sorted(found, key=lambda channel: channel.channel_id)
+
     def field_types(
         self, topics: Collection[str], recordings: Collection[str] | None
     ) -> dict[str, str] | None:
@@ -813,8 +827,7 @@ class Session:
             tuple(
                 channel
                 for summary in snapshot.differing(places)
-                for channel in self.channels(self.entry_of(summary))
-                if channel.channel.topic in topics
+                for channel in self.channels_of(self.entry_of(summary), set(topics))
             )
         )
 
@@ -1144,6 +1157,7 @@ class Session:
         self._index_version = None
         self._places = None
         self._channels.clear()
+        self._by_topic.clear()
         with self._lock:
             self._contents.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it

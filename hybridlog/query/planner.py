@@ -140,10 +140,9 @@ class Planner:
         recording = self.session.entry_of(summary)
         wanted = set(self.question.topics)
         by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
-        for channel in self.session.channels(recording):
-            if channel.channel.topic in wanted:
-                self._check_clock(channel)
-                by_topic[channel.channel.topic].append(channel)
+        for channel in self.session.channels_of(recording, wanted):
+            self._check_clock(channel)
+            by_topic[channel.channel.topic].append(channel)
         predicate = self.question.predicate
         asks_fields = predicate is not None and predicate.asks_fields
         for topic, channels in by_topic.items():
@@ -181,8 +180,7 @@ class Planner:
         return [
             channel
             for summary in summaries
-            for channel in self.session.channels(self.session.entry_of(summary))
-            if channel.channel.topic in wanted
+            for channel in self.session.channels_of(self.session.entry_of(summary), wanted)
         ]
 
     @lazy

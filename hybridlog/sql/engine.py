@@ -42,6 +42,11 @@ _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
 )
+_SHOW_TABLES: Final = re.compile(r"\s*show\s+tables\s*;?\s*", re.IGNORECASE)
+_NAMES: Final = (
+    "select unnest(?::varchar[]) as name union select table_name from duckdb_tables() "
+    "union select view_name from duckdb_views() where not internal order by name"
+)
 _MAX_TREES: Final = 64  # syntax trees that are kept
 _MAX_TREE: Final = 1 << 20  # characters of one of them
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
@@ -182,6 +187,11 @@ class SqlConnection:
             statements = list(self.cursor.extract_statements(text))
         if not statements:
             raise UsageError("The query is empty.")
+        if len(statements) == 1 and _SHOW_TABLES.fullmatch(text) and not params:
+            # DuckDB would need every view, with its columns.
+            return self._prepared(
+                self.cursor.extract_statements(_NAMES)[0], [self.names()], timeout
+            )
         if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
             raise UsageError("Only queries are possible here, such as select and show.")
         self._names.update(self.engine.content().names.named(text))

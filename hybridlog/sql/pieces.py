@@ -107,8 +107,7 @@ class TopicOfRecording:
         """Channels of the topic, by id."""
         return {
             channel.channel_id: channel
-            for channel in self.session.channels(self.entry)
-            if channel.channel.topic == self.topic
+            for channel in self.session.channels_of(self.entry, [self.topic])
         }
 
     @lazy

@@ -15,7 +15,7 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
+from itertools import accumulate, chain
 from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -527,7 +527,8 @@ class _Cache:
             self._size = 0
 
 
-class _Rows(NamedTuple):
+@dataclass(frozen=True)
+class _Rows:
     """The rows of a recording in a file.
 
     Attributes:
@@ -540,13 +541,15 @@ class _Rows(NamedTuple):
     begin: int
     section: Section
 
+    @lazy
+    def _begins(self) -> dict[str, int]:
+        """First row of each topic."""
+        rows = (counts.rows for counts in self.section.topics.values())
+        return dict(zip(self.section.topics, accumulate(rows, initial=self.begin), strict=False))
+
     def of(self, topic: str) -> Iterator[TablePart]:
         """The rows of a topic."""
-        before = self.begin
-        for name, counts in self.section.topics.items():
-            if name == topic:
-                yield from self.file.parts(before, counts.rows)
-            before += counts.rows
+        return self.file.parts(self._begins[topic], self.section.topics[topic].rows)
 
 
 class _Folder:
