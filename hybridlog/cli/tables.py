@@ -10,7 +10,6 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import query_of
-from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
@@ -31,6 +30,8 @@ def command(
     *, topic: str, store: Path | None, choice: Choice, mongo: str | None, as_json: bool
 ) -> None:
     """Show the Parquet files of a topic, and SQL that reads them with DuckDB."""
+    from hybridlog.snapshot import UNFINISHED
+
     with opened_store(store, mongo, quiet=as_json) as opened:
         channels = query_of(opened, [topic], choice).channels()
         ended = [one for one in channels if one.recording.status not in UNFINISHED]
