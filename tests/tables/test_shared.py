@@ -1,0 +1,181 @@
+"""Recordings share files: what is opened, written and rewritten."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance import tables as making
+from hybridlog.query.predicate import to_mask as deciding
+from hybridlog.tables import folders, parquet_file, reader
+from hybridlog.tables import writer as writing
+from hybridlog.tables.parquet_file import ParquetFileReader
+from hybridlog_storage import files
+from hybridlog_storage.errors import StoreError
+from tests.tables.logs import BASE, SECOND, varied, write_log
+from tests.tables.test_writer import compare, files_of
+
+COUNT = 8
+
+
+def record(store: hl.Store, path: Path, number: int, rows: int = 30) -> None:
+    begin = BASE + number * SECOND
+    said = [(begin + n, f"/{'ab'[n % 2]}", varied(n)) for n in range(rows)]
+    log = write_log(path / f"{number}.mcap", said)
+    store.record(log, name=f"r{number}", again=True)
+
+
+@pytest.fixture
+def several(store: hl.Store, tmp_path: Path) -> hl.Store:
+    for number in range(COUNT):
+        record(store, tmp_path, number)
+    return store
+
+
+def opened_files(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Tables that are opened from now on."""
+    found: list[Path] = []
+    real = files.open_file
+
+    def seen(path: Path, *arguments: Any, **options: Any) -> int:
+        if path.suffix == ".parquet":
+            found.append(path)
+        return real(path, *arguments, **options)
+
+    monkeypatch.setattr(files, "open_file", seen)
+    return found
+
+
+def test_a_file_is_opened_once_for_all_its_recordings_and_topics(
+    several: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert len(files_of(several)) == 1
+    several.refresh()
+    opened = opened_files(monkeypatch)
+    query = several.query(["/a", "/b"]).where("i8 > 0")
+    assert query.count() == COUNT * 12
+    assert opened == files_of(several)
+    opened.clear()
+    assert query.count() == COUNT * 12
+    assert several.query(["/a", "/b"]).where("i8 > 1").count() == COUNT * 6
+    assert not opened
+
+
+def test_a_predicate_is_evaluated_once_for_a_file(
+    several: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decided: list[int] = []
+    real = deciding.to_mask
+
+    def seen(predicate: Any, types: Any, records: Any) -> Any:
+        decided.append(len(records))
+        return real(predicate, types, records)
+
+    monkeypatch.setattr(deciding, "to_mask", seen)
+    assert several.query(["/a", "/b"]).where("i8 > 0").count() == COUNT * 12
+    assert decided == [COUNT * 30]
+
+
+def test_long_arrays_of_another_recording_change_no_count(
+    several: hl.Store, tmp_path: Path
+) -> None:
+    from tests.tables.logs import payload
+
+    query = several.topic("/a").where("many[0] > 1")
+    before = query.count()
+    said = [(BASE + n, "/a", payload(n, many=[2.0] * 40)) for n in range(10)]
+    several.record(write_log(tmp_path / "long.mcap", said), name="long")
+    several.refresh()
+    assert several.topic("/a").where("many[0] > 1").count() == before + 10
+
+
+def test_more_files_than_may_be_open(
+    several: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file is closed, but what is known of it stays."""
+    monkeypatch.setattr(writing, "LONG_ROWS", 20)
+    for number in range(COUNT, COUNT + 6):
+        record(several, tmp_path, number, 60)
+    monkeypatch.setattr(reader, "_OPEN_FILES", 4)
+    several.refresh()
+    assert len(files_of(several)) == 13
+    query = several.query(["/a", "/b"]).where("i8 > 0")
+    want = query.count()
+    opened = opened_files(monkeypatch)
+    assert query.count() == want
+    assert not opened
+    assert several.query(["/a", "/b"]).where("f64 < 5").count() > 0
+    assert len(opened) <= 13
+
+
+def test_a_closed_file_that_was_replaced_is_not_believed(several: hl.Store, tmp_path: Path) -> None:
+    (path,) = files_of(several)
+    file = ParquetFileReader(path)
+    file.release()
+    record(several, tmp_path, COUNT)
+    with pytest.raises(StoreError, match="replaced"):
+        file.table()
+
+
+def test_a_full_file_gets_no_more_rows(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(folders, "MAX_SHARED_ROWS", 70)
+    for number in range(5):
+        record(store, tmp_path, number)
+    rows = [pq.read_metadata(path).num_rows for path in files_of(store)]
+    assert rows == [60, 60, 30]
+    # One removal rewrites one file.
+    before = {path: path.stat().st_ino for path in files_of(store)}
+    store.remove("r1")
+    after = {path: path.stat().st_ino for path in files_of(store)}
+    assert sum(before[path] != after[path] for path in before) == 1
+    assert compare(store) == 120
+
+
+def test_rows_are_by_recording_topic_and_time(several: hl.Store, tmp_path: Path) -> None:
+    record(several, tmp_path, -3)
+    (path,) = files_of(several)
+    table = pq.read_table(path)
+    ids = list(dict.fromkeys(table.column("recording").to_pylist()))
+    begins = {entry.id: min(first for _, first, _ in entry.spans) for entry in several.recordings()}
+    assert ids == sorted(begins, key=lambda one: (begins[one], one))
+    keys = [
+        (ids.index(row["recording"]), row["topic"], row["t"], row["seq"])
+        for row in table.select(["recording", "topic", "t", "seq"]).to_pylist()
+    ]
+    assert keys == sorted(keys)
+
+
+def test_several_writers_lose_no_rows(store: hl.Store, tmp_path: Path) -> None:
+    def work(first: int) -> None:
+        with hl.open(store.directory.path, mongo="none") as other:
+            for number in range(first, first + 4):
+                record(other, tmp_path, number)
+
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(work, (0, 4, 8)))
+    store.refresh()
+    assert len(files_of(store)) == 1
+    assert pq.read_metadata(files_of(store)[0]).num_rows == 12 * 30
+    assert all(not making.missing(store.directory, entry) for entry in store.recordings())
+    assert compare(store) == 12 * 30
+
+
+def test_footers_do_not_grow_with_each_merge(several: hl.Store) -> None:
+    (path,) = files_of(several)
+    assert set(pq.read_metadata(path).metadata) == {
+        b"ARROW:schema",
+        b"hybridlog",
+        parquet_file._SEALED_BY.encode(),
+    }
+
+
+def test_listing_views_makes_none(several: hl.Store) -> None:
+    assert ("a",) in several.sql("SHOW tables;").rows()
+    assert not several.sql_engine.content()._views
