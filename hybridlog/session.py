@@ -64,6 +64,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hybridlog.field_indexes import FieldIndex
     from hybridlog.index_version import GuardedIndex, IndexVersion
     from hybridlog.index_writer import IndexTarget
     from hybridlog.payloads.reader import PayloadReader
@@ -164,6 +165,7 @@ class Session:
         connection: The connection to MongoDB.
         repairs: Repairs made when the store was opened.
         recent_chunks: Chunks that single messages were read from.
+        field_indexes: The indexes on fields in MongoDB; empty without a connection.
     """
 
     def __init__(
@@ -179,6 +181,8 @@ class Session:
         self.connection = Connection(directory, mongo, cache_mb)
         self.repairs = RepairReport()
         self.recent_chunks = RecentChunks()
+        self.field_indexes: list[FieldIndex] = []
+        self._uncertain: tuple[int, dict[str, set[str]]] | None = None
         self._unavailable: HybridlogError | None = None
         self._rests_until = 0.0
         self._connecting = threading.RLock()
@@ -277,6 +281,7 @@ class Session:
                 raise
 
     def _connect(self, recordings: Collection[RecordingEntry] | None) -> Database:
+        from hybridlog import field_indexes
         from hybridlog.maintenance import index
 
         if self.connected is None:
@@ -287,7 +292,11 @@ class Session:
         has_changed = False
         wanted = None if recordings is None else {entry.id: entry for entry in recordings}
         try:
+            is_new = self.connected is None
             database = self.connection.open()
+            if is_new:
+                self.field_indexes = field_indexes.listed(database)
+                self._uncertain = None
             if self.connection.may_write:
                 has_changed = index.bring_up_to_date(
                     self.directory,
@@ -449,6 +458,27 @@ class Session:
             database, keys, None if anew else self._index_version
         )
         return found
+
+    def uncertain(self, topic: str) -> tuple[int, set[str]]:
+        """Recordings whose documents may not tell about a topic, see `IndexState`.
+
+        Returns:
+            The turn of the index before it was asked, and their keys.
+        """
+        from hybridlog_storage.index_state import IndexState
+
+        assert self.connected is not None
+        state = IndexState(self.connected)
+        if self._uncertain is None:
+            self._uncertain = state.turn(read="linearizable"), {}
+        turn, known = self._uncertain
+        if topic not in known:
+            known[topic] = state.uncertain(topic)
+        return turn, known[topic]
+
+    def forget_uncertain(self) -> None:
+        """Look again: another process has changed the index."""
+        self._uncertain = None
 
     # The moment.
 
@@ -1152,6 +1182,7 @@ class Session:
         if getattr(self._pinned, "moment", None) is not None:
             self._pinned.moment = self._latest
         self._entries = {}
+        self._uncertain = None
         self._is_indexed = False
         self._indexed.clear()
         self._index_version = None

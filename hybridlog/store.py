@@ -732,6 +732,7 @@ class Store:
         database = self.database_for("An index", writes=True)
         query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
         field_indexes.add(database, query.topics, fields)
+        self.session.field_indexes = field_indexes.listed(database)
         return field_indexes.of_topics(database, query.topics)
 
     @_again_if_lost
@@ -743,7 +744,9 @@ class Store:
         """
         query = self.topic(topic)
         database = self.database_for("An index", writes=True)
-        return field_indexes.remove(database, query.topics, fields)
+        found = field_indexes.remove(database, query.topics, fields)
+        self.session.field_indexes = field_indexes.listed(database)
+        return found
 
     @_again_if_lost
     def indexes(self, *topics: str) -> list[FieldIndex]:

@@ -119,7 +119,7 @@ def bring_up_to_date(
         catalog.put_indexed(settled, index)
     if has_strangers:
         _remove_strangers(directory, database, known, report)
-    return has_changed or bool(report.indexed)
+    return has_changed or bool(report.indexed) or bool(settled)
 
 
 def _bring_one(

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
+    from hybridlog.query.ranges import Ranges
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -121,8 +122,22 @@ class Planner:
             TimeError: the time range is empty, or outside all recordings.
             TopicError: a topic does not have the requested clock.
         """
-        found = self._ranges.resolve()
+        found = self._matching_ranges()
         return self.batch_hint([part for one in found for part in self.parts_in(*one)])
+
+    def _matching_ranges(self) -> Ranges:
+        """The recordings to ask, without those of which an index says that nothing matches."""
+        found = self._ranges.resolve()
+        predicate = self.question.predicate
+        if predicate is None or predicate.needs_index or self.session.connected is None:
+            return found
+        if not self.session.field_indexes:
+            return found
+        from hybridlog.query.narrowing import narrowed
+
+        wanted = self.question.topics
+        channels = [one for one in self.examples if one.channel.topic in wanted]
+        return narrowed(self.session, self.question, found, channels)
 
     def parts_in(
         self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
@@ -289,7 +304,7 @@ class Planner:
 
         The first group is small, so that the first message needs few recordings.
         """
-        found = self._ranges.resolve()
+        found = self._matching_ranges()
         # In the order of the answer; going back, a recording begins with its last message.
         first, last = found.first, found.last
         if self.question.reverse:

@@ -640,14 +640,27 @@ class Database:
         collection: str,
         pipeline: Sequence[Mapping[str, object]],
         *,
+        hint: str | None = None,
         max_time_ms: int | None = None,
     ) -> Iterator[Document]:
-        """Run an aggregation pipeline that only reads."""
+        """Run an aggregation pipeline that only reads.
+
+        Args:
+            collection: The collection; one that does not exist is empty.
+            pipeline: The stages.
+            hint: Name of the index to use, see `index_name`.
+            max_time_ms: Most milliseconds on the server.
+
+        Raises:
+            WhereError: There is no such index, as well.
+        """
         for stage in pipeline:
             if not _WRITING_STAGES.isdisjoint(stage):
                 raise WhereError(f"A pipeline may only read: {', '.join(stage)} is not allowed.")
         of = self._collection(collection)
         options: dict[str, Any] = {"allowDiskUse": True}
+        if hint is not None:
+            options["hint"] = hint
         if max_time_ms is not None:
             options["maxTimeMS"] = max_time_ms
         stages = [dict(stage) for stage in pipeline]
@@ -745,9 +758,7 @@ class Database:
         options: dict[str, Any] = {"sparse": True} if sparse else {}
         if only:
             options["partialFilterExpression"] = dict(only)
-            # By default indexes of equal keys have equal names.
-            text = json.dumps([keys, sorted(only.items())])
-            options["name"] = hashlib.sha256(text.encode()).hexdigest()
+        options["name"] = index_name(keys, only)
         return self._again(lambda: of.create_index(list(keys), unique=unique, **options))
 
     def indexes(self, collection: str) -> list[Index]:
@@ -813,6 +824,14 @@ class Database:
 _IN_ORDER: Document = {"$sort": {"_id": 1}}
 """Lets MongoDB consider a range of `_id` for a pipeline: with another matching index, it does
 so only if that saves sorting."""
+
+
+def index_name(keys: Sort, only: Mapping[str, str] | None = None) -> str:
+    """The name that `create_index` gives: MongoDB's own, but one for each `only`."""
+    if only:
+        text = json.dumps([keys, sorted(only.items())])
+        return hashlib.sha256(text.encode()).hexdigest()
+    return "_".join(f"{field}_{order}" for field, order in keys)
 
 
 def _together(

@@ -22,7 +22,7 @@ from typing import Any, Final, Literal, NamedTuple
 from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database, ReadConcern
-from hybridlog_storage.topic_places import SHARED, TopicPlace
+from hybridlog_storage.topic_places import SHARED, TopicPlace, text_of
 
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 CHUNKS: Final = f"{CATALOG_PREFIX}chunks"
@@ -36,6 +36,12 @@ indexed, complete, being removed for good."""
 _DESTROYS: Final = frozenset({"clearing", "removing"})
 _KEY: Final = re.compile("[0-9a-f]{16}")
 _TURN: Final = {"_id": "turn"}
+_FIELDS: Final = {"_id": "fields"}
+_UNCERTAIN_CHANNEL: Final = [
+    {"is_indexed": {"$ne": True}},
+    {"reason": {"$ne": None}},
+    {"stats.unreadable": {"$ne": 0}},
+]
 _TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MOST_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
@@ -142,6 +148,28 @@ class IndexState:
         """The number of removals of documents of any recording so far."""
         found = self._db.find_one(STORE, _TURN, read=read, max_time_ms=_TURN_MS)
         return int(found["turn"]) if found is not None else 0
+
+    def uncertain(self, topic: str) -> set[str]:
+        """Keys of the recordings whose documents may not tell about a topic.
+
+        Their index is not complete, or messages of the topic have no documents, or documents
+        without fields.
+        """
+        channel = {"$elemMatch": {"topic": text_of(topic), "$or": _UNCERTAIN_CHANNEL}}
+        damaged = {"index.damage": {"$exists": True}}
+        asked = {"$or": [{"index.state": {"$ne": "complete"}}, damaged, {"channels": channel}]}
+        return {str(one["_id"]) for one in self._db.find(RECORDINGS, asked, {"_id": 1})}
+
+    def field_indexes(self) -> list[tuple[str, tuple[str, ...]]]:
+        """Topic and fields of each index on fields, as `put_field_indexes` was told."""
+        found = self._db.find_one(STORE, _FIELDS)
+        listed = [] if found is None else found.get("indexes", ())
+        return [(str(one["topic"]), tuple(map(str, one["fields"]))) for one in listed]
+
+    def put_field_indexes(self, indexes: Iterable[tuple[str, Sequence[str]]]) -> None:
+        """List the indexes on fields, so that questions know them without a look at each."""
+        listed = [{"topic": topic, "fields": list(fields)} for topic, fields in indexes]
+        self._db.replace(STORE, _FIELDS, {**_FIELDS, "indexes": listed})
 
     def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
         """Progress of recordings by key, without unknown ones."""
