@@ -29,7 +29,7 @@ from hybridlog.maintenance.opening import (
     repair_on_open,
 )
 from hybridlog.maintenance.report import Progress, RepairReport
-from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from hybridlog.field_indexes import FieldIndex
     from hybridlog.index_version import GuardedIndex, IndexVersion
     from hybridlog.index_writer import IndexTarget
-    from hybridlog.payloads.reader import PayloadReader
+    from hybridlog.payloads.reader import ArrayTable
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
@@ -203,7 +203,7 @@ class Session:
         self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
         self._by_topic: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self._segments: dict[tuple[str, int], SegmentReader] = {}
-        self._contents: dict[Path, MovedContents] = {}
+        self._contents: dict[Path, RecordingPayloads] = {}
         self._columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and made if missing
         self._lock = threading.Lock()
@@ -1126,21 +1126,27 @@ class Session:
         path = self.directory.recording(label)
         return open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path))
 
-    def payload_readers(self, recording: RecordingEntry, topic: str) -> list[PayloadReader] | None:
-        """Files of columns of a topic in order of time; None if they cannot be used."""
+    def arrays(self, recording: RecordingEntry, topic: str) -> ArrayTable | None:
+        """The arrays of a topic in columns; None without, or if they cannot be used."""
+        from hybridlog.payloads.reader import ArrayTable
+
         with self._lock:
             contents = self._contents_of(self.directory.recording(recording.label))
         try:
-            return contents.payloads().ordered(topic)
+            readers = contents.ordered(topic)
         except StoreError:
             return None
+        channel = next((c for c in self.channels(recording) if c.channel.topic == topic), None)
+        if not readers or channel is None:
+            return None
+        return ArrayTable(channel, readers, self.tables.cache)
 
-    def _contents_of(self, recording: Path) -> MovedContents:
+    def _contents_of(self, recording: Path) -> RecordingPayloads:
         """The content of moved chunks, shared by the segments of a recording."""
         found = self._contents.get(recording)
         if found is None:
             _make_room(self._contents)
-            found = self._contents[recording] = MovedContents(recording)
+            found = self._contents[recording] = RecordingPayloads(recording)
         return found
 
     @lazy

@@ -105,6 +105,30 @@ class Columns:
                 yield rows[n], ref["off"] - 31, record
 
 
+OURS = ("log_time", "t", "seq", "pub", "stamp", "channel", "state", "error", "ref")
+
+
+def _in_columns(about: Mapping[str, Any]) -> list[str]:
+    """Paths of the arrays, but for points that are unpacked."""
+    return [path for path in about["order"] if about["layout"] is None or path != "data"]
+
+
+def _array(table: pa.Table, path: str) -> Any:
+    """The column of a field."""
+    array: Any = None
+    for name in path.split("."):
+        fields = list(table.schema if array is None else array.type)
+        (number,) = [
+            number
+            for number, field in enumerate(fields)
+            if name == (field.metadata or {}).get(b"hybridlog.name", field.name.encode()).decode()
+            and (array is not None or field.name not in OURS)
+            and b"hybridlog.own" not in (field.metadata or {})
+        ]
+        array = table.column(number).combine_chunks() if array is None else array.field(number)
+    return array
+
+
 def _column(table: pa.Table, path: str) -> Any:
     name, *inner = path.split(".")
     array = table.column(name).combine_chunks()
@@ -125,16 +149,14 @@ def _values(array: Any, row: int) -> Any:
 def _payloads(table: pa.Table, about: Mapping[str, Any]) -> Iterator[bytes]:
     """The payload of each row: its rest with the arrays put in."""
     recipes = table.column("recipe").to_pylist()
-    columns = {path: (_column(table, column), kind) for path, column, kind in about["arrays"]}
+    columns = {path: _array(table, path) for path in _in_columns(about)}
     for row, recipe in enumerate(recipes):
         rest = recipe["rest"]
         is_big = about["wire"] == "cdr" and rest[:2] == b"\0\0"
         payload, at = b"", 0
         for place, path in zip(recipe["at"], about["order"], strict=True):
             if path in columns:
-                array, kind = columns[path]
-                values = _values(array, row)
-                demand(values.dtype == np.dtype(kind), "the type of an array")
+                values = _values(columns[path], row)
                 data = (values.byteswap() if is_big else values).tobytes()
             else:
                 data = _cloud(table, row, about["layout"], recipe["padding"])
@@ -162,10 +184,11 @@ def _cloud(table: pa.Table, row: int, layout: Mapping[str, Any], padding: bytes)
 def _check_zones(table: pa.Table, about: Mapping[str, Any], group: int) -> None:
     """Each number of an array lies between the ends of its region."""
     zones = about["zones"][group]
-    numbers = {path: column for path, column, kind in about["arrays"] if kind != "u1"}
-    demand(zones.keys() == numbers.keys(), "the zones")
+    arrays = {path: _array(table, path) for path in _in_columns(about)}
+    numbers = {path for path, array in arrays.items() if not pa.types.is_binary(array.type)}
+    demand(zones.keys() == numbers, "the zones")
     for path, (width, low, high) in zones.items():
-        array = _column(table, numbers[path])
+        array = arrays[path]
         ends: list[list[Any]] = [[None, None] for _ in low]
         for row in range(len(array)):
             values = _values(array, row)

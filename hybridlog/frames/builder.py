@@ -11,6 +11,7 @@ from hybridlog.frames.columns import chunked, flat, in_order, with_summaries
 from hybridlog.frames.names import FIELD, TAG, arranged, free_name
 from hybridlog.schema.arrow_columns import TIME, numbers
 from hybridlog.schema.arrow_types import common_type, converted
+from hybridlog_storage.row_order import order_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -161,16 +162,8 @@ def _order(blocks: Sequence[Block]) -> NDArray[np.intp] | None:
     blocks = [block for block in blocks if len(block.log_time)]
     if not blocks:
         return None
-    time = blocks[0].log_time
-    if len(blocks) > 1:
-        time = np.concatenate([block.log_time for block in blocks])
-    later = time[1:] > time[:-1]
-    if later.all():
-        return None
-    order = np.concatenate([block.order for block in blocks])
-    if bool((later | ((time[1:] == time[:-1]) & (order[1:] >= order[:-1]))).all()):
-        return None
-    return np.lexsort((order, time))
+    time = np.concatenate([block.log_time for block in blocks])
+    return order_of(time, np.concatenate([block.order for block in blocks]))
 
 
 def _ordered(

@@ -22,7 +22,7 @@ from hybridlog.maintenance import thinning
 from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import CompactedTopic
 from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.contents import open_segment
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
 from hybridlog.tables.layout import table_schema_of, topic_folder
 from hybridlog_storage import durability, files, journal
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress
     from hybridlog.payloads.columns import TopicColumns
-    from hybridlog.payloads.reader import RecordingPayloads
     from hybridlog.payloads.writer import TopicWriter
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
@@ -229,9 +228,8 @@ class _Compaction:
             topic.report.column_bytes = sum(file.bytes for file in topic.files)
 
     def _add(self, topic: _Topic, chunk: StoredChunk, rows: NDArray[np.intp], digest: str) -> None:
-        channels = chunk.batch.channel[rows].tolist()
-        has_publish_time = np.array([topic.channels[c].has_publish_time for c in channels])
-        piece = topic.columns.piece(chunk, rows, has_publish_time=has_publish_time)
+        has_publish_time = {n: channel.has_publish_time for n, channel in topic.channels.items()}
+        piece = topic.columns.piece(chunk, rows, has_publish_time)
         if piece is None:
             topic.keep(len(rows), "a message of the chunk does not fit its definition")
             return
@@ -245,8 +243,6 @@ class _Compaction:
 
         The files of a topic that differs are removed.
         """
-        from hybridlog.payloads.reader import RecordingPayloads
-
         left = {
             number: (topic, RecordingPayloads(self.path, topic.files, PARTS), Counter[str]())
             for number, topic in enumerate(chosen)
@@ -344,8 +340,6 @@ def _difference(
     Returns:
         The difference; empty if there is none, or if the chunk is not in the columns.
     """
-    from hybridlog.payloads.columns import column_at
-
     try:
         readers = payloads.having(chunk.segment, chunk.number)
         if not readers or not len(rows):
@@ -353,14 +347,13 @@ def _difference(
         (reader,) = readers
         place = reader.places[chunk.segment, chunk.number]
         rebuilt = reader.rebuilt(place.group)
-        seq = column_at(reader.table(place.group, ["seq"]), "seq").to_numpy()
     except StoreError as error:
         return str(error)
     inside = slice(place.begin, place.begin + place.rows)
     begin = chunk.batch.offset[rows] - MESSAGE_HEAD.itemsize
     end = chunk.batch.offset[rows] + chunk.batch.length[rows]
     is_same = place.rows == len(rows) and bool(
-        (seq[inside] == chunk.seq[rows]).all()
+        (rebuilt.seq[inside] == chunk.seq[rows]).all()
         and (rebuilt.place[inside] == begin).all()
         and (np.diff(rebuilt.offset)[inside] == end - begin).all()
     )

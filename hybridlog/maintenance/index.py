@@ -15,7 +15,7 @@ from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import describe_inventory, put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
-from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.catalog import stamps_of
 from hybridlog_storage.directory import LOCK_WAIT_S
@@ -429,7 +429,7 @@ def _chunks(
     total = entry.stored_bytes
     before = 0
     path = directory.recording(entry.label)
-    contents = MovedContents(path)
+    contents = RecordingPayloads(path)
     for number, _, _ in entry.spans:
         with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
             summary = reader.summary()

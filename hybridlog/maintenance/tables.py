@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.tables.layout import PARTS, parts_folder, type_prefix
 from hybridlog.tables.writer import TableWriter, topics_of
 from hybridlog_storage import files
@@ -119,7 +119,7 @@ def _chunks(
 ) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
     """Chunks with messages of some topics, in order; damaged ones are left out."""
     path = directory.recording(entry.label)
-    contents = MovedContents(path)
+    contents = RecordingPayloads(path)
     for number, _, _ in entry.spans:
         with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
             summary = reader.summary()

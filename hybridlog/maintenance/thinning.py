@@ -19,7 +19,7 @@ import numpy as np
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.report import CompactedTopic
 from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.payloads.layout import thinned_name
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
@@ -68,7 +68,7 @@ def drop(
     total = sum(len(summary.chunks) for summary in inventory.summaries.values())
     done = 0
     for number, summary in inventory.summaries.items():
-        contents = MovedContents(path)
+        contents = RecordingPayloads(path)
         with open_segment(path / inventory.listing.sealed[number], number, contents) as reader:
             movable = _movable(inventory, reader, summary, contents, topics)
             if movable:
@@ -113,7 +113,7 @@ def _movable(
     inventory: Inventory,
     reader: SegmentReader,
     summary: SegmentSummary,
-    contents: MovedContents,
+    contents: RecordingPayloads,
     topics: Collection[str] | None,
 ) -> set[int]:
     """Numbers of the chunks whose content comes back from columns, byte for byte."""

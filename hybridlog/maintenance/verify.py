@@ -11,7 +11,7 @@ from hybridlog.entries import take_inventory
 from hybridlog.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
-from hybridlog.payloads.contents import MovedContents, open_segment
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog_storage.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.index_documents import recording_key, with_prefix
@@ -184,7 +184,7 @@ class _Check:
         self._label = label
         self._result = result
         self._path = directory.recording(label)
-        self._contents = MovedContents(self._path)
+        self._contents = RecordingPayloads(self._path)
         self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
         self._is_damaged = False
@@ -273,8 +273,6 @@ class _Check:
         listed = inventory.payloads
         if not listed and PAYLOADS not in inventory.listing.others:
             return
-        from hybridlog.payloads.reader import RecordingPayloads
-
         payloads = RecordingPayloads(self._path, list(listed.values()))
         for file in listed.values():
             try:

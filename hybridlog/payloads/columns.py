@@ -32,19 +32,23 @@ from hybridlog.schema.arrow_columns import array_of, lists, numbers, structs
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, offsets
 from hybridlog.schema.definition import parse_definition
 from hybridlog.schema.wire import WireReader
-from hybridlog.tables.fields import FieldShape, original_name
+from hybridlog.tables.fields import FieldShape, records_of
+from hybridlog.tables.layout import OWN, OWN_COLUMNS
+from hybridlog.tables.rows import Messages, own_columns
+from hybridlog.tables.rows import Piece as TablePiece
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.mcap_content import MESSAGE_HEAD
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch, Channel
 
-_TIME = pa.timestamp("us", "UTC")
+NEEDED = ("t", "seq", "pub", "channel", "sequence", "ref", RECIPE, POINTS)
+"""Our columns that messages are made from."""
 _OWN_BYTES = 80  # about what the columns of a message take besides its payload
 
 
@@ -61,37 +65,6 @@ class Piece:
     table: pa.Table
     layout: PointLayout | None
     size: int
-
-
-@dataclass(frozen=True, slots=True)
-class ArrayColumn:
-    """A column that holds an array of the messages.
-
-    Attributes:
-        path: Dotted path of the field.
-        column: Dotted path of the column.
-        dtype: Type of the elements, as numpy spells it.
-    """
-
-    path: str
-    column: str
-    dtype: str
-
-    def to_json(self) -> list[str]:
-        """As values for JSON."""
-        return [self.path, self.column, self.dtype]
-
-    @classmethod
-    def from_json(cls, value: Sequence[Any]) -> ArrayColumn:
-        """The opposite of `to_json`.
-
-        Raises:
-            ValueError, TypeError: The value is invalid.
-        """
-        path, column, dtype = map(str, value)
-        if np.dtype(dtype).kind not in "iuf":
-            raise ValueError("an array has no numbers")
-        return cls(path, column, dtype)
 
 
 class TopicColumns:
@@ -116,8 +89,6 @@ class TopicColumns:
         self._reader = WireReader(message_type, self._wire)
         self._is_cloud = channel.schema.name in CLOUD_TYPES
         self._shape = FieldShape(None, PAYLOAD_RESERVED)
-        self.columns: list[ArrayColumn] = []
-        """The arrays with their columns; known once there are rows."""
 
     def share_of_sequences(self, batch: Batch) -> float:
         """Share of sequences of numbers in the bytes of some messages.
@@ -132,14 +103,14 @@ class TopicColumns:
         return float(spans.size[:, is_sequence].sum() / max(batch.payload_bytes, 1))
 
     def piece(
-        self, chunk: StoredChunk, rows: NDArray[np.intp], *, has_publish_time: NDArray[np.bool_]
+        self, chunk: StoredChunk, rows: NDArray[np.intp], has_publish_time: Mapping[int, bool]
     ) -> Piece | None:
         """Rows of messages; None if one does not fit its definition.
 
         Args:
             chunk: The chunk that holds them.
             rows: Their rows in it, ascending; one at least.
-            has_publish_time: bool[n], True for messages whose channel has publish times.
+            has_publish_time: Whether messages of a channel have a publish time, by channel id.
         """
         batch = chunk.batch.take(rows)
         spans = self._locator.spans(batch.buffer, batch.offset, batch.length)
@@ -149,54 +120,23 @@ class TopicColumns:
         records = decoded.records
         layout = layout_of(records) if self._is_cloud else None
         parts = split(batch.buffer, batch.offset, batch.length, spans)
-        fields = self._fields(records, layout)
-        own = _own_columns(chunk, rows, batch, has_publish_time)
-        padding = None
-        if layout is not None:
-            data = field_at(records, DATA)
-            assert isinstance(data, Arrays)
-            assert isinstance(data.values, Scalars)
-            padding = _padding(layout, data.values.values, data.offset)
-        columns = {**own, **fields, RECIPE: _recipe(parts, padding)}
-        schema = pa.schema(
-            [
-                *(pa.field(name, column.type) for name, column in own.items()),
-                *self._schema_of(fields),
-                pa.field(RECIPE, columns[RECIPE].type),
-            ]
-        )
-        schema = pa.schema([field.with_type(_required(field.type)) for field in schema])
-        arrays = [
-            column.cast(kind) for column, kind in zip(columns.values(), schema.types, strict=True)
-        ]
-        table = pa.Table.from_arrays(arrays, schema=schema)
+        fields = self._shape.columns(self._struct(records, "", layout))
+        messages = Messages.of(chunk, 0).take(rows)
+        segment = np.full(len(rows), chunk.segment, np.int32)
+        piece = TablePiece(chunk.segment, messages, None)
+        own = own_columns([piece], messages, segment, fields, has_publish_time)
+        has_none = own["pub"].is_null().to_numpy(zero_copy_only=False)
+        same = batch.publish_time == batch.log_time
+        own["pub"] = pa.array(batch.publish_time, mask=has_none & same)
+        besides = {"sequence": pa.array(batch.sequence), **_recipe(layout, parts, records)}
+        schema = [pa.field(name, column.type) for name, column in own.items()]
+        schema += list(fields.type)
+        schema += [pa.field(n, c.type, metadata={OWN: b"1"}) for n, c in besides.items()]
+        schema = [field.with_type(_required(field.type)) for field in schema]
+        columns = [*own.values(), *fields.flatten(), *besides.values()]
+        arrays = [column.cast(field.type) for column, field in zip(columns, schema, strict=True)]
+        table = pa.Table.from_arrays(arrays, schema=pa.schema(schema))
         return Piece(table, layout, batch.payload_bytes + _OWN_BYTES * len(rows))
-
-    def _fields(self, records: Records, layout: PointLayout | None) -> dict[str, pa.Array[Any]]:
-        """Columns of the fields, by their names; notes where the arrays are."""
-        struct = self._struct(records, "", layout)
-        shaped = self._shape.columns(struct)
-        self._kind = shaped.type
-        found = {
-            shaped.type.field(number).name: shaped.field(number)
-            for number in range(shaped.type.num_fields)
-        }
-        self.columns = [
-            ArrayColumn(array.path, _column_path(shaped.type, array.path), array.dtype.str[1:])
-            for array in self.arrays
-            if layout is None or array.path != DATA
-        ]
-        if layout is not None:
-            data = field_at(records, DATA)
-            assert isinstance(data, Arrays)
-            assert isinstance(data.values, Scalars)
-            found[POINTS] = _points(layout, data.values.values, data.offset)
-        return found
-
-    def _schema_of(self, fields: Mapping[str, pa.Array[Any]]) -> Iterator[pa.Field[Any]]:
-        own = {self._kind.field(n).name: self._kind.field(n) for n in range(self._kind.num_fields)}
-        for name, column in fields.items():
-            yield own[name] if name in own else pa.field(name, column.type)
 
     def _struct(self, records: Records, prefix: str, layout: PointLayout | None) -> pa.StructArray:
         cut = {array.path for array in self.arrays}
@@ -208,9 +148,7 @@ class TopicColumns:
             if isinstance(column, Records):
                 arrays[name] = self._struct(column, f"{path}.", layout)
             elif path in cut and _is_bytes(column):
-                assert isinstance(column, Arrays)
-                assert isinstance(column.values, Scalars)
-                arrays[name] = _binary(column.values.values, column.offset)
+                arrays[name] = _binary(*_data_of(column))
             else:
                 arrays[name] = array_of(column)
         return structs(arrays, records.rows)
@@ -226,21 +164,17 @@ def _required(kind: Any) -> Any:
     return kind
 
 
-def _column_path(kind: Any, path: str) -> str:
-    """The dotted path of the column of a field."""
-    names = []
-    for name in path.split("."):
-        inner = [kind.field(number) for number in range(kind.num_fields)]
-        (found,) = [field for field in inner if original_name(field) == name]
-        names.append(found.name)
-        kind = found.type
-    return ".".join(names)
-
-
 def _is_bytes(column: Column) -> bool:
     if not isinstance(column, Arrays) or not isinstance(column.values, Scalars):
         return False
     return bool(column.values.values.dtype == np.uint8)
+
+
+def _data_of(column: Column) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Elements and bounds of arrays of numbers."""
+    assert isinstance(column, Arrays)
+    assert isinstance(column.values, Scalars)
+    return column.values.values, column.offset
 
 
 def _binary(data: NDArray[np.uint8], offset: NDArray[np.int64]) -> pa.Array[Any]:
@@ -273,41 +207,19 @@ def _padding(
     return _binary(np.concatenate(found), offsets(sizes))
 
 
-def _recipe(parts: Split, padding: pa.Array[Any] | None) -> pa.StructArray:
+def _recipe(layout: PointLayout | None, parts: Split, records: Records) -> dict[str, pa.Array[Any]]:
+    """What the original bytes need besides the arrays, and the points of unpacked clouds."""
     rows, arrays = parts.at.shape
     bounds = np.arange(rows + 1, dtype=np.int64) * arrays
     columns = {
         "rest": _binary(parts.rest, parts.rest_offset),
         "at": lists(numbers(parts.at.ravel().astype(np.uint32)), bounds),
     }
-    if padding is not None:
-        columns["padding"] = padding
-    return structs(columns, rows)
-
-
-def _own_columns(
-    chunk: StoredChunk,
-    rows: NDArray[np.intp],
-    batch: Batch,
-    has_publish_time: NDArray[np.bool_],
-) -> dict[str, pa.Array[Any]]:
-    count = len(rows)
-    reference = {
-        "seg": numbers(np.full(count, chunk.segment, np.int32)),
-        "chunk": numbers(np.full(count, chunk.number, np.int64)),
-        "off": numbers(batch.offset.astype(np.int64)),
-        "len": numbers(batch.length.astype(np.int64)),
-    }
-    has_none = ~has_publish_time & (batch.publish_time == batch.log_time)
-    return {
-        "log_time": pa.array(batch.log_time // 1000).cast(_TIME),
-        "t": pa.array(batch.log_time),
-        "seq": pa.array(chunk.seq[rows]),
-        "pub": pa.array(batch.publish_time, mask=has_none),
-        "channel": pa.array(batch.channel.astype(np.int32)),
-        "sequence": pa.array(batch.sequence),
-        "ref": structs(reference, count),
-    }
+    if layout is None:
+        return {RECIPE: structs(columns, rows)}
+    data, offset = _data_of(field_at(records, DATA))
+    columns["padding"] = _padding(layout, data, offset)
+    return {POINTS: _points(layout, data, offset), RECIPE: structs(columns, rows)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,11 +230,13 @@ class Rebuilt:
         data: uint8, whole message records, one after the other.
         offset: int64[n + 1], bounds of each record.
         place: int64[n], where each record starts in the content of its chunk.
+        seq: int64[n], arrival numbers.
     """
 
     data: NDArray[np.uint8]
     offset: NDArray[np.int64]
     place: NDArray[np.int64]
+    seq: NDArray[np.int64]
 
 
 class Rebuilder:
@@ -330,53 +244,38 @@ class Rebuilder:
 
     Args:
         wire: Encoding of the messages, `ros1` or `cdr`.
-        arrays: All arrays in the order of the wire; the points of clouds as their `data`.
-        columns: Column of each array, by the path of its field.
+        order: Paths of all arrays in the order of the wire; the points of clouds as their `data`.
         layout: Layout of the points of clouds, where they are unpacked.
     """
 
-    def __init__(
-        self,
-        wire: str,
-        columns: Sequence[ArrayColumn],
-        order: Sequence[str],
-        layout: PointLayout | None,
-    ) -> None:
+    def __init__(self, wire: str, order: Sequence[str], layout: PointLayout | None) -> None:
         self._wire: Any = wire
-        self._columns = {column.path: column for column in columns}
         self._order = order
         self._layout = layout
 
-    @property
-    def needed(self) -> list[str]:
-        """Dotted paths of the columns that it reads."""
-        own = ["t", "pub", "channel", "sequence", "ref.off", "ref.len"]
-        arrays = [column.column for column in self._columns.values()]
-        points = [] if self._layout is None else [POINTS]
-        return [*own, *arrays, *points, RECIPE]
-
-    def records(self, table: pa.Table) -> Rebuilt:
+    def records(self, own: Mapping[str, pa.Array[Any]], fields: pa.StructArray) -> Rebuilt:
         """The message records of some rows.
 
         Args:
-            table: Has the columns `needed`.
+            own: The columns `NEEDED`.
+            fields: The arrays, as fields of messages.
 
         Raises:
             ValueError: The rows contradict each other.
         """
-        payloads, bounds = join(self._parts(table))
+        payloads, bounds = join(self._parts(own, fields))
         length = np.diff(bounds)
-        if (length != _numbers(table, "ref.len")).any():
+        if (length != _numbers(own, "ref.len")).any():
             raise ValueError("rebuilt messages have another length")
-        log_time = _numbers(table, "t")
-        pub = column_at(table, "pub")
+        log_time = _numbers(own, "t")
+        pub = own["pub"]
         publish = pub.fill_null(0).to_numpy(zero_copy_only=False)
         is_missing = pub.is_null().to_numpy(zero_copy_only=False)
         heads = np.zeros(len(length), MESSAGE_HEAD)
         heads["opcode"] = 5
         heads["length"] = MESSAGE_HEAD.itemsize - 9 + length
-        heads["channel"] = _numbers(table, "channel")
-        heads["sequence"] = _numbers(table, "sequence")
+        heads["channel"] = _numbers(own, "channel")
+        heads["sequence"] = _numbers(own, "sequence")
         heads["log_time"] = log_time
         heads["publish_time"] = np.where(is_missing, log_time, publish)
         size = MESSAGE_HEAD.itemsize
@@ -388,49 +287,45 @@ class Rebuilder:
             np.full((len(length), 1), size, np.int64),
         )
         data, record_bounds = join(whole)
-        return Rebuilt(data, record_bounds, _numbers(table, "ref.off") - size)
+        place = _numbers(own, "ref.off") - size
+        return Rebuilt(data, record_bounds, place, _numbers(own, "seq"))
 
-    def _parts(self, table: pa.Table) -> Split:
-        rest, rest_offset = bytes_of(column_at(table, f"{RECIPE}.rest"))
-        at, _ = values_of(column_at(table, f"{RECIPE}.at"))
+    def _parts(self, own: Mapping[str, pa.Array[Any]], fields: pa.StructArray) -> Split:
+        rest, rest_offset = bytes_of(_at(own, f"{RECIPE}.rest"))
+        at, _ = values_of(_at(own, f"{RECIPE}.at"))
         rows = len(rest_offset) - 1
         starts = rest_offset[:-1]
         is_big = big_endian_rows(self._wire, rest.data, starts, np.diff(rest_offset))
         arrays, sizes = [], []
         for path in self._order:
-            if path in self._columns:
-                values, bounds = values_of(column_at(table, self._columns[path].column))
-                kind = np.dtype(self._columns[path].dtype)
-                if values.dtype != kind:
-                    raise ValueError("a column has another type")
-                arrays.append(_wire_bytes(values, bounds, is_big))
-                sizes.append(np.diff(bounds) * kind.itemsize)
-            else:
-                data, size = self._cloud(table)
+            if path == DATA and self._layout is not None:
+                data, size = _cloud(self._layout, own)
                 arrays.append(data)
                 sizes.append(size)
+                continue
+            values, bounds = values_of(field_of(fields, path))
+            arrays.append(_wire_bytes(values, bounds, is_big))
+            sizes.append(np.diff(bounds) * values.itemsize)
         places = at.astype(np.int64).reshape(rows, len(self._order))
         return Split(rest, rest_offset, places, arrays, np.column_stack(sizes))
 
-    def _cloud(self, table: pa.Table) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Data of the clouds, and bytes of each."""
-        layout = self._layout
-        if layout is None:
-            raise ValueError("an array has no column")
-        columns = {
-            field.column: values_of(column_at(table, f"{POINTS}.{field.column}"))
-            for field in layout.fields
-        }
-        first = layout.fields[0]
-        bounds = columns[first.column][1] // first.count
-        padding, padding_offset = bytes_of(column_at(table, f"{RECIPE}.padding"))
-        values = {name: column for name, (column, _) in columns.items()}
-        whole = layout.pack(values, int(bounds[-1]))
-        for row in np.flatnonzero(np.diff(padding_offset)).tolist():
-            begin, end = int(bounds[row]) * layout.step, int(bounds[row + 1]) * layout.step
-            own = padding[int(padding_offset[row]) : int(padding_offset[row + 1])]
-            layout.pad(whole[begin:end], own)
-        return whole, np.diff(bounds) * layout.step
+
+def _cloud(
+    layout: PointLayout, own: Mapping[str, pa.Array[Any]]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Data of clouds, and bytes of each."""
+    columns = {
+        field.column: values_of(field_of(own[POINTS], field.column)) for field in layout.fields
+    }
+    first = layout.fields[0]
+    bounds = columns[first.column][1] // first.count
+    padding, padding_offset = bytes_of(_at(own, f"{RECIPE}.padding"))
+    whole = layout.pack({name: values for name, (values, _) in columns.items()}, int(bounds[-1]))
+    for row in np.flatnonzero(np.diff(padding_offset)).tolist():
+        begin, end = int(bounds[row]) * layout.step, int(bounds[row + 1]) * layout.step
+        given = padding[int(padding_offset[row]) : int(padding_offset[row + 1])]
+        layout.pad(whole[begin:end], given)
+    return whole, np.diff(bounds) * layout.step
 
 
 def _wire_bytes(
@@ -444,28 +339,40 @@ def _wire_bytes(
     return np.ascontiguousarray(little).view(np.uint8)
 
 
-def column_at(table: pa.Table, path: str) -> pa.Array[Any]:
-    """A column by its dotted path, in one piece.
+def rows_of(table: pa.Table) -> tuple[dict[str, pa.Array[Any]], pa.StructArray]:
+    """Our columns by name, and the others as fields of messages."""
+    own: dict[str, pa.Array[Any]] = {}
+    fields, columns = [], []
+    for field, column in zip(table.schema, table.columns, strict=True):
+        array = column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks)
+        if field.name in OWN_COLUMNS or OWN in (field.metadata or {}):
+            own[field.name] = array
+        else:
+            fields.append(field)
+            columns.append(array)
+    return own, records_of(pa.StructArray.from_arrays(columns, fields=fields))
+
+
+def field_of(array: pa.StructArray, path: str) -> pa.Array[Any]:
+    """A field of messages by its dotted path.
 
     Raises:
         ValueError: It is missing.
     """
-    name, *inner = path.split(".")
-    try:
-        column = table.column(name)
-    except KeyError as error:
-        raise ValueError(f"the column {path} is missing") from error
-    array = column.chunk(0) if column.num_chunks == 1 else pa.concat_arrays(column.chunks)
-    for name in inner:
-        index = array.type.get_field_index(name) if pa.types.is_struct(array.type) else -1
-        if index < 0:
+    for name in path.split("."):
+        if not pa.types.is_struct(array.type) or array.type.get_field_index(name) < 0:
             raise ValueError(f"the column {path} is missing")
-        array = array.field(index)
+        array = array.field(name)
     return array
 
 
-def _numbers(table: pa.Table, path: str) -> NDArray[Any]:
-    array = column_at(table, path)
+def _at(own: Mapping[str, pa.Array[Any]], path: str) -> pa.Array[Any]:
+    name, _, rest = path.partition(".")
+    return field_of(own[name], rest) if rest else own[name]
+
+
+def _numbers(own: Mapping[str, pa.Array[Any]], path: str) -> NDArray[Any]:
+    array = _at(own, path)
     if array.null_count:
         raise ValueError(f"the column {path} has nulls")
     return array.to_numpy(zero_copy_only=False)

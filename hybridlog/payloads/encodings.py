@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hybridlog.payloads.columns import column_at
-from hybridlog.payloads.layout import OWN_COLUMNS, RECIPE
+from hybridlog.payloads.columns import field_of
+from hybridlog.payloads.layout import RECIPE
+from hybridlog.tables.layout import OWN_COLUMNS
 from hybridlog.tables.parquet_file import DICTIONARY, leaf_paths
 
 if TYPE_CHECKING:
@@ -31,13 +32,14 @@ def encodings_of(table: pa.Table) -> dict[str, str]:
         table: The first rows.
     """
     chosen = {f"{RECIPE}.rest": _PLAIN, f"{RECIPE}.padding": _PLAIN}
+    rows = table.to_struct_array().combine_chunks()
     for path, kind in leaf_paths(table.schema):
         if path.partition(".")[0] in OWN_COLUMNS or path in chosen:
             continue
         if pa.types.is_binary(kind):
             chosen[path] = _PLAIN
         elif path.count(_ELEMENT) == 1 and path.endswith(_ELEMENT):
-            array = column_at(table, path.removesuffix(_ELEMENT))
+            array = field_of(rows, path.removesuffix(_ELEMENT))
             found = smallest(array.flatten().slice(0, _TRIED))
             if found:
                 chosen[path] = found

@@ -20,8 +20,6 @@ RECIPE: Final = "recipe"
 """Column with what the original bytes need besides the arrays."""
 POINTS: Final = "points"
 """Column of the points of clouds, in place of their `data`."""
-OWN_COLUMNS: Final = ("log_time", "t", "seq", "pub", "channel", "sequence", "ref")
-"""Columns of every file, before the fields of the messages."""
 PAYLOAD_RESERVED: Final = RESERVED | {"sequence", RECIPE, POINTS}
 """Names that no column of a field has."""
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 import pyarrow as pa
 
-from hybridlog.payloads.columns import TopicColumns, column_at, values_of
+from hybridlog.payloads.columns import TopicColumns, field_of, rows_of, values_of
 from hybridlog.payloads.encodings import LEVEL, encodings_of
 from hybridlog.payloads.layout import IN_PAYLOADS, payload_file
 from hybridlog.payloads.zones import Zone
@@ -23,9 +22,10 @@ from hybridlog.tables.layout import (
 from hybridlog.tables.parquet_file import ParquetFileWriter
 from hybridlog_storage import durability, files
 from hybridlog_storage.journal import PayloadFile
+from hybridlog_storage.row_order import order_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from hybridlog.payloads.clouds import PointLayout
@@ -56,7 +56,6 @@ class _OpenFile:
     """
 
     name: str
-    columns: list[list[str]] = field(default_factory=list)
     writer: ParquetFileWriter | None = None
     tables: list[pa.Table] = field(default_factory=list)
     waiting: int = 0
@@ -116,7 +115,6 @@ class TopicWriter:
             schema = table_schema_of(self._channel)
             name = payload_file(topic_folder(self._channel.topic), schema, self._number())
             file = self._open[piece.layout] = _OpenFile(name)
-            file.columns = [column.to_json() for column in self._columns.columns]
         file.tables.append(piece.table)
         file.waiting += piece.size
         file.size += piece.size
@@ -138,13 +136,6 @@ class TopicWriter:
             layout, file = self._open.popitem()
             self._finish(file, layout)
 
-    def discard(self) -> None:
-        """Delete what is unfinished."""
-        for file in self._open.values():
-            if file.writer is not None:
-                file.writer.discard()
-        self._open.clear()
-
     def _flush(self, file: _OpenFile) -> None:
         table = pa.concat_tables(file.tables).combine_chunks()
         path = self._folder / file.name
@@ -157,16 +148,21 @@ class TopicWriter:
             file.writer.write(table)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
-        time, seq = (column_at(table, name).to_numpy() for name in ("t", "seq"))
+        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
         first, last = (int(time[0]), int(seq[0])), (int(time[-1]), int(seq[-1]))
-        is_next = (time[1:] > time[:-1]) | ((time[1:] == time[:-1]) & (seq[1:] > seq[:-1]))
-        file.is_ordered &= file.last < first and bool(is_next.all())
+        file.is_ordered &= file.last < first and order_of(time, seq) is None
         file.last = last
         file.bounds.append((len(time), *first, *last))
         file.chunks.append(file.pending)
-        file.zones.append(_zones(table, file.columns))
+        file.zones.append(self._zones(table))
         file.rows += len(time)
         file.tables, file.pending, file.waiting = [], [], 0
+
+    def _zones(self, table: pa.Table) -> dict[str, list[Any]]:
+        """The zones of the arrays in a row group, but for those of bytes."""
+        fields = rows_of(table)[1]
+        paths = [a.path for a in self._columns.arrays if a.dtype != np.uint8]
+        return {path: Zone.of(*values_of(field_of(fields, path))).to_json() for path in paths}
 
     def _finish(self, file: _OpenFile, layout: PointLayout | None) -> None:
         if file.tables:
@@ -174,7 +170,6 @@ class TopicWriter:
         assert file.writer is not None
         payloads: dict[str, Any] = {
             "wire": self._channel.message_encoding,
-            "arrays": file.columns,
             "order": [array.path for array in self._columns.arrays],
             "layout": layout.to_json() if layout is not None else None,
             "chunks": file.chunks,
@@ -184,47 +179,12 @@ class TopicWriter:
         topics = {self._channel.topic: TopicCounts(file.rows)}
         path = self._folder / file.name
         try:
-            file.writer.close(
-                About(
-                    [Section(self._recording, 0, file.segments, topics)],
-                    bounds=tuple(file.bounds),
-                    payloads=payloads,
-                )
+            about = About(
+                [Section(self._recording, 0, file.segments, topics)],
+                bounds=tuple(file.bounds),
+                payloads=payloads,
             )
-            size, digest = synced(path)
+            size, digest = file.writer.close(about, sync=True)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
         self.written.append(PayloadFile(file.name, size, digest, self._channel.topic, file.rows))
-
-
-def _zones(table: pa.Table, columns: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
-    """The zones of the arrays in a row group, but for those of bytes."""
-    found = {}
-    for path, column, dtype in columns:
-        if dtype != "u1":
-            values, bounds = values_of(column_at(table, column))
-            found[path] = Zone.of(values, bounds).to_json()
-    return found
-
-
-def synced(path: Path) -> tuple[int, str]:
-    """Force a file to the disk; return its size, and the digest of its footer.
-
-    Raises:
-        OSError: It cannot be read or synced.
-    """
-    fd = files.open_file(path, os.O_RDONLY, depth=IN_PAYLOADS)
-    try:
-        durability.sync_file(fd)
-        return footer_digest(fd)
-    finally:
-        os.close(fd)
-
-
-def footer_digest(fd: int) -> tuple[int, str]:
-    """Size of a Parquet file, and SHA-256 of its footer, which has checksums of the rest."""
-    size = os.fstat(fd).st_size
-    tail = os.pread(fd, 8, max(size - 8, 0))
-    length = min(int.from_bytes(tail[:4], "little") + 8, size)
-    footer = os.pread(fd, length, size - length)
-    return size, f"sha256:{hashlib.sha256(footer).hexdigest()}"

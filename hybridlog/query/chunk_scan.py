@@ -21,6 +21,7 @@ import numpy as np
 from hybridlog.query.counters import Counters
 from hybridlog_storage.copying import interleave, joined
 from hybridlog_storage.distinct import distinct
+from hybridlog_storage.row_order import order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches
 
@@ -405,23 +406,20 @@ def _merged(runs: list[MessageRun]) -> MessageRun:
 
 def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
     """Merge runs, sorted by log time, recording and arrival."""
-    if len(runs) == 1 and not plan.reverse and _is_in_order(runs[0]):
-        return runs[0]
     keys = np.array([int(channel.recording.key, 16) for channel in plan.channels], np.uint64)
     times = np.concatenate([r.batch.log_time for r in runs])
     channels = np.concatenate([r.batch.channel for r in runs])
     seq = np.concatenate([r.seq for r in runs])
-    order = np.lexsort((seq, keys[channels], times))
+    order = order_of(times, keys[channels], seq)
+    if order is None and len(runs) == 1 and not plan.reverse:
+        return runs[0]
+    if order is None:
+        order = np.arange(len(times))
     if plan.reverse:
         order = order[::-1]
     if len(runs) == 1:
         return runs[0].take(order)
     return MessageRun(interleave([r.batch for r in runs], order), seq[order], plan.channels)
-
-
-def _is_in_order(run: MessageRun) -> bool:
-    """True if a run of one chunk is sorted; strictly increasing log times suffice."""
-    return bool((run.batch.log_time[1:] > run.batch.log_time[:-1]).all())
 
 
 def _groups(tasks: list[ChunkTask], limit: int = 50_000) -> Iterator[list[ChunkTask]]:

@@ -38,9 +38,8 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines.base import Engine, Objects, Outcomes, Values
-    from hybridlog.query.engines.payload_columns import PayloadColumns
     from hybridlog.query.engines.running import RunningTables
-    from hybridlog.query.engines.tables import TablesEngine
+    from hybridlog.query.engines.tables import ArraysEngine, TablesEngine
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
@@ -91,10 +90,10 @@ class Planner:
         return TablesEngine(self.session, self.counters)
 
     @lazy
-    def _columns(self) -> PayloadColumns:
-        from hybridlog.query.engines.payload_columns import PayloadColumns
+    def _columns(self) -> ArraysEngine:
+        from hybridlog.query.engines.tables import ArraysEngine
 
-        return PayloadColumns(self.session, self.counters)
+        return ArraysEngine(self.session, self.counters)
 
     @lazy
     def _running(self) -> RunningTables:

@@ -325,7 +325,8 @@ def _example(array: Array) -> Array:
 def converted(array: Array, kind: pa.DataType) -> Array:
     """The values of an array in another type that represents them.
 
-    Arrays become summaries where the type is that of summaries.
+    Arrays become summaries where the type is that of summaries, and bytes become lists of
+    numbers.
 
     Raises:
         pa.ArrowInvalid: the type does not represent them exactly.
@@ -338,12 +339,23 @@ def converted(array: Array, kind: pa.DataType) -> Array:
         return json_array(plain_values(array))
     if _types.is_struct(kind):
         return _converted_struct(array, kind)
+    if is_list(kind) and _types.is_binary(array.type):
+        array = _numbers_of(array)
     if is_list(kind) and is_list(array.type):
         made = with_values(array, converted(array.flatten(), kind.value_type))
         return made if made.type == kind else made.cast(kind)
     if any(same(kind) and same(array.type) for same in (_is_countable, is_text, is_bytes)):
         return array.cast(kind)
     raise pa.ArrowInvalid(f"{array.type} is not {kind}")
+
+
+def _numbers_of(array: Array) -> Array:
+    """Bytes as lists of numbers, without a copy."""
+    validity, places, data = array.buffers()
+    data = data if data is not None else pa.py_buffer(b"")
+    values = pa.Array.from_buffers(pa.uint8(), data.size, [None, data])
+    kind, buffers = pa.list_(pa.uint8()), [validity, places]
+    return pa.Array.from_buffers(kind, len(array), buffers, offset=array.offset, children=[values])
 
 
 def _is_countable(kind: pa.DataType) -> bool:

@@ -25,8 +25,8 @@ from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
+    from hybridlog.payloads.reader import ArrayTable
     from hybridlog.session import Session
-    from hybridlog.sql.payload_arrays import PayloadArrays
     from hybridlog.tables.reader import TablePart, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
@@ -111,12 +111,9 @@ class TopicOfRecording:
         }
 
     @lazy
-    def arrays(self) -> PayloadArrays:
-        """The columns of its payloads."""
-        from hybridlog.sql.payload_arrays import PayloadArrays
-
-        readers = self.session.payload_readers(self.entry, self.topic)
-        return PayloadArrays(readers or [])
+    def arrays(self) -> ArrayTable | None:
+        """The columns of its arrays."""
+        return self.session.arrays(self.entry, self.topic)
 
     @property
     def is_fixed(self) -> bool:
@@ -226,8 +223,7 @@ class _TableRows:
             raise DamagedTableError(self._source, str(error)) from error
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
-        counts.files.add(str(self._part.file.path))
-        counts.row_groups += 1
+        counts.add_group(self._part.file.path, self._part.group)
         is_whole = not (self._table.unreadable or self._table.reduced)
         wanted = own if is_whole else {*own, "state"}
         try:

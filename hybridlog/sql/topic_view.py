@@ -426,7 +426,9 @@ def _from_payloads(
         place = int(ref["seg"][group[0]]), int(ref["chunk"][group[0]])
         own = recording.channels[int(channel[group[0]])]
         good = np.arange(len(group))
-        records = recording.arrays.read(own, place, ref["off"][group], paths, counts)
+        arrays, records = recording.arrays, None
+        if arrays is not None:
+            records = arrays.at(place, ref["off"][group], paths, counts)
         if records is None:
             chunk = recording.chunk(*place, counts)
             buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]

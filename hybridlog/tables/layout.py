@@ -62,6 +62,8 @@ ORIGINAL: Final = b"hybridlog.name"
 """Metadata of a column: the name of its field, if it differs."""
 SUMMARY: Final = b"hybridlog.summary"
 """Metadata of a column: the name of the array whose summaries it has."""
+OWN: Final = b"hybridlog.own"
+"""Metadata of a column that is none of a field, besides `OWN_COLUMNS`."""
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
 VERSION: Final = 2

@@ -138,12 +138,15 @@ class ParquetFileWriter:
         """
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
 
-    def close(self, about: About, *, sync: bool = False) -> None:
+    def close(self, about: About, *, sync: bool = False) -> tuple[int, str]:
         """Finish the file.
 
         Args:
             about: The description of the file, without `body` and `checksums`.
             sync: True to force it to the disk.
+
+        Returns:
+            Its bytes, and the digest of its footer.
 
         Raises:
             OSError: the file cannot be written.
@@ -162,7 +165,7 @@ class ParquetFileWriter:
                 {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
             )
             self._writer.close()
-            self._sink.finish(sync=sync)
+            return self._sink.finish(sync=sync)
         except BaseException:
             self.discard()
             raise
@@ -220,8 +223,8 @@ class _Sink:
         self._footer = bytearray()
         return self._position, "".join(self._checksums)
 
-    def finish(self, *, sync: bool) -> None:
-        """Seal the footer, and write all remaining bytes."""
+    def finish(self, *, sync: bool) -> tuple[int, str]:
+        """Seal the footer, write all remaining bytes; return size and digest of the footer."""
         assert self._footer is not None
         marks = [found.start(1) for found in _SEAL.finditer(self._footer)]
         if len(marks) != 1:
@@ -234,6 +237,7 @@ class _Sink:
             files.system.sync(self._fd)
         os.close(self._fd)
         self._fd = -1
+        return self._position, digest_of(self._footer)
 
     def abandon(self) -> None:
         self._is_abandoned = True
@@ -305,7 +309,7 @@ class ParquetFileReader:
     @property
     def digest(self) -> str:
         """Digest of the footer, which has checksums of all other bytes."""
-        return f"sha256:{hashlib.sha256(self._source.footer).hexdigest()}"
+        return digest_of(self._source.footer)
 
     @property
     def groups(self) -> int:
@@ -576,6 +580,11 @@ def _runs(path: str, kind: pa.DataType) -> bool:
     if path in _RUNNING or pa.types.is_timestamp(kind):
         return True
     return path.endswith(".seq") and bool(pa.types.is_integer(kind))
+
+
+def digest_of(footer: Buffer) -> str:
+    """Digest of a footer, which has checksums of all other bytes."""
+    return f"sha256:{hashlib.sha256(footer).hexdigest()}"
 
 
 def _checksum(data: Buffer) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate, chain
@@ -39,6 +39,7 @@ from hybridlog.tables.layout import (
     IN_PARTS,
     IN_TABLES,
     ORIGINAL,
+    OWN,
     OWN_COLUMNS,
     SHARED,
     SUFFIX,
@@ -53,6 +54,7 @@ from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
 from hybridlog_storage import files
 from hybridlog_storage.errors import StoreError, unreadable
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.row_order import order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
 
@@ -60,6 +62,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.intervals import Span
+    from hybridlog.query.predicate.tree import Node
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
 MAX_BYTES: Final = 64 << 20
@@ -330,15 +333,25 @@ class TopicTable:
             for file in self.files
         )
 
-    def size(self, paths: Collection[str] | None = None, own: Collection[str] = ()) -> int:
+    def size(
+        self,
+        paths: Collection[str] | None = None,
+        own: Collection[str] = (),
+        where: Node | None = None,
+    ) -> int:
         """Stored bytes to read for some fields.
 
         Args:
             paths: As for `fields`.
             own: Columns of the table itself.
+            where: As for `scan`.
         """
         own = {"t", "seq", *own}
-        return sum(part.file.stored(part.group, paths, own) for part in self._parts)
+        return sum(
+            part.file.stored(part.group, paths, own)
+            for part in self._parts
+            if self.may_hold(part, where)
+        )
 
     def scan(
         self,
@@ -346,6 +359,8 @@ class TopicTable:
         *,
         own: Collection[str] = (),
         spans: Sequence[Span] | None = None,
+        where: Node | None = None,
+        every: bool = True,
     ) -> Iterator[TableRows]:
         """Messages by log time and arrival, one row group at a time.
 
@@ -353,31 +368,36 @@ class TopicTable:
             paths: Dotted paths of fields, including all fields below them; None for all.
             own: Columns of the table itself besides log time and arrival number.
             spans: Ranges of log time, ns, disjoint, in order; None for all times.
+            where: A predicate. Row groups in which it holds for no row have null fields.
+            every: False to leave such row groups out.
 
         Raises:
             StoreError: the data read is damaged.
         """
         kind = self.empty(paths)
-        streams = [self._read_run(run, paths, own, spans, kind) for run in self._runs]
+        runs = [[p for p in run if every or self.may_hold(p, where)] for run in self._runs]
+
+        def read(part: TablePart) -> TableRows:
+            return self._read(part, paths, own, kind, where)
+
+        streams = [self._read_run(run, spans, read) for run in runs]
         return streams[0] if len(streams) == 1 else _merged(streams)
 
     def _read_run(
         self,
         run: Sequence[TablePart],
-        paths: Collection[str] | None,
-        own: Collection[str],
         spans: Sequence[Span] | None,
-        kind: Any,
+        read: Callable[[TablePart], TableRows],
     ) -> Iterator[TableRows]:
         for part in run:
             if spans is None:
-                yield self._read(part, paths, own, kind)
+                yield read(part)
                 continue
             low, high = span_of(part.first[0], part.last[0])
             near = [span for span in spans if span[0] < high and span[1] > low]
             if not near:
                 continue
-            rows = self._read(part, paths, own, kind)
+            rows = read(part)
             bounds = np.searchsorted(placed(rows.t), np.array(near, np.int64).reshape(-1, 2))
             begins, counts = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
             if len(near) == 1:
@@ -388,11 +408,24 @@ class TopicTable:
                 yield rows
 
     def _read(
-        self, part: TablePart, paths: Collection[str] | None, own: Collection[str], kind: Any
+        self,
+        part: TablePart,
+        paths: Collection[str] | None,
+        own: Collection[str],
+        kind: Any,
+        where: Node | None,
     ) -> TableRows:
-        ours, records = self.read(part, paths, {"t", "seq", *own})
+        is_excluded = not self.may_hold(part, where)
+        ours, records = self.read(part, () if is_excluded else paths, {"t", "seq", *own})
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
-        return TableRows(t, seq, ours, alike([kind, records], by_type=True)[1])
+        if is_excluded:
+            nulls = {field.name: pa.nulls(len(t), field.type) for field in kind.type}
+            return TableRows(t, seq, ours, structs(nulls, len(t)))
+        return TableRows(t, seq, ours, self._fitted(records, kind))
+
+    def _fitted(self, records: Any, kind: Any) -> Any:
+        """Fields of a row group in the type of all."""
+        return alike([kind, records], by_type=True)[1]
 
     @property
     def parts(self) -> list[TablePart]:
@@ -481,6 +514,10 @@ class TopicTable:
             found.append(self._records(columns, kept, 0))
         first = alike(found, by_type=True)[0]
         return first.slice(0, 0)
+
+    def may_hold(self, part: TablePart, where: Node | None) -> bool:
+        """False if a predicate holds for no row of a row group."""
+        return True
 
 
 class _Cache:
@@ -628,6 +665,11 @@ class Tables:
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._generation = 0
         self._lock = threading.RLock()
+
+    @property
+    def cache(self) -> _Cache:
+        """The cache of decoded columns, for tables that are not in `tables/`."""
+        return self._cache
 
     def invalidate(self) -> None:
         """Forget all files, columns and invalid tables."""
@@ -876,11 +918,12 @@ def _in_order(parts: Sequence[TableRows]) -> TableRows:
     own = {name: pa.concat_arrays([part.own[name] for part in parts]) for name in parts[0].own}
     t, seq = np.concatenate([p.t for p in parts]), np.concatenate([p.seq for p in parts])
     rows = TableRows(t, seq, own, pa.concat_arrays([part.records for part in parts]))
-    return rows.take(np.lexsort((seq, t)))
+    order = order_of(t, seq)
+    return rows if order is None else rows.take(order)
 
 
 def _leaves(top: Any) -> Iterator[_Leaf]:
-    if top.name in _OWN:
+    if top.name in _OWN or OWN in (top.metadata or {}):
         for names, _ in leaves_of(pa.schema([top])):
             yield _Leaf(top.name, True, names)
         return

@@ -42,6 +42,7 @@ from hybridlog_storage import files
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.messages import ORIGINAL_ENCODING
 from hybridlog_storage.messages import REDUCED as REDUCED_ENCODING
+from hybridlog_storage.row_order import order_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -158,7 +159,7 @@ class _Topic:
             known += [fields.type.field(number) for number in range(fields.type.num_fields)]
             arrays += fields.flatten()
         table = pa.Table.from_arrays(arrays, schema=pa.schema(known))
-        order = _order(messages.log_time, messages.seq)
+        order = order_of(messages.log_time, messages.seq)
         return table if order is None else table.take(pa.array(order))
 
 
@@ -660,16 +661,6 @@ def _are_long(pieces: Sequence[Piece]) -> bool:
     """True if rows of a topic have a file of their own."""
     rows, size = sum(piece.rows for piece in pieces), sum(piece.size for piece in pieces)
     return rows >= LONG_ROWS or size >= LONG_BYTES
-
-
-def _order(log_time: NDArray[np.int64], seq: NDArray[np.int64]) -> NDArray[np.intp] | None:
-    """Order of the rows by log time and arrival; None if they are in order already."""
-    later = log_time[1:] > log_time[:-1]
-    if not later.all():
-        same = log_time[1:] == log_time[:-1]
-        if not (later | (same & (seq[1:] > seq[:-1]))).all():
-            return np.lexsort((seq, log_time))
-    return None
 
 
 def _rows_of_group(table: Any) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybridlog.payloads.columns import Piece, Rebuilder, TopicColumns
+from hybridlog.payloads.columns import Piece, Rebuilder, TopicColumns, rows_of
 from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.messages import Batch, Channel
@@ -40,13 +40,13 @@ def chunk_of(payloads: Sequence[bytes], *, channels: Sequence[int] | None = None
 def piece_of(topic: TopicColumns, chunk: StoredChunk, *, publish: bool = True) -> Piece | None:
     """All messages of a chunk as rows."""
     rows = np.arange(len(chunk.batch))
-    return topic.piece(chunk, rows, has_publish_time=np.full(len(rows), publish))
+    return topic.piece(chunk, rows, dict.fromkeys(chunk.batch.channel.tolist(), publish))
 
 
 def rebuilder_of(topic: TopicColumns, piece: Piece, channel: Channel) -> Rebuilder:
     """What makes messages from such rows."""
     order = [array.path for array in topic.arrays]
-    return Rebuilder(channel.message_encoding, topic.columns, order, piece.layout)
+    return Rebuilder(channel.message_encoding, order, piece.layout)
 
 
 def assert_exact(channel: Channel, payloads: Sequence[bytes], *, publish: bool = True) -> Piece:
@@ -55,7 +55,7 @@ def assert_exact(channel: Channel, payloads: Sequence[bytes], *, publish: bool =
     piece = piece_of(topic, chunk, publish=publish)
     assert piece is not None
     rebuilder = rebuilder_of(topic, piece, channel)
-    found = rebuilder.records(piece.table)
+    found = rebuilder.records(*rows_of(piece.table))
     assert found.data.tobytes() == bytes(memoryview(chunk.batch.buffer))
     assert found.place.tolist() == found.offset[:-1].tolist()
     return piece

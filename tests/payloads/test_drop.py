@@ -15,8 +15,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
-from hybridlog.payloads.contents import open_segment
-from hybridlog.payloads.reader import RecordingPayloads
+from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog_storage import journal
 from hybridlog_storage.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, SegmentError

@@ -163,7 +163,7 @@ def test_only_row_groups_that_may_match_are_read(store: Path) -> None:
             assert sum(len(one.holds) for one in found) == COUNT
             assert sum(int(one.holds.sum()) for one in found) == counts[0]
             query.counters.bytes_read = 0
-            planner._columns.count([part])
+            Planner(opened.session, query.question, query.counters)._columns.count([part])
             read[text] = counts[0], query.counters.bytes_read
         assert read["ranges[20] < 0.5"] == read["ranges[20:40] < 0.5"] == (0, 0)
         assert read["ranges[340:380] < 0.5"] == read["ranges[350] < 0.5"]
@@ -181,9 +181,9 @@ def test_sql_reads_each_row_group_once(store: Path) -> None:
         answer = opened.sql("select ranges[11], list_min(ranges[341:380]) from scan order by t")
         found = np.array(answer.rows(), np.float32)
         (file,) = opened.recordings()[0].payloads
-        reader = opened.session.payload_readers(opened.recordings()[0], file["topic"])
-        assert reader is not None
-        groups = reader[0].file.groups
+        table = opened.session.arrays(opened.recordings()[0], file["topic"])
+        assert table is not None
+        groups = table.files[0].groups
         assert (answer.counts.chunks, answer.counts.row_groups) == (0, groups + 1)
     numbers = np.arange(COUNT)
     np.testing.assert_array_equal(found[:, 0], (0.1 * (numbers % 7) + 1).astype(np.float32))

@@ -28,14 +28,17 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.payloads.reader import ArrayTable
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
+    from hybridlog.query.predicate.tree import Node
     from hybridlog.query.question import Part
     from hybridlog.session import Session
     from hybridlog.tables.reader import TableRows, TopicTable
 
 _OPEN_S = 2e-4  # seconds to query an open table
 _BYTE_S = 1.5e-9  # seconds to read and decode a stored byte
+_ARRAY_BYTE_S = 4e-9  # the same for arrays
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 
 
@@ -68,6 +71,8 @@ class TablesEngine:
         self._told: set[Part] = set()
         self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
 
+    _byte_s = _BYTE_S
+
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the stored bytes of the columns; None without a table that can tell."""
         table = self._believed(part, need, fields)
@@ -77,9 +82,10 @@ class TablesEngine:
         try:
             wanted = _wanted(table, part, fields if need is Need.VALUES else ())
         except StoreError:
-            self._session.reject_table(part.recording, part.topic)
+            self._reject(part)
             return None
-        return _OPEN_S + _BYTE_S * table.size(wanted, own) * max(part.share, 0.01)
+        size = table.size(wanted, own, _root(part))
+        return _OPEN_S + self._byte_s * size * max(part.share, 0.01)
 
     def _believed(
         self, part: Part, need: Need, fields: Collection[str] | None
@@ -92,7 +98,7 @@ class TablesEngine:
         if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
             return None  # the table does not say which messages have one
         is_lossy = any(True for _ in lost_spans(part.recording))  # lost rows must not answer
-        if is_lossy or (need is Need.VALUES and not _are_whole(part, fields)):
+        if is_lossy or (need is Need.VALUES and not self._are_whole(part, fields)):
             return None
         table = self._table_of(part)
         is_whole = table is not None and not (table.reduced or part.blind)
@@ -101,6 +107,24 @@ class TablesEngine:
         # A table may be older than the package that reads the messages.
         is_older = not table.has_fields and any(c.codec.indexed for c in part.channels)
         return None if is_older else table
+
+    def _are_whole(self, part: Part, fields: Collection[str] | None) -> bool:
+        """True if tables hold these fields in full: no array that may be a summary."""
+        types = part.field_types
+        if types is None:
+            return False
+        paths = list(types) if fields is None else list(fields)
+        for path in paths:
+            below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
+            if not below:
+                return False
+            for name in below:
+                inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
+                kind, width = types[name], width_of(types[name])
+                is_short = width is not None and width <= _WHOLE and element_of(kind) in SINGLE
+                if not (kind in SINGLE or is_short) and not (inner and not kind.endswith("]")):
+                    return False
+        return True
 
     def count(self, parts: Sequence[Part]) -> int:
         """Number of rows for which the predicate holds.
@@ -165,19 +189,22 @@ class TablesEngine:
                 self._told.add(part)
                 self._counters.unreadable += self._counts[part].unreadable
 
+    def _confirm(self, parts: Sequence[Part]) -> None:
+        """Confirm that the columns can decide, before an answer begins."""
+        for part in parts:
+            if part.predicate is not None:
+                self.check(part)
+                self._tell_unreadable([part])
+
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """The outcome for each row, in order."""
-        if part.predicate is not None:
-            self.check(part)
-            self._tell_unreadable([part])
-        for rows, holds in self._rows(part):
+        self._confirm([part])
+        for rows, holds in self._rows(part, every=True):
             yield Outcomes(rows.t, rows.seq, holds)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Columns of the rows for which the predicate holds, in order."""
-        if part.predicate is not None:
-            self.check(part)
-            self._tell_unreadable([part])
+        self._confirm([part])
         for rows, holds in self._rows(part, fields):
             chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
             if len(chosen):
@@ -186,9 +213,7 @@ class TablesEngine:
     def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
         """References of the rows for which the predicate holds."""
         wanted = {task.key for task in tasks}
-        for part in parts:
-            self.check(part)
-        self._tell_unreadable(parts)
+        self._confirm(parts)
         found: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         for part in parts:
             if part not in self._places:
@@ -209,6 +234,8 @@ class TablesEngine:
         part: Part,
         fields: Collection[str] | None = (),
         own: Collection[str] = (),
+        *,
+        every: bool = False,
         whole: TopicTable | None = None,
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of the part's time, with the outcome for each.
@@ -217,6 +244,7 @@ class TablesEngine:
             part: The part.
             fields: Fields to read.
             own: Columns of the table itself.
+            every: True for rows of all row groups, whatever is known of them.
             whole: All rows of its file, in place of its table.
 
         Raises:
@@ -234,14 +262,19 @@ class TablesEngine:
         if asks_fields and table.unreadable:
             columns.add("state")
         paths = _wanted(table, part, fields)
-        self._counters.bytes_read += int(table.size(paths, own) * min(part.share * 1.2, 1.0))
+        where = _root(part)
+        size = table.size(paths, own, where)
+        self._counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
         try:
-            for rows in table.scan(paths, own=columns, spans=spans):
+            for rows in table.scan(paths, own=columns, spans=spans, where=where, every=every):
                 yield rows, self._holds(part, rows) & ~rows.is_unreadable()
         except StoreError:
             if whole is None:
-                self._session.reject_table(part.recording, part.topic)
+                self._reject(part)
             raise
+
+    def _reject(self, part: Part) -> None:
+        self._session.reject_table(part.recording, part.topic)
 
     def _holds(self, part: Part, rows: TableRows) -> NDArray[np.bool_]:
         predicate = part.predicate
@@ -258,6 +291,60 @@ class TablesEngine:
         if found is None:
             raise UndecidedError(f"The table of {part.topic} cannot tell.")
         return found
+
+
+class ArraysEngine(TablesEngine):
+    """Reads arrays in full from the columns of a recording.
+
+    Args:
+        session: The open store.
+        counters: Count the bytes that are read.
+    """
+
+    _byte_s = _ARRAY_BYTE_S
+
+    def __init__(self, session: Session, counters: Counters) -> None:
+        super().__init__(session, counters, self._arrays_of)
+        self._arrays: dict[tuple[str, str], ArrayTable | None] = {}
+
+    def _arrays_of(self, part: Part) -> ArrayTable | None:
+        key = part.recording.id, part.topic
+        if key not in self._arrays:
+            self._arrays[key] = self._session.arrays(part.recording, part.topic)
+        return self._arrays[key]
+
+    def _believed(
+        self, part: Part, need: Need, fields: Collection[str] | None
+    ) -> TopicTable | None:
+        """The columns of a part, if they hold all of its messages and all fields asked for."""
+        asked = part.predicate.fields() if part.predicate is not None else ()
+        if part.field_types is None or any(map(is_meta, asked)):
+            return None
+        table = self._arrays_of(part)
+        if table is None or super()._believed(part, need, fields) is None:
+            return None
+        if table.rows != part.messages:
+            return None
+        paths = _wanted(table, part, fields if need is Need.VALUES else ())
+        return table if table.covers(paths) else None
+
+    def _are_whole(self, part: Part, fields: Collection[str] | None) -> bool:
+        """True if all fields exist."""
+        types = part.field_types or {}
+        return all(
+            any(name == path or name.startswith((f"{path}.", f"{path}[")) for name in types)
+            for path in fields or ()
+        )
+
+    def _confirm(self, parts: Sequence[Part]) -> None:
+        """Nothing: the types of the columns tell at the first row group."""
+
+    def _reject(self, part: Part) -> None:
+        """Nothing: other engines answer this time."""
+
+
+def _root(part: Part) -> Node | None:
+    return part.predicate.root if part.predicate is not None else None
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:
@@ -304,22 +391,3 @@ def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.Struc
     if not names:
         return structs({}, len(records))
     return pa.StructArray.from_arrays(columns, names=names)
-
-
-def _are_whole(part: Part, fields: Collection[str] | None) -> bool:
-    """True if tables hold these fields in full: no array that may be a summary."""
-    types = part.field_types
-    if types is None:
-        return False
-    paths = list(types) if fields is None else list(fields)
-    for path in paths:
-        below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
-        if not below:
-            return False
-        for name in below:
-            inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
-            kind, width = types[name], width_of(types[name])
-            is_short = width is not None and width <= _WHOLE and element_of(kind) in SINGLE
-            if not (kind in SINGLE or is_short) and not (inner and not kind.endswith("]")):
-                return False
-    return True
