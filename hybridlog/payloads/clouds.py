@@ -94,6 +94,19 @@ class PointLayout:
             return False
         return all(a.end <= b.offset for a, b in pairwise(self.fields))
 
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """A point, as numpy describes it."""
+        fields = self.fields
+        return np.dtype(
+            {
+                "names": [f.column for f in fields],
+                "formats": [(f.dtype, (f.count,)) for f in fields],
+                "offsets": [f.offset for f in fields],
+                "itemsize": self.step,
+            }
+        )
+
     def unpack(self, data: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """Points as columns.
 
@@ -103,19 +116,12 @@ class PointLayout:
         Returns:
             For each field its elements in native byte order, `count` for each point.
         """
-        points = len(data) // self.step
-        found: dict[str, NDArray[Any]] = {}
-        for field in self.fields:
-            kind = np.dtype(field.dtype)
-            view: NDArray[Any] = np.ndarray(
-                (points, field.count),
-                kind,
-                data.data if points else b"\0" * self.step,
-                field.offset,
-                (self.step, kind.itemsize),
-            )
-            found[field.column] = view.astype(kind.newbyteorder("=")).ravel()
-        return found
+        points = np.ascontiguousarray(data).view(self.dtype)
+        columns = {field.column: points[field.column] for field in self.fields}
+        return {
+            name: values.astype(values.dtype.newbyteorder("=")).ravel()
+            for name, values in columns.items()
+        }
 
     def padding(self, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The bytes that no field covers, point by point; empty if all are zero."""
@@ -131,22 +137,10 @@ class PointLayout:
         Raises:
             ValueError: Columns have another length.
         """
-        data = np.zeros(points * self.step, np.uint8)
+        packed = np.zeros(points, self.dtype)
         for field in self.fields:
-            kind = np.dtype(field.dtype)
-            values = columns[field.column]
-            if len(values) != points * field.count:
-                raise ValueError("columns of points differ in length")
-            if points:
-                view: NDArray[Any] = np.ndarray(
-                    (points, field.count),
-                    kind,
-                    data.data,
-                    field.offset,
-                    (self.step, kind.itemsize),
-                )
-                view[:] = values.reshape(points, field.count)
-        return data
+            packed[field.column] = columns[field.column].reshape(points, field.count)
+        return packed.view(np.uint8)
 
     def pad(self, data: NDArray[np.uint8], padding: NDArray[np.uint8]) -> None:
         """Put the padding back into points.
