@@ -106,6 +106,19 @@ def test_reindex_and_verify(store: hl.Store) -> None:
     assert store.all_topics().where(least(3)).count() == 3 * FEW
 
 
+def test_few_commands_verify_many_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = write_log(tmp_path / "log.mcap", 200)
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        store.record(log)
+        sent = commands_of(monkeypatch)
+        assert store.verify().findings == []
+        assert store.verify(["log"]).findings == []
+        assert sent.total() <= 40, sent
+        place = store.topic_place(topic(7))
+        assert database_of(store).delete(place.collection, place.documents()) == 5
+        assert "messages in the segments" in store.verify().findings[-1].problem
+
+
 def test_a_changed_document_of_a_shared_collection_is_found(store: hl.Store) -> None:
     key = store.entry("two").key
     asked = {"_meta.rec": key, "_meta.topic": topic(9), "_meta.seq": 9}

@@ -585,16 +585,16 @@ def remove_rest(
     expected = {entry.key: _documents(entry, places) for entry in known.values()}
     again: set[str] = set()
     strangers: list[object] = []
-    for collection in state.document_collections():
-        pipeline = [{"$group": {"_id": "$_meta.rec", "count": {"$sum": 1}}}]
-        for found in database.aggregate(collection, pipeline):
-            key = found["_id"]
+    collections = state.document_collections()
+    counted = database.count_by(collections, "_meta.rec")
+    for collection, counts in zip(collections, counted, strict=True):
+        for key, count in counts:
             entry = known.get(key) if isinstance(key, str) else None
             if entry is None:
                 strangers.append(key)
                 continue
             # Fewer, too: a document of no recording may have had the key of one.
-            missing = expected[entry.key][collection] - found["count"]
+            missing = expected[entry.key][collection] - count
             if missing < 0 or (missing > 0 and not catalog.damage(entry.id)):
                 again.add(entry.key)
     # Listed after the index: a recording that has begun meanwhile has a directory by now.

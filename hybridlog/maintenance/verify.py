@@ -135,11 +135,12 @@ class _Index:
         self.count_all = count_all
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
         if count_all:
-            pipeline = [{"$group": {"_id": "$_meta.rec", "count": {"$sum": 1}}}]
-            for collection in IndexState(database).document_collections():
-                for found in database.aggregate(collection, pipeline):
-                    if isinstance(found["_id"], str):
-                        self._counts[found["_id"]][collection] = found["count"]
+            collections = IndexState(database).document_collections()
+            counted = database.count_by(collections, "_meta.rec")
+            for collection, counts in zip(collections, counted, strict=True):
+                for key, count in counts:
+                    if isinstance(key, str):
+                        self._counts[key][collection] = count
 
     def documents_of(self, entry: RecordingEntry) -> Counter[str]:
         """Numbers of documents of a recording, by collection."""
@@ -326,8 +327,13 @@ class _Check:
         documents, _ = self._indexer.documents_of([chunk], channels)
         key = self._indexer.recording[:16]
         found = _by_collection(self._indexed.places, documents)
-        for collection, (places, want) in found.items():
+        for collection, (_, want) in found.items():
             self._expected[collection] += len(want)
+        everything = [place for places, _ in found.values() for place in places]
+        whole = [row for _, want in found.values() for row in want]
+        if not found or _compare(self._indexed.database, key, chunk, everything, whole) is None:
+            return
+        for collection, (places, want) in found.items():
             problem = _compare(self._indexed.database, key, chunk, places, want)
             if problem:
                 where = f"{name} byte {chunk.offset}, collection {collection}"
@@ -396,13 +402,13 @@ def _by_collection(
 def _compare(
     database: Database, key: str, chunk: StoredChunk, places: list[TopicPlace], want: list[bytes]
 ) -> str | None:
-    """Compare the documents of a chunk in one collection.
+    """Compare the documents of a chunk in some collections.
 
     Args:
         database: The index.
         key: Key of the recording.
         chunk: The chunk.
-        places: The topics of the chunk that are in the collection.
+        places: The topics of the chunk that are in the collections.
         want: The documents that should be there.
 
     Returns:

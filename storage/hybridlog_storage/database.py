@@ -20,7 +20,6 @@ import json
 import operator
 import re
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
@@ -583,13 +582,14 @@ class Database:
             numbers[place] = number
         return numbers
 
-    def count_by(
-        self, questions: Sequence[tuple[str, Mapping[str, object]]], field: str
-    ) -> dict[object, int]:
-        """Count the documents that match any of many questions, by the value of a field."""
-        numbers: Counter[object] = Counter()
-        for value, number in self._grouped(questions, lambda _: f"${field}"):
-            numbers[value] += number
+    def count_by(self, collections: Sequence[str], field: str) -> list[list[tuple[Any, int]]]:
+        """The values of a field in each of some collections, and how many documents have each."""
+        numbers: list[list[tuple[Any, int]]] = [[] for _ in collections]
+        questions: list[tuple[str, Document]] = [(name, {}) for name in collections]
+        for key, number in self._grouped(
+            questions, lambda place: {"place": {"$literal": place}, "value": f"${field}"}
+        ):
+            numbers[key["place"]].append((key.get("value"), number))
         return numbers
 
     def _grouped(

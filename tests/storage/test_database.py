@@ -261,7 +261,8 @@ def test_many_questions_at_once(database: Database, name: str) -> None:
     ranges = [{"_id": {"$gte": keys[a], "$lt": keys[b]}, "x": {"$ne": 6}} for a, b in spans]
     want = [sum(x != 6 for x in range(a, b)) for a, b in spans]
     assert database.count_each([(name, one) for one in ranges]) == want
-    assert database.count_by([(name, one) for one in ranges], "s") == {"ü" * 20: sum(want)}
+    total = database.count(name, {"s": "ü" * 20})
+    assert database.count_by(["none", name], "s") == [[], [("ü" * 20, total)]]
     # A collection that is not there is empty, at the beginning and elsewhere.
     mixed = [("none", ranges[1]), (name, ranges[1]), ("none", {})]
     assert database.count_each(mixed) == [0, want[1], 0]
