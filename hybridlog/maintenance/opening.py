@@ -90,6 +90,10 @@ def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairRe
 
 
 def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
+    from hybridlog.maintenance import tables
+
+    # A recording has its directory before it has tables.
+    gone = set() if catalog.is_in_memory else tables.unfinished(directory)
     if not catalog.is_in_memory:
         for name in directory.names():
             if name.startswith(REMOVED):
@@ -114,7 +118,12 @@ def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairR
         # The row of a recording that is unreadable now may be valid again later.
         if summary.id not in found and summary.label not in report.unreadable:
             catalog.remove(summary.id)
-    return snapshot_of(catalog, [summary for (summary,) in found.values()])
+            gone.add(summary.id)
+    snapshot = snapshot_of(catalog, [summary for (summary,) in found.values()])
+    if gone and not (catalog.is_in_memory or report.unreadable):
+        tables.remove_unfinished(directory, snapshot)
+        tables.remove_all(directory, gone - found.keys())
+    return snapshot
 
 
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:

@@ -205,6 +205,18 @@ def remove(directory: StoreDirectory, recording: str, types: Collection[str] | N
         files.remove_tree(parts_folder(directory.path, recording), depth=files.IN_FOLDER)
 
 
+def unfinished(directory: StoreDirectory) -> set[str]:
+    """Ids of recordings with unfinished files, or whose removal was not finished."""
+    return {name.removeprefix("r") for name in _names(directory, PARTS)}
+
+
+def remove_all(directory: StoreDirectory, recordings: Collection[str]) -> None:
+    """Remove the tables of removed recordings, as far as that is possible now."""
+    for recording in sorted(recordings):
+        with suppress(OSError):
+            remove(directory, recording)
+
+
 def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
     """Remove unfinished files that a crash has left."""
     for name in _names(directory, PARTS):
@@ -218,8 +230,7 @@ def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
 
 def are_left(directory: StoreDirectory, snapshot: Snapshot) -> bool:
     """True if the removal of the tables of a recording was not finished."""
-    names = _names(directory, PARTS)
-    return any(name.removeprefix("r") not in snapshot.by_id for name in names)
+    return not unfinished(directory) <= snapshot.by_id.keys()
 
 
 def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> None:
@@ -231,11 +242,8 @@ def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> Non
     """
     from hybridlog.tables.folders import recordings_of
 
-    left = {name.removeprefix("r") for name in _names(directory, PARTS)}
-    for recording in sorted(left | recordings_of(directory.path)):
-        if recording[:16] not in present:
-            with suppress(OSError):
-                remove(directory, recording)
+    there = unfinished(directory) | recordings_of(directory.path)
+    remove_all(directory, {one for one in there if one[:16] not in present})
 
 
 def _names(directory: StoreDirectory, top: str) -> list[str]:

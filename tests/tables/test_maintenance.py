@@ -130,6 +130,20 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     assert compare(few) == 90
 
 
+def test_what_is_gone_has_no_tables_without_mongodb(few: hl.Store, tmp_path: Path) -> None:
+    root = few.directory.path
+    before = contents(few)
+    few.record(write_log(tmp_path / "more.mcap", FEW), name="more", again=True)
+    gone = few.entry("more").id
+    few.close()
+    shutil.rmtree(root / "recordings/more")
+    (root / PARTS / f"r{gone}").mkdir(parents=True)
+    (root / PARTS / ("r" + "b" * 32)).mkdir(parents=True)
+    with hl.open(root, mongo="none") as again:
+        assert contents(again) == before
+        assert not unfinished(again)
+
+
 def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
     before = contents(few)
     few.rebuild_index()
