@@ -88,7 +88,7 @@ def path(tmp_path: Path) -> Iterator[Path]:
 def store(path: Path, short: Path) -> Iterator[hl.Store]:
     """A store with the recording `short`, in several segments."""
     with hl.open(path, require_database=True) as opened:
-        settings = SegmentSettings(chunk_size=16 << 10, segment_size=60_000, span_size=0)
+        settings = SegmentSettings(chunk_size=16 << 10, segment_size=55_000, span_size=0)
         report = opened.record(short, settings=settings)
         assert report.entry.label == "short"
         assert report.entry.segments > 2

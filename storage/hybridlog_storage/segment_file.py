@@ -248,7 +248,7 @@ class SegmentFile:
             else:
                 self._write([definitions_chunk(content)])
                 self._prove()
-        self.schemas = schemas | self.schemas
+        self.schemas |= schemas
         self.channels |= {number: (schema, channel) for number, schema, channel in defined}
 
     def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
