@@ -16,8 +16,7 @@ from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.entries import new_id, recording_metadata, sealed_event, text
-from hybridlog.index_writer import IndexTarget, IndexWriter, Lag
-from hybridlog.indexing import ChunkIndexer
+from hybridlog.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
 from hybridlog.tables.writer import TableWriter
@@ -46,9 +45,8 @@ class Backpressure:
     Attributes:
         hurry: Returns whether writing is behind. Then only chunks that shrink to a fifth are
             compressed.
-        behind: Returns whether writing is so far behind that indexing pauses; it later reads
-            chunks back from the segments.
-        has_room: Returns whether this many bytes of chunks may wait for the index in memory.
+        behind: Returns whether writing is so far behind that indexing pauses.
+        index_interval_s: Longest time between two passes of the index, seconds.
         next_chunk_size: Returns the size in bytes of the next chunk.
         spare: Semaphore of the processors for packing that can wait, and for making documents
             and tables.
@@ -58,7 +56,7 @@ class Backpressure:
 
     hurry: Callable[[], bool]
     behind: Callable[[], bool]
-    has_room: Callable[[int], bool]
+    index_interval_s: float
     next_chunk_size: Callable[[], int]
     spare: BoundedSemaphore
     on_written: Callable[[], None]
@@ -115,13 +113,18 @@ class Capture:
             self.entry = self._begin(name, tags, source, target.database)
             self._held = self._held.pop_all()
         self._target = target
-        self.indexer = ChunkIndexer(self.entry.id, has_documents=target.is_wanted)
         recording = directory.recording(self.entry.label)
-        lag = None
-        if pressure:
-            lag = Lag(recording, pressure.behind, pressure.has_room, pressure.spare)
         self._tables = TableWriter(directory.path, self.entry.id)
-        self.index = IndexWriter(self.entry, self.indexer, target, lag=lag, tables=self._tables)
+        self.index = IndexWriter(
+            recording,
+            self.entry,
+            target,
+            catalog,
+            tables=self._tables,
+            behind=pressure.behind if pressure else lambda: False,
+            spare=pressure.spare if pressure else None,
+            interval_s=pressure.index_interval_s if pressure else INTERVAL_S,
+        )
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             recording,
@@ -200,27 +203,23 @@ class Capture:
         self._journal.append(*lines)
         messages = sum(channel.messages for channel in sealed.channels)
         self._tables.seal(sealed.segment, sealed.digest, messages)
+        self.index.seal(sealed)
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()
         failure = self.index.failure
         label = self.entry.label
+        if self.index.damage:
+            self.catalog.put_damage(self.entry.id, self.index.damage)
         try:
             if failure is None:
-                self.entry = finish(
-                    self._directory,
-                    self.catalog,
-                    self.index.database,
-                    label,
-                    turn=self._turn,
-                    decoded=self.index.decoded,
-                )
-                self._tables.close(self.entry)
+                database = self.index.database
+                self.entry = finish(self._directory, self.catalog, database, label, turn=self._turn)
         except DatabaseError as error:
             failure = error
         if failure is not None:
             self.entry = put_entry(self._directory, self.catalog, label)
-        self._tables.discard()
+        self._tables.close(self.entry)
         self._held.close()
         return failure
 

@@ -11,7 +11,6 @@ from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
     DiskFullError,
-    HybridlogError,
     MissingDependencyError,
     ResourceError,
     StoreError,
@@ -54,6 +53,7 @@ class Connection:
     Attributes:
         wanted: The URI that was asked for; None for the one in the store's settings.
         may_write: False if the user of MongoDB may only read.
+        has_none: True if the store does without MongoDB: none is wanted, or ours does not start.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
         index: Id of the index; an index that replaces it has another one. Empty without a
             connection, and for an index without an id that this user may only read.
@@ -63,6 +63,7 @@ class Connection:
         self, directory: StoreDirectory, mongo: str | None, cache_mb: int | None = None
     ) -> None:
         self.may_write = True
+        self.has_none = False
         self.damage: list[str] = []
         self.index = ""
         self._database: Database | None = None
@@ -119,6 +120,7 @@ class Connection:
             )
         uri = self._uri
         if uri == NONE:
+            self.has_none = True
             told = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
             raise WithoutMongoError(
                 f"The store is used without MongoDB ({told}). With --mongo embedded, or --mongo "
@@ -133,7 +135,12 @@ class Connection:
             if self._mongod is None:
                 cache_mb = self._cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
                 self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
-            uri = _started(self._mongod)
+            try:
+                uri = _started(self._mongod)
+            except (DatabaseError, MissingDependencyError, ResourceError) as error:
+                self.has_none = not isinstance(error, DiskFullError)
+                raise
+            self.has_none = False
             timeout_s = _EMBEDDED_TIMEOUT_S
             if self._mongod.damage is not None:
                 self.damage.append(self._mongod.damage)
@@ -144,12 +151,6 @@ class Connection:
         except ConnectionLostError as error:
             shortage = None if self._mongod is None else self._mongod.shortage()
             raise (shortage or error) from error
-
-    def may_record_without(self, error: HybridlogError) -> bool:
-        """True if there is no MongoDB to record with: none is wanted, or ours does not start."""
-        if self._uri == EMBEDDED and not isinstance(error, DiskFullError):
-            return isinstance(error, DatabaseError | MissingDependencyError | ResourceError)
-        return isinstance(error, WithoutMongoError)
 
     def address(self, wait_s: float) -> str:
         """The URI of the index for other programs; it stays the same. Has no password.

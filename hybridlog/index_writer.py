@@ -1,253 +1,53 @@
-"""Indexes chunks in the background.
+"""Makes tables, statistics and index documents of a recording, behind its recorder.
 
-`IndexWriter` makes documents of chunks and sends them to the database. With a `Lag` it may
-fall behind its recording, drop chunks from memory, and read them back from the segments.
+`IndexWriter` reads the chunks that were flushed back from their segments, so memory does not
+grow with what waits. `DocumentSender` sends documents in the order of the file, so that one
+position says what the index has.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog_storage.catalog import ChunkEntry
-from hybridlog_storage.chunk import StoredChunk
-from hybridlog_storage.distinct import distinct
-from hybridlog_storage.errors import DatabaseError, SegmentError
+from hybridlog.indexing import ChunkIndexer
+from hybridlog_storage.catalog import decoded_rows
+from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
 from hybridlog_storage.index_documents import with_prefix
-from hybridlog_storage.index_state import IndexState
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.index_state import NOTHING, IndexState, Through
 from hybridlog_storage.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
 from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
-    from hybridlog.indexing import ChunkIndexer, Documents
+    from hybridlog.indexing import Documents
     from hybridlog.tables.writer import TableWriter
-    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
+    from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry, RecordingEntry
+    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.database import Database
-    from hybridlog_storage.topic_places import TopicPlace
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segment_file import Sealed
 
-_SENDERS = 2
-_LAG_PAUSE_S = 0.002
-_RETRY_S = 2.0  # seconds between attempts after the database has failed
-_PARCEL_BYTES = 4 << 20
-_PARCEL_CHUNKS = 32
-_BACKLOG = 8  # chunks in memory, waiting or in work
-# The same with a lag, if memory allows. Topics of equal rate and size close their chunks at
-# the same time, and chunks without room must be read again.
-_MOST_BACKLOG = 96
-_FEW = 32  # most messages, and
-_FEW_BYTES = 1 << 20  # most bytes of a chunk that waits for others
-_FEW_CHUNKS = 512  # most waiting chunks,
-_FEW_WAITING = 16 << 20  # and their bytes
-_MOST_LATEST = 4096  # chunks: far more than a killed server has not in its journal
-
-
-@dataclass(slots=True)
-class _Parcel:
-    """Documents of some chunks that are sent to the database together, and those chunks.
-
-    Attributes:
-        documents: Those of each topic.
-    """
-
-    documents: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
-    entries: list[ChunkEntry] = field(default_factory=list)
-    messages: int = 0
-    size: int = 0
-
-    def add(self, documents: list[Documents], entries: list[ChunkEntry]) -> None:
-        for part in documents:
-            self.documents.setdefault(part.topic, []).extend(part.tables)
-            self.size += part.size
-        self.entries += entries
-        self.messages += sum(entry.messages for entry in entries)
-
-
-class _Few:
-    """Chunks of few messages, which wait to be indexed together. Thread safe.
-
-    A topic of 4 Hz has a chunk of four messages each second, so that no more can be lost.
-    Making and inserting the documents of such a chunk costs as much as those of a hundred
-    messages, and so does waking the thread.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._chunks: list[StoredChunk] = []
-        self._untabled: deque[StoredChunk] = deque()  # of these, in the order of the file
-        self._channels: dict[int, Channel] = {}
-        self._size = 0
-        self._since = 0.0
-
-    def add(
-        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_in_tables: bool
-    ) -> bool:
-        """Let a chunk wait, if it has few messages and there is room.
-
-        Args:
-            chunk: The chunk.
-            channels: What it is about; of a recording that is recovered each segment has its
-                own.
-            is_in_tables: Whether it is in the tables.
-
-        Returns:
-            Whether it waits.
-        """
-        size = len(chunk.batch.buffer)
-        if len(chunk.batch) > _FEW or size > _FEW_BYTES:
-            return False
-        with self._lock:
-            if self.is_full:
-                return False
-            if not self._chunks:
-                self._since = time.monotonic()
-            # A copy, since its buffer may be a hundred times as large.
-            batch = replace(chunk.batch, buffer=bytes(chunk.batch.buffer))
-            waits = replace(chunk, batch=batch)
-            # Not all channels of the recording, which may be thousands.
-            own = distinct(batch.channel).tolist()
-            self._channels.update({number: channels[number] for number in own})
-            self._chunks.append(waits)
-            if not is_in_tables:
-                self._untabled.append(waits)
-            self._size += size
-        return True
-
-    @property
-    def is_full(self) -> bool:
-        """True if the limit is reached."""
-        return self._size >= _FEW_WAITING or len(self._chunks) >= _FEW_CHUNKS
-
-    @property
-    def waited(self) -> float:
-        """Seconds for which the first chunk has waited; 0 without chunks."""
-        return time.monotonic() - self._since if self._chunks else 0.0
-
-    def untabled(
-        self, before: StoredChunk | None = None
-    ) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
-        """Those that are to go into the tables now, in the order of the file.
-
-        Args:
-            before: Only chunks before this one; None for all.
-        """
-        found = []
-        with self._lock:
-            while self._untabled:
-                first = self._untabled[0]
-                if before is not None and _place(first) > _place(before):
-                    break
-                found.append(self._untabled.popleft())
-        return found, self._channels
-
-    def take(self) -> tuple[list[StoredChunk], Mapping[int, Channel]]:
-        """Remove and return all waiting chunks and their channels."""
-        with self._lock:
-            chunks, self._chunks, self._size = self._chunks, [], 0
-        return chunks, self._channels
-
-
-def _place(chunk: StoredChunk) -> tuple[int, int]:
-    return chunk.segment, chunk.offset
-
-
-class Lag:
-    """Lets the index fall behind its recording.
-
-    Args:
-        recording: The recording's directory.
-        behind: Says whether the recorder has more than it can write.
-        has_room: Says whether so many bytes of chunks may wait in memory, where they are more
-            than a few.
-        spare: Processors for what can wait. One is held while documents or tables are made.
-    """
-
-    def __init__(
-        self,
-        recording: Path,
-        behind: Callable[[], bool],
-        has_room: Callable[[int], bool],
-        spare: threading.BoundedSemaphore,
-    ) -> None:
-        self.has_room = has_room
-        self.spare = spare
-        self._recording = recording
-        self._behind = behind
-        self._reader: SegmentReader | None = None
-        self._thread = Threads(1, "hybridlog-reread")
-        self._ahead: tuple[_Forgotten, Future[StoredChunk]] | None = None
-
-    def wait(self) -> None:
-        """Wait until the recorder does not need the processor and the disk."""
-        while self._behind():
-            time.sleep(_LAG_PAUSE_S)
-
-    def read(self, chunk: _Forgotten) -> StoredChunk:
-        """Read a chunk back from its segment, which may still be growing."""
-        ahead, self._ahead = self._ahead, None
-        if ahead is None or ahead[0] is not chunk:
-            return self._thread.submit(self._read, chunk).result()
-        return ahead[1].result()
-
-    def read_ahead(self, chunk: _Forgotten) -> None:
-        """Start reading the next chunk."""
-        self._ahead = chunk, self._thread.submit(self._read, chunk)
-
-    def _read(self, chunk: _Forgotten) -> StoredChunk:
-        if self._reader is None or self._reader.number != chunk.segment:
-            self._release()
-            self._reader = self._open(chunk.segment)
-        self._reader.grow()
-        return self._reader.read_chunk(chunk.place)
-
-    def close(self) -> None:
-        """Close the open segment."""
-        self._thread.shutdown(wait=True, cancel_futures=True)
-        self._release()
-
-    def _release(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
-
-    def _open(self, segment: int) -> SegmentReader:
-        path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
-        if path.exists():
-            # It may be sealed and renamed at this moment.
-            with suppress(SegmentError):
-                return SegmentReader(path, segment, direct=True)
-        sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
-        return SegmentReader(sealed, segment, direct=True)
-
-
-class _Forgotten(NamedTuple):
-    """A chunk that was dropped from memory and is in its segment.
-
-    Attributes:
-        segment: Number of the segment.
-        place: Its position there.
-        messages: Number of its messages.
-        is_in_tables: Whether it is in the tables.
-    """
-
-    segment: int
-    place: ChunkPlace
-    messages: int
-    is_in_tables: bool
+INTERVAL_S = 5.0
+"""Longest time between two passes over what was flushed, seconds."""
+_INTERVAL_BYTES = 64 << 20  # content that was flushed since the last pass, at most
+_SEND_BYTES = 8 << 20  # documents that are sent together, at most
+_GROUP_BYTES = 1 << 20  # content of small chunks that are decoded together
+_PAUSE_S = 0.002
+_RETRY_S = 2.0  # between attempts after the database has failed
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,95 +71,185 @@ class IndexTarget:
         return self.database is not None or self.failure is not None
 
 
-class IndexWriter:
-    """Indexes chunks in the background, so that recording need not wait.
-
-    One thread makes documents, others send them. Documents made while all senders are busy
-    are sent together, so a chunk of one image costs no round trip of its own. A failing
-    database stops the index, never the recording. Missing documents are made later from the
-    segments: with a lag as soon as the database answers again, else when a question needs
-    the index.
+class DocumentSender:
+    """Sends the documents of a recording's chunks to the index, in the order of the file.
 
     Args:
         entry: The recording.
-        indexer: Makes the documents.
-        target: Where they go.
-        lag: With it `submit` never waits: chunks that find no room in memory are read back.
-        tables: Gets each chunk of which documents are made, once.
+        database: The index.
+        through: What the index has.
+
+    Attributes:
+        through: What the index has.
+        added: The same with what is being sent, or waits for more.
+    """
+
+    def __init__(self, entry: RecordingEntry, database: Database, through: Through) -> None:
+        self.through = self.added = through
+        self._key = entry.key
+        self._database = database
+        self._places = TopicPlaces(database)
+        self._documents: dict[str, list[NDArray[np.uint8]]] = {}
+        self._size = 0
+        self._thread = Threads(1, "hybridlog-send")
+        self._sending: Future[None] | None = None
+
+    def prepare(self, topics: Collection[str]) -> None:
+        """Assign places to topics before their first documents."""
+        self._places.assigned(topics)
+
+    def add(self, documents: Sequence[Documents], entries: Sequence[ChunkEntry]) -> None:
+        """Add the documents of chunks that follow those added before.
+
+        Raises:
+            DatabaseError: An earlier sending has failed.
+        """
+        for part in documents:
+            self._documents.setdefault(part.topic, []).extend(part.tables)
+            self._size += part.size
+        last, messages = entries[-1], sum(entry.messages for entry in entries)
+        messages += self.added.messages
+        self.added = Through(last.segment, last.number, last.offset, messages)
+        if self._size >= _SEND_BYTES:
+            self.send()
+
+    def send(self, *, wait: bool = False) -> None:
+        """Send what was added, while more is made.
+
+        Args:
+            wait: True to wait until the index has it.
+
+        Raises:
+            DatabaseError: This sending has failed, or an earlier one.
+        """
+        if self._sending is not None:
+            self._sending.result()
+        if self.added != self.through:
+            documents, self._documents, self._size = self._documents, {}, 0
+            self._sending = self._thread.submit(self._send, documents, self.added)
+            if wait:
+                self._sending.result()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _send(self, documents: Mapping[str, list[NDArray[np.uint8]]], through: Through) -> None:
+        for collection, tables in self._by_collection(documents).items():
+            counts, widths = zip(*(table.shape for table in tables), strict=True)
+            data = b"".join(table.data for table in tables)
+            lengths = np.repeat(widths, counts).astype(np.int64)
+            self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
+        IndexState(self._database).put_through(self._key, through)
+        self.through = through
+
+    def _by_collection(
+        self, documents: Mapping[str, list[NDArray[np.uint8]]]
+    ) -> dict[str, list[NDArray[np.uint8]]]:
+        """The documents of topics by collection, with their keys there."""
+        found: dict[str, list[NDArray[np.uint8]]] = {}
+        for topic, place in self._places.assigned(documents.keys()).items():
+            own = [with_prefix(table, place.prefix) for table in documents[topic]]
+            found.setdefault(place.collection, []).extend(own)
+        return {collection: tables for collection, tables in found.items() if tables}
+
+
+class IndexWriter:
+    """Follows a recording that is being written.
+
+    One thread reads the chunks that were flushed: every few seconds, after many bytes, when a
+    segment is sealed and at the end. A failing database stops the index, never the recording:
+    the index goes on where it was as soon as the database answers again, at the latest when a
+    question needs it.
+
+    Args:
+        recording: The recording's directory.
+        entry: The recording.
+        target: Where documents go.
+        catalog: Gets the decoding results of each segment.
+        tables: Gets each chunk once, in the order of the file.
+        behind: Returns whether the recorder has more than it can write; this then waits.
+        spare: Processors for what can wait. One is held while documents or tables are made.
+        interval_s: Longest time between two passes, seconds.
+
+    Attributes:
+        failure: The error that stopped the index; None while it works.
+        database: The present connection to the index; None without one.
+        damage: Chunks that could not be read back: reason by segment and number.
     """
 
     def __init__(
         self,
+        recording: Path,
         entry: RecordingEntry,
-        indexer: ChunkIndexer,
         target: IndexTarget,
+        catalog: Catalog,
         *,
-        lag: Lag | None = None,
-        tables: TableWriter | None = None,
+        tables: TableWriter,
+        behind: Callable[[], bool] = lambda: False,
+        spare: AbstractContextManager[Any] | None = None,
+        interval_s: float = INTERVAL_S,
     ) -> None:
         self.failure = target.failure
-        self.decoded: dict[int, dict[int, Mapping[int, ChannelStats]]] = {}
-        """Statistics of the decoded chunks: by segment, chunk and channel."""
-        self.indexed = 0
-        """Number of indexed messages."""
-        self.missed = 0
-        """Number of messages skipped after a failure of the database."""
-        self._latest: deque[ChunkEntry] = deque(maxlen=_MOST_LATEST)
-        self._entry = entry
-        self._indexer = indexer
-        self._target = target
-        self._lag = lag
-        self._tables = tables
-        self._spare = lag.spare if lag else nullcontext()
-        self._forgotten: deque[_Forgotten] = deque()
         self.database = target.database
-        """The present connection to the index; None without one."""
-        self._places: TopicPlaces | None = None
-        self._lock = threading.Lock()
-        self._room = threading.BoundedSemaphore(_BACKLOG if lag is None else _MOST_BACKLOG)
-        self._in_memory = 0  # chunks waiting or in work
-        self._bytes_in_memory = 0
-        self._is_asked = False  # for the next dropped chunk
-        self._has_ended = False  # no more chunks are accepted
-        self._maker = Threads(1, "hybridlog-index")
-        self._senders = Threads(_SENDERS, "hybridlog-send")
-        self._idle = threading.BoundedSemaphore(_SENDERS)
-        self._few = _Few()
-        self._parcel = _Parcel()
-        self._crash: BaseException | None = None
+        self.damage: dict[tuple[int, int], str] = {}
+        self._recording = recording
+        self._entry = entry
+        self._target = target
+        self._catalog = catalog
+        self._tables = tables
+        self._behind = behind
+        self._spare = spare or nullcontext()
+        self._interval_s = interval_s
+        self._indexer = ChunkIndexer(entry.id, has_documents=target.is_wanted)
         self._channels: Mapping[int, Channel] = {}
+        self._places: dict[int, list[ChunkPlace]] = {}  # chunks of segments that are not read yet
+        self._sealed: dict[int, str] = {}  # their digests
+        self._flushed = 0  # messages
+        self._unread = 0  # bytes since the last pass
+        self._next = 0, 0  # segment and number of the first chunk that is not decoded
+        self._stats: dict[int, Mapping[int, ChannelStats]] = {}  # of this segment, by chunk
+        self._reader: SegmentReader | None = None
+        self._sender: DocumentSender | None = None
+        if target.database is not None:
+            self._sender = DocumentSender(entry, target.database, NOTHING)
+        self._indexed = 0
         self._retry_at = 0.0
-        self._is_away = False
         self._renewed: list[Database] = []
+        self._crash: BaseException | None = None
+        self._has_ended = self._is_abandoned = False
+        # No event: a thread that is interrupted in `set` may leave it locked forever.
+        self._calls: SimpleQueue[str] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
+        self._thread.start()
+
+    @property
+    def indexed(self) -> int:
+        """Number of messages that the index has."""
+        return self._indexed if self._sender is None else self._sender.through.messages
+
+    @property
+    def missed(self) -> int:
+        """Number of messages that it lacks after a failure of the database."""
+        return self._flushed - self.indexed if self.failure is not None else 0
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Index a chunk that is in its segment; wait while the backlog is full."""
+        """Note a chunk that is in its segment."""
         if self._crash is not None:
             raise self._crash
         self._channels = channels
-        if self.failure is None and self._few.add(chunk, channels, is_in_tables=False):
-            if self._few.is_full:
-                self._maker.submit(self._make_few).add_done_callback(self._done)
-            return
-        size = len(chunk.batch.buffer)
-        if not self._find_room(size):
-            self._forget(chunk)
-            self._catch_up()
-            return
-        with self._lock:
-            self._in_memory += 1
-            self._bytes_in_memory += size
-        future = self._maker.submit(self._make, chunk, channels)
-        future.add_done_callback(partial(self._made, size))
+        self._places.setdefault(chunk.segment, []).append(_place_of(chunk))
+        self._flushed += len(chunk.batch)
+        self._unread += len(chunk.batch.buffer)
+        if self._unread >= _INTERVAL_BYTES:
+            self._unread = 0
+            self._calls.put("")
 
-    def _find_room(self, size: int) -> bool:
-        """Reserve memory for a waiting chunk; wait for room without a lag, else return False."""
-        if self._lag is None:
-            return self._room.acquire()
-        with self._lock:
-            is_usual = self._in_memory < _BACKLOG
-            size += self._bytes_in_memory
-        return (is_usual or self._lag.has_room(size)) and self._room.acquire(blocking=False)
+    def seal(self, sealed: Sealed) -> None:
+        """Note that a segment has all its chunks."""
+        self._places.setdefault(sealed.segment, [])
+        self._sealed[sealed.segment] = sealed.digest
+        self._calls.put("")
 
     def prepare(self, channel: Channel, *, with_place: bool) -> None:
         """Prepare a channel before its first message.
@@ -369,44 +259,20 @@ class IndexWriter:
             with_place: Whether to assign a place in MongoDB to its topic.
         """
         self._indexer.prepare(channel)
-        if with_place and self._target.is_wanted:
-            self._maker.submit(self._prepare, channel).add_done_callback(self._done)
-
-    def _prepare(self, channel: Channel) -> None:
-        if self._is_away or self.failure is not None:
-            return
-        try:
-            self._assigned([channel.topic])
-        except DatabaseError:
-            # It fails again with the first documents, and is reported then. A timeout takes
-            # seconds, and other channels wait.
-            self._is_away = True
-
-    def nudge(self, patience_s: float) -> None:
-        """Send the documents made so far once a sender is free.
-
-        Args:
-            patience_s: Seconds for which chunks of few messages may wait for others.
-        """
-        # Waking the thread that makes documents costs as much as ten documents.
-        if self._parcel.entries or self._forgotten or self.failure or self._is_late(patience_s):
-            self._maker.submit(self._tend, patience_s).add_done_callback(self._done)
+        if with_place:
+            self._calls.put(channel.topic)
 
     def close(self) -> None:
-        """Wait for all chunks; raise errors other than those of the database."""
-        if self._crash is None:
-            self._maker.submit(self._last_try).add_done_callback(self._done)
-            self._maker.submit(self._remember_all).add_done_callback(self._done)
-            self._maker.submit(self._make_few).add_done_callback(self._done)
-            self._maker.submit(self._dispatch, wait=True).add_done_callback(self._done)
+        """Read all chunks; raise errors other than those of the database."""
+        self._has_ended = True
         self._end()
-        self.missed += sum(chunk.messages for chunk in self._forgotten)
         if self._crash is not None:
             raise self._crash
 
     def abandon(self) -> None:
-        """Stop without indexing waiting chunks."""
-        self._end(cancel=True)
+        """Stop without reading waiting chunks."""
+        self._has_ended = self._is_abandoned = True
+        self._end()
 
     def release(self) -> None:
         """Close the connections made by this object; `database` may be one of them."""
@@ -414,232 +280,179 @@ class IndexWriter:
             database.close()
         self._renewed.clear()
 
-    def _end(self, *, cancel: bool = False) -> None:
-        with self._lock:
-            self._has_ended = True
-        self._maker.shutdown(wait=True, cancel_futures=cancel)
-        self._senders.shutdown(wait=True, cancel_futures=cancel)
-        if self._lag is not None:
-            self._lag.close()
+    def _end(self) -> None:
+        self._calls.put("")
+        self._thread.join()
 
-    def _forget(self, chunk: StoredChunk, *, is_in_tables: bool = False) -> None:
-        """Keep only where a chunk lies."""
-        place = ChunkPlace(
-            offset=chunk.offset,
-            length=chunk.length,
-            trailer=chunk.trailer,
-            first=int(chunk.batch.log_time.min()),
-            last=int(chunk.batch.log_time.max()),
-            channels=(),
-            number=chunk.number,
-            crc=chunk.crc,
-            trailer_crc=chunk.trailer_crc,
-        )
-        self._forgotten.append(_Forgotten(chunk.segment, place, len(chunk.batch), is_in_tables))
+    # The methods below run on the thread of the index.
 
-    def _catch_up(self) -> None:
-        """Request a dropped chunk once none waits in memory.
+    def _run(self) -> None:
+        try:
+            due = 0.0
+            while True:
+                has_ended = self._has_ended
+                topic = ""
+                with suppress(Empty):
+                    topic = self._calls.get(timeout=max(due - time.monotonic(), 0))
+                if topic and not has_ended:
+                    self._prepare(topic)
+                    continue
+                if not self._is_abandoned:
+                    self._advance(has_ended=has_ended)
+                if has_ended:
+                    return
+                due = time.monotonic() + self._interval_s
+        except BaseException as error:
+            self._crash = error
+        finally:
+            self._stop_sending()
+            self._close_reader()
 
-        Reading a chunk back costs more than making its documents. In arrival order, dropped
-        chunks would delay others until these have no room either.
-        """
-        with self._lock:
-            is_idle = not (self._is_asked or self._in_memory or self._has_ended)
-            if not is_idle or not self._forgotten or self.failure is not None:
-                return
-            self._is_asked = True
-            future = self._maker.submit(self._remember_next)
-        future.add_done_callback(self._done)
+    def _prepare(self, topic: str) -> None:
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.prepare([topic])
 
-    def _tend(self, patience_s: float) -> None:
-        if self.failure is not None and time.monotonic() >= self._retry_at:
-            self._retry()
-        self._catch_up()
-        if self._is_late(patience_s):
-            self._make_few()
-        self._dispatch(wait=False)
+    def _advance(self, *, has_ended: bool) -> None:
+        """Read what was flushed since the last pass."""
+        if self.failure is not None and (has_ended or time.monotonic() >= self._retry_at):
+            self._reconnect()
+        segment, first = self._next
+        if self._sender is not None:
+            added = self._sender.added
+            segment, first = min(self._next, (added.segment, added.chunk + 1))
+        while segment in self._places or segment < self._next[0]:
+            digest = self._sealed.get(segment)  # first: what it has is known then
+            reader = self._open(segment)
+            reader.grow()
+            places = self._places.get(segment)
+            if places is None:
+                places = reader.summary().chunks
+            for group in self._read(reader, places[first:]):
+                self._take(group)
+                if self._is_abandoned:
+                    return
+            if digest is None:
+                break
+            if segment == self._next[0]:
+                self._end_segment(segment, digest)
+            segment, first = segment + 1, 0
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.send(wait=has_ended)
 
-    def _is_late(self, patience_s: float) -> bool:
-        """True if chunks have waited to be indexed for too long."""
-        return self._few.waited > patience_s
+    def _read(
+        self, reader: SegmentReader, places: Sequence[ChunkPlace]
+    ) -> Iterator[list[StoredChunk]]:
+        """The chunks at some places; small ones in groups."""
+        group: list[StoredChunk] = []
+        size = 0
+        for place in places:
+            while self._behind():
+                time.sleep(_PAUSE_S)
+            try:
+                chunk = reader.read_chunk(place)
+            except SegmentError as error:
+                self.damage[reader.number, place.number] = str(error)
+                continue
+            size += len(chunk.batch.buffer)
+            if group and size > _GROUP_BYTES:
+                yield group
+                group, size = [], len(chunk.batch.buffer)
+            group.append(chunk)
+        if group:
+            yield group
 
-    def _last_try(self) -> None:
-        if self.failure is not None:
-            self._retry()
+    def _take(self, chunks: Sequence[StoredChunk]) -> None:
+        """Make rows and documents of chunks of one segment."""
+        new = [chunk for chunk in chunks if (chunk.segment, chunk.number) >= self._next]
+        for chunk in new:
+            with self._spare:
+                self._tables.add(chunk, self._channels)
+        with self._spare:
+            documents, entries = self._indexer.documents_of(chunks, self._channels)
+        for entry in entries[len(chunks) - len(new) :]:
+            self._stats[entry.number] = entry.stats
+            self._next = entry.segment, entry.number + 1
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.add(documents, entries)
 
-    def _retry(self) -> None:
-        """Continue after a failure of the database, if it can be reconnected."""
-        if self._lag is None or self._target.renew is None:
+    def _end_segment(self, segment: int, digest: str) -> None:
+        """Store the decoding results of a segment, if all of it could be read."""
+        places = self._places.pop(segment)
+        if len(self._stats) == len(places):
+            rows = decoded_rows([self._stats[number] for number in range(len(places))])
+            with suppress(HybridlogError):  # it is derived, and the disk may be full
+                self._catalog.put_stamps(self._entry.id, [(segment, digest, rows)])
+        self._stats = {}
+        self._next = segment + 1, 0
+
+    def _open(self, segment: int) -> SegmentReader:
+        """The reader of a segment, which may still grow."""
+        if self._reader is not None and self._reader.number == segment:
+            return self._reader
+        self._close_reader()
+        path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
+        try:
+            self._reader = SegmentReader(path, segment, direct=True)
+        except SegmentError:  # it may be sealed and renamed at this moment
+            sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
+            self._reader = SegmentReader(sealed, segment, direct=True)
+        return self._reader
+
+    def _close_reader(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    @contextmanager
+    def _noting_failure(self) -> Iterator[None]:
+        """Stop the index at a failure of the database."""
+        try:
+            yield
+        except DatabaseError as error:
+            self._fail(error)
+
+    def _fail(self, error: DatabaseError) -> None:
+        self._stop_sending()
+        self.failure = error
+        self._retry_at = time.monotonic() + _RETRY_S
+
+    def _stop_sending(self) -> None:
+        if self._sender is not None:
+            self._sender.close()
+            self._indexed, self._sender = self._sender.through.messages, None
+
+    def _reconnect(self) -> None:
+        """Go on after a failure of the database, from what a new connection has."""
+        if self._target.renew is None:
             return
         try:
             database = self._target.renew()
             self._renewed.append(database)
             state = IndexState(database)
-            if state.one(self._entry.key) is None:  # it was away when the recording began
+            indexed = state.one(self._entry.key)
+            if indexed is None:  # it was unavailable when the recording began
                 state.put(self._entry, "open", turn=1)
-            there = state.places(self._entry.key)
+            # A killed server has lost what was not in its journal yet.
+            through = NOTHING if indexed is None else indexed.through
         except DatabaseError as error:
-            self.failure = error
-            self._retry_at = time.monotonic() + _RETRY_S
+            self._fail(error)
             return
-        with self._lock:
-            self.database, self._places = database, None
-            # A killed server has lost documents that were not in its journal yet.
-            latest, self._latest = self._latest, deque(maxlen=_MOST_LATEST)
-            for entry in latest:
-                if there.get((entry.segment, entry.number)) == entry.offset:
-                    self._latest.append(entry)
-                else:
-                    self.indexed -= self._put_back(entry)
-            self.failure, self._is_away = None, False
+        self.database, self.failure = database, None
+        self._sender = DocumentSender(self._entry, database, through)
 
-    def _remember_next(self) -> None:
-        with self._lock:
-            self._is_asked = False
-        self._remember()
-        self._catch_up()
 
-    def _remember_all(self) -> None:
-        while self._forgotten and self.failure is None:
-            self._remember()
-
-    def _remember(self) -> None:
-        """Index the first dropped chunk, while the next one is read."""
-        assert self._lag is not None
-        if self.failure is not None or not self._forgotten:
-            return
-        place = self._forgotten.popleft()
-        self._lag.wait()
-        chunk = self._lag.read(place)
-        if self._forgotten:
-            self._lag.read_ahead(self._forgotten[0])
-        self._make(chunk, self._channels, is_in_tables=place.is_in_tables)
-
-    def _make(
-        self, chunk: StoredChunk, channels: Mapping[int, Channel], *, is_in_tables: bool = False
-    ) -> None:
-        if self.failure is not None:
-            if self._lag is not None:
-                self._forget(chunk, is_in_tables=is_in_tables)
-            else:
-                with self._lock:
-                    self.missed += len(chunk.batch)
-            return
-        if self._lag is not None:
-            self._lag.wait()
-        if not is_in_tables:
-            # In the order of the file, for as long as that can be: rows are sorted then.
-            self._add_to_tables(*self._few.untabled(before=chunk))
-            self._add_to_tables([chunk], channels)
-        if not self._few.add(chunk, channels, is_in_tables=True):
-            self._index([chunk], channels)
-        elif self._few.is_full:
-            self._make_few()
-
-    def _make_few(self) -> None:
-        """Index the waiting chunks of few messages."""
-        if self._lag is not None:
-            self._lag.wait()
-        chunks, channels = self._few.take()
-        self._add_to_tables(*self._few.untabled())
-        if chunks:
-            self._index(chunks, channels)
-
-    def _add_to_tables(
-        self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
-    ) -> None:
-        """Give chunks to the tables."""
-        if self._tables is not None:
-            for chunk in chunks:
-                with self._spare:
-                    self._tables.add(chunk, channels)
-
-    def _index(self, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]) -> None:
-        with self._spare:
-            documents, entries = self._indexer.documents_of(chunks, channels)
-        for entry in entries:
-            self.decoded.setdefault(entry.segment, {})[entry.number] = entry.stats
-        self._parcel.add(documents, entries)
-        parcel = self._parcel
-        if len(parcel.entries) >= _PARCEL_CHUNKS or parcel.size >= _PARCEL_BYTES // 4:
-            self._dispatch(wait=parcel.size >= _PARCEL_BYTES)
-
-    def _dispatch(self, *, wait: bool) -> None:
-        """Hand the documents over, if a sender is free or must be waited for."""
-        if self._parcel.entries and self._idle.acquire(blocking=wait):
-            parcel, self._parcel = self._parcel, _Parcel()
-            future = self._senders.submit(self._send, parcel)
-            future.add_done_callback(self._sent)
-
-    def _send(self, parcel: _Parcel) -> None:
-        failure = self.failure
-        try:
-            if failure is None and self.database is not None:
-                for collection, tables in self._placed(parcel.documents).items():
-                    lengths = np.concatenate(
-                        [np.full(len(table), table.shape[1], np.int64) for table in tables]
-                    )
-                    data = b"".join(table.data for table in tables)
-                    self.database.insert_raw(collection, data, len(lengths), lengths=lengths)
-                IndexState(self.database).put_chunks(parcel.entries)
-        except DatabaseError as error:
-            failure = error
-        with self._lock:
-            if failure is None:
-                self.indexed += parcel.messages if self._target.is_wanted else 0
-                self._latest.extend(parcel.entries)
-                return
-            self.failure = failure
-            self._retry_at = time.monotonic() + _RETRY_S
-            if self._lag is None:
-                self.missed += parcel.messages
-                return
-            # Inserting a document twice has no effect, so all are sent again.
-            for entry in parcel.entries:
-                self._put_back(entry)
-
-    def _put_back(self, entry: ChunkEntry) -> int:
-        """Queue a chunk again; return the number of its messages."""
-        self._forgotten.append(_Forgotten(entry.segment, entry.place, entry.messages, True))
-        return entry.messages
-
-    def _placed(
-        self, documents: Mapping[str, list[NDArray[np.uint8]]]
-    ) -> dict[str, list[NDArray[np.uint8]]]:
-        """The documents of topics by collection, with their keys there.
-
-        Raises:
-            DatabaseError: MongoDB fails.
-        """
-        places = self._assigned(documents.keys())
-        found: dict[str, list[NDArray[np.uint8]]] = {}
-        for topic, tables in documents.items():
-            place = places[topic]
-            own = [with_prefix(table, place.prefix) for table in tables]
-            found.setdefault(place.collection, []).extend(own)
-        return found
-
-    def _assigned(self, topics: Collection[str]) -> dict[str, TopicPlace]:
-        if self._places is None:
-            assert self.database is not None
-            self._places = TopicPlaces(self.database)
-        return self._places.assigned(topics)
-
-    def _made(self, size: int, future: Future[None]) -> None:
-        self._room.release()
-        with self._lock:
-            self._in_memory -= 1
-            self._bytes_in_memory -= size
-        self._done(future)
-        self._catch_up()
-
-    def _sent(self, future: Future[None]) -> None:
-        self._idle.release()
-        self._done(future)
-
-    def _done(self, future: Future[None]) -> None:
-        if future.cancelled():
-            return
-        error = future.exception()
-        if error is not None and self._crash is None:
-            self._crash = error
+def _place_of(chunk: StoredChunk) -> ChunkPlace:
+    return ChunkPlace(
+        offset=chunk.offset,
+        length=chunk.length,
+        trailer=chunk.trailer,
+        first=int(chunk.batch.log_time.min()),
+        last=int(chunk.batch.log_time.max()),
+        channels=(),
+        number=chunk.number,
+        crc=chunk.crc,
+        trailer_crc=chunk.trailer_crc,
+    )

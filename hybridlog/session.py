@@ -384,7 +384,7 @@ class Session:
         if self.database is None and self._unavailable is not None:
             if isinstance(self._unavailable, ConnectionLostError):
                 return IndexTarget(failure=self._unavailable, renew=self._another_database)
-            if self.connection.may_record_without(self._unavailable):
+            if self.connection.has_none:
                 return IndexTarget()
         database = self.database_for(purpose, writes=True)
         return IndexTarget(database, renew=self._another_database)

@@ -11,7 +11,6 @@ from tests.mutate import Mutant
 AGREEMENT = "tests/query/predicate/test_agreement.py"
 MASK = "tests/query/predicate/test_to_mask.py"
 JSON_ARRAYS = f"{AGREEMENT}::test_what_json_arrays_answer"
-MISSED = "tests/test_faults.py::test_each_message_that_is_missing_in_the_index_is_counted"
 INTERVALS = "tests/query/test_intervals.py"
 LEDGER = "tests/test_losses.py"
 
@@ -141,23 +140,17 @@ MUTANTS = [
     *_of(
         "hybridlog/index_writer.py",
         (
-            "missed-chunks-for-missed-messages",
-            "self.missed += sum(chunk.messages for chunk in self._forgotten)",
-            "self.missed += len(self._forgotten)",
+            "missed-messages-are-none",
+            "return self._flushed - self.indexed if self.failure is not None else 0",
+            "return 0",
             "tests/live/test_recording.py::"
             "test_a_database_that_refuses_to_the_end_leaves_what_segments_know",
         ),
         (
-            "one-missed-message-a-chunk",
-            "self.missed += len(chunk.batch)",
-            "self.missed += 1",
-            MISSED,
-        ),
-        (
-            "messages-sent-in-vain-are-not-missed",
-            "self.missed += parcel.messages",
-            "pass",
-            MISSED,
+            "the-index-begins-behind-what-it-has",
+            "(added.segment, added.chunk + 1)",
+            "(added.segment, added.chunk + 2)",
+            "tests/live/test_recording.py::test_documents_of_many_chunks_are_sent_together",
         ),
     ),
     *_of(

@@ -1140,7 +1140,7 @@ def test_the_specification_names_what_there_is() -> None:
         assert f"`{name}`" in rows, name
     for state in typing.get_args(index_state.State):
         assert f"`{state}`" in text
-    for name in (index_state.RECORDINGS, index_state.CHUNKS, index_state.STORE):
+    for name in (index_state.RECORDINGS, index_state.STORE):
         assert f"`{name}`" in text
     for name in (CATALOG, directory.LOCK, journal.JOURNAL, directory.REMOVED, directory.IMPORTING):
         assert name in sections(DOCS / "format.md", 2)["Directory"]

@@ -32,7 +32,7 @@ from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
-from hybridlog_storage.index_state import RECORDINGS, STORE, IndexState
+from hybridlog_storage.index_state import RECORDINGS, STORE, IndexState, Through
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.segment_reader import SegmentReader
 from hybridlog_storage.segment_writer import SegmentSettings
@@ -238,7 +238,8 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
     state = IndexState(store.database)
     # All chunks are in the index, and it is not done.
     state.put(entry, "open", turn=1)
-    state.put_chunks(chunk_entries(store.catalog, entry))
+    last = chunk_entries(store.catalog, entry)[-1]
+    state.put_through(entry.key, Through(last.segment, last.number, last.offset, entry.messages))
 
 
 @pytest.mark.parametrize("listed", [False, True])

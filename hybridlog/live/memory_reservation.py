@@ -12,8 +12,6 @@ _INITIAL_BYTES = 128 << 20  # buffers reserved before the first message, at most
 _AHEAD_S = 0.75  # later: as much as comes in this time, since disks stall for so long
 _PAUSE = 1.0  # between two buffers, as a multiple of the time one takes: it delays writers
 _SHARE_FOR_SMALL = 0.25  # of the reserved buffers, which large chunks do not use
-_SHARE_FOR_CHUNKS = 0.5  # of the reserved buffers, which the index backlog does not use
-_BACKLOG_DIVISOR = 8  # the index backlog may hold this part of the budget
 _RATES = 16  # the highest of so many rates counts: sources pause, and disks stall
 _STEADY = 1.25  # a rate that grows by more is still rising
 _MAX_CHUNKS_PER_S = 100  # above it chunks grow, because each one has a fixed cost
@@ -26,8 +24,7 @@ class MemoryReservation:
 
     Memory that is requested only when the disk stalls comes too late. At hundreds of
     chunks a second their fixed cost dominates, so chunks become two or four times as
-    large. Reserved memory serves new messages first, then large chunks, then the index
-    backlog.
+    large. Reserved memory serves new messages first, then large chunks.
 
     Args:
         chunk_size: Usual bytes of a chunk.
@@ -80,11 +77,6 @@ class MemoryReservation:
             self.chunk_size, _SHARE_FOR_SMALL
         )
         return self._usual if is_short else self.chunk_size
-
-    def has_room(self, size: int) -> bool:
-        """Tells whether so many bytes of chunks may wait in memory for the index."""
-        is_too_large = size > self._budget // _BACKLOG_DIVISOR
-        return not (is_too_large or buffers.is_short(self.chunk_size, _SHARE_FOR_CHUNKS))
 
     def close(self) -> None:
         """End a running reservation, and return surplus memory."""

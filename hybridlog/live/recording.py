@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.capture import Backpressure, Capture
+from hybridlog.index_writer import INTERVAL_S
 from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
 from hybridlog.live.fair_semaphore import FairSemaphore
 from hybridlog.live.frozen_objects import frozen_objects
@@ -51,12 +52,11 @@ _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has 
 _TICK_S = 0.1  # interval of the writing thread when little comes
 _MIN_BATCH = 10  # messages per chunk: fewer cost less one by one than as a batch
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
-_INDEX_DELAY = 4  # flush intervals for which small chunks wait to be indexed together,
-_INDEX_DELAY_S = 4.0  # at most so many seconds
+_INDEX_INTERVALS = 4  # flush intervals between two passes of the index
 _LARGE_AT_WORK = 3  # large chunks in normal operation: two in compression, one being written
 _INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
 _SKIP_COMPRESSION_AT = 8 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
-_DELAY_INDEX_AT = 32 << 20  # above it the index waits, and later reads chunks again
+_DELAY_INDEX_AT = 32 << 20  # above it the index waits
 _MAX_COPYING = 2  # threads that copy large messages at the same time
 _NO_LIMIT = nullcontext()
 _CALM_S = 1.0  # both measures last so long afterwards, or they would cause the next delay
@@ -195,7 +195,7 @@ class LiveRecording:
                 pressure=Backpressure(
                     hurry=lambda: self._is_under_pressure(self._compression_pressure),
                     behind=lambda: self._is_under_pressure(self._index_pressure),
-                    has_room=self._reservation.has_room,
+                    index_interval_s=_index_interval_s(options.flush_interval_s),
                     next_chunk_size=self._reservation.next_chunk_size,
                     spare=threading.BoundedSemaphore(_spare_processors()),
                     on_written=self._make_room,
@@ -510,7 +510,6 @@ class LiveRecording:
                         flushed = now
                     if now - reported >= interval / 4:
                         self._write_losses()
-                        self._capture.index.nudge(_index_delay(interval))
                         reported = now
                 if now - measured >= _RATE_S:
                     stored = self._capture.writer.totals.payload_bytes
@@ -641,14 +640,14 @@ def _check_channel(channel: object) -> None:
             ) from error
 
 
-def _index_delay(flush_interval_s: float) -> float:
-    """Seconds for which small chunks may wait to be indexed together."""
-    return min(_INDEX_DELAY * flush_interval_s, _INDEX_DELAY_S)
+def _index_interval_s(flush_interval_s: float) -> float:
+    """Longest time between two passes of the index, seconds."""
+    return min(_INDEX_INTERVALS * flush_interval_s, INTERVAL_S)
 
 
 def indexed_within_s(flush_interval_s: float) -> float:
     """Seconds in which an index that keeps up receives a message."""
-    return flush_interval_s + _index_delay(flush_interval_s) + _INDEXING_S
+    return flush_interval_s + _index_interval_s(flush_interval_s) + _INDEXING_S
 
 
 def _groups(inbox: deque[_Message]) -> Iterator[Sequence[_Message]]:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from itertools import groupby
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from hybridlog.entries import take_inventory
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
-from hybridlog.maintenance.opening import describe_inventory, put_entry
+from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.tables.writer import TableWriter
-from hybridlog_storage.catalog import stamps_of
+from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     CatalogError,
@@ -27,13 +26,10 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.index_state import Indexed, IndexState
+from hybridlog_storage.index_state import NOTHING, Indexed, IndexState, Through
 from hybridlog_storage.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from hybridlog.entries import Inventory
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
@@ -45,8 +41,6 @@ if TYPE_CHECKING:
 
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
-Decoded: TypeAlias = "Mapping[int, Mapping[int, Mapping[int, ChannelStats]]]"
-"""Statistics of messages by segment, chunk and channel."""
 _TRIES = 10
 
 
@@ -154,8 +148,7 @@ def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
 
 def _is_settled(indexed: Indexed | None, entry: RecordingEntry) -> bool:
     """True if a completely indexed recording needs no further work."""
-    is_shown = indexed is not None and not indexed.has_list and indexed.mirrors(entry)
-    return is_shown and entry.is_decoded
+    return indexed is not None and indexed.mirrors(entry) and entry.is_decoded
 
 
 def _tend(
@@ -179,8 +172,6 @@ def _tend(
         return 0
     if not indexed.mirrors(entry):
         state.show(entry)
-    if indexed.has_list:
-        state.drop_list(entry.key)
     return None
 
 
@@ -288,59 +279,51 @@ def catch_up(
         SegmentError: A segment cannot be read.
     """
     entry = put_entry(directory, catalog, label)
-    indexed, done = _prepare(database, entry, catalog)
+    indexed = _prepare(database, entry, catalog)
     whole = {int(number) for number in indexed.segments}
     missing = {
-        (number, chunk): offset
+        (number, chunk)
         for number, _, _ in entry.spans
         if number not in whole
-        for chunk, offset in enumerate(catalog.table(entry, number).chunks["offset"].tolist())
-        if (number, chunk) not in done
+        for chunk in range(len(catalog.table(entry, number).chunks))
+        if (number, chunk) > indexed.through[:2]
     }
     damage = catalog.damage(entry.id)
-    decoded = _index(
+    _index(
         directory,
         catalog,
         database,
         entry,
+        through=indexed.through,
         missing=missing,
         damage=damage,
         progress=progress,
     )
     catalog.put_damage(entry.id, damage)
-    entry = finish(directory, catalog, database, label, turn=indexed.turn, decoded=decoded)
+    entry = finish(directory, catalog, database, label, turn=indexed.turn)
     if not entry.is_decoded:  # documents indexed before
         IndexState(database).show(decode_again(directory, catalog, entry, progress))
-    return len(missing.keys() - damage.keys())
+    return len(missing - damage.keys())
 
 
-def _prepare(
-    database: Database, entry: RecordingEntry, catalog: Catalog
-) -> tuple[Indexed, dict[Place, int]]:
-    """Remove documents from the index that do not fit the segments; return the rest.
-
-    Returns:
-        The state of the recording's index, and the offsets of indexed chunks in
-        incompletely indexed segments.
-    """
+def _prepare(database: Database, entry: RecordingEntry, catalog: Catalog) -> Indexed:
+    """Remove documents from the index that do not fit the segments; return what it has."""
     state = IndexState(database)
     indexed = state.one(entry.key)
-    done = state.places(entry.key)
     if (
         indexed is not None
         and indexed.state in {"open", "indexing"}
-        and _fits(entry, catalog, done)
+        and _fits(entry, catalog, indexed.through)
         and all(entry.digests.get(n) == digest for n, digest in indexed.segments.items())
     ):
-        return indexed, done
+        return indexed
     turn = 1 if indexed is None else indexed.turn + 1
     left: dict[str, str] = {}
     if indexed is not None and indexed.state in {"complete", "clearing"}:
         left = {n: d for n, d in indexed.segments.items() if entry.digests.get(n) == d}
     if indexed is not None and indexed.state == "complete" and left == dict(indexed.segments):
         state.put(entry, "indexing", turn=turn, segments=left)
-        state.forget_chunks(entry.key)
-        return Indexed(entry.id, "indexing", left, turn), {}
+        return Indexed(entry.id, "indexing", left, turn)
     # If this is interrupted, the next opening repeats it.
     state.put(entry, "clearing", turn=turn, segments=left)
     if indexed is None:
@@ -349,22 +332,20 @@ def _prepare(
     else:
         _clear_documents(database, entry.key, indexed, entry, but=[int(n) for n in left])
     state.put(entry, "indexing", turn=turn, segments=left)
-    return Indexed(entry.id, "indexing", left, turn), {}
+    return Indexed(entry.id, "indexing", left, turn)
 
 
-def _fits(entry: RecordingEntry, catalog: Catalog, done: Mapping[Place, int]) -> bool:
-    """True if the positions of all indexed chunks match the segments.
+def _fits(entry: RecordingEntry, catalog: Catalog, through: Through) -> bool:
+    """True if the last indexed chunk is in the segments.
 
     A power cut may remove chunks whose index documents are on the disk already.
     """
-    tables = {
-        number: catalog.table(entry, number).chunks["offset"].tolist()
-        for number, _, _ in entry.spans
-    }
-    return all(
-        number < len(tables.get(segment, ())) and tables[segment][number] == offset
-        for (segment, number), offset in done.items()
-    )
+    if through == NOTHING:
+        return True
+    if all(number != through.segment for number, _, _ in entry.spans):
+        return False
+    offsets = catalog.table(entry, through.segment).chunks["offset"]
+    return through.chunk < len(offsets) and bool(offsets[through.chunk] == through.offset)
 
 
 def _index(
@@ -373,17 +354,19 @@ def _index(
     database: Database,
     entry: RecordingEntry,
     *,
-    missing: Mapping[Place, int],
+    through: Through,
+    missing: Collection[Place],
     damage: dict[Place, str],
     progress: Progress | None,
-) -> Decoded:
+) -> None:
     """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
-    from hybridlog.index_writer import IndexTarget, IndexWriter
+    from hybridlog.index_writer import INTERVAL_S, DocumentSender
     from hybridlog.indexing import ChunkIndexer
 
     topics = tables.missing(directory, entry)
     writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
-    index = IndexWriter(entry, ChunkIndexer(entry.id), IndexTarget(database))
+    indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, database, through)
+    sent = time.monotonic()
     # A chunk that is indexed already may be missing in the tables all the same.
     found = _chunks(
         directory,
@@ -395,24 +378,26 @@ def _index(
         progress=progress,
     )
     try:
-        last = ""
-        for chunk, channels in found:
-            if last and str(chunk.segment) != last:
-                writer.cut(int(last), entry.digests[last])
-            last = str(chunk.segment)
-            writer.add(chunk, channels)
-            if (chunk.segment, chunk.number) in missing:
-                index.submit(chunk, channels)
-        index.close()
-        if index.failure is not None:
-            raise index.failure
+        for number, chunks in groupby(found, key=lambda one: one[0].segment):
+            stats: dict[int, Mapping[int, ChannelStats]] = {}
+            for chunk, channels in chunks:
+                writer.add(chunk, channels)
+                documents, entries = indexer.documents_of([chunk], channels)
+                stats[chunk.number] = entries[0].stats
+                if (number, chunk.number) in missing:
+                    sender.add(documents, entries)
+                if time.monotonic() - sent > INTERVAL_S:
+                    sender.send()
+                    sent = time.monotonic()
+            writer.cut(number, entry.digests[str(number)])
+            if len(stats) == len(catalog.table(entry, number).chunks):
+                rows = decoded_rows(stats.values())
+                catalog.put_stamps(entry.id, [(number, entry.digests[str(number)], rows)])
+        sender.send(wait=True)
         writer.close(entry)
-    except BaseException:
-        index.abandon()
-        raise
     finally:
+        sender.close()
         writer.discard()
-    return index.decoded
 
 
 def _chunks(
@@ -420,7 +405,7 @@ def _chunks(
     catalog: Catalog,
     entry: RecordingEntry,
     *,
-    missing: Mapping[Place, int],
+    missing: Collection[Place],
     topics: Collection[str],
     damage: dict[Place, str],
     progress: Progress | None,
@@ -456,12 +441,8 @@ def finish(
     label: str,
     *,
     turn: int,
-    decoded: Decoded,
 ) -> RecordingEntry:
     """Mark the index of a recording as complete; return the recording's complete entry.
-
-    Decoding results go into the catalog, then the mirror becomes `complete`, and last the
-    list of chunks is dropped.
 
     Args:
         directory: The store.
@@ -469,40 +450,13 @@ def finish(
         database: The index; None without one.
         label: The recording.
         turn: As for `IndexState.put`.
-        decoded: Statistics of chunks.
     """
-    inventory = take_inventory(directory, label)
-    damage = catalog.damage(inventory.id)
-    catalog.put_stamps(inventory.id, _stamps(inventory, decoded, damage))
-    described = describe_inventory(catalog, inventory)
-    catalog.put(described)
-    entry = described.entry
-    if database is None:
-        return entry
-    state = IndexState(database)
-    state.put(
-        entry,
-        "complete",
-        turn=turn,
-        segments=entry.digests,
-        has_list=True,
-        damage=damage,
-    )
-    state.drop_list(entry.key)
+    entry = put_entry(directory, catalog, label)
+    if database is not None:
+        damage = catalog.damage(entry.id)
+        state = IndexState(database)
+        state.put(entry, "complete", turn=turn, segments=entry.digests, damage=damage)
     return entry
-
-
-def _stamps(
-    inventory: Inventory, decoded: Decoded, damage: Collection[Place]
-) -> Iterator[tuple[int, str, NDArray[np.void]]]:
-    """Number, digest and stamp rows of each segment whose chunks are all decoded."""
-    for segment, stats in decoded.items():
-        summary = inventory.summaries.get(segment)
-        if summary is None:
-            continue
-        places = {(segment, number) for number in range(len(summary.table.chunks))}
-        if places.issubset({*damage, *((segment, number) for number in stats)}):
-            yield segment, summary.digest, stamps_of(summary.table, stats)
 
 
 def rebuild(

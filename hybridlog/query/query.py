@@ -763,7 +763,10 @@ class Query:
     def documents(self) -> Iterator[dict[str, Any]]:
         """The index documents in MongoDB, in the order of the messages.
 
-        Without MongoDB, they are made of the messages.
+        In a store without MongoDB, they are made of the messages.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
         """
         from hybridlog.query.answers.index_documents import index_documents
 

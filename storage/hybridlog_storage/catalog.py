@@ -439,19 +439,33 @@ def stamps_of(
     for number, by_channel in chunks.items():
         for row in range(bounds[number], bounds[number + 1]):
             stats = by_channel.get(int(table.parts["channel"][row]))
-            if stats is None:
-                continue
-            rows[row] = (
-                stats.unreadable,
-                stats.surplus,
-                stats.stamped,
-                stats.first_stamp or 0,
-                stats.last_stamp or 0,
-                stats.skew_sum,
-                stats.skew_min or 0,
-                stats.skew_max or 0,
-            )
+            if stats is not None:
+                rows[row] = _decoded(stats)
     return rows
+
+
+def decoded_rows(chunks: Iterable[Mapping[int, ChannelStats]]) -> NDArray[np.void]:
+    """The same of a segment whose chunks could all be decoded.
+
+    Args:
+        chunks: Statistics by channel, for each chunk of the segment.
+    """
+    rows = [_decoded(stats) for one in chunks for _, stats in sorted(one.items())]
+    return np.array(rows, _STAMPS)
+
+
+def _decoded(stats: ChannelStats) -> tuple[float, ...]:
+    """A row of the results of decoding."""
+    return (
+        stats.unreadable,
+        stats.surplus,
+        stats.stamped,
+        stats.first_stamp or 0,
+        stats.last_stamp or 0,
+        stats.skew_sum,
+        stats.skew_min or 0,
+        stats.skew_max or 0,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,29 +3,26 @@
 `hybridlog.recordings` mirrors the catalog for other programs. It also states for each
 recording whether its index is complete, and from which segments it was made. The index is
 used only if both match, and in a replica set only if a majority of its members has them:
-then the documents, written before, cannot be lost. `hybridlog.chunks` lists indexed chunks
-while a recording is being indexed. A row is written after the documents of its chunk, so a
-killed server has not lost documents that it lists.
+then the documents, written before, cannot be lost. While a recording is being indexed, its
+mirror says through which chunk. That is written after the documents, so a killed server has
+not lost documents up to there.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import secrets
-import struct
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Final, Literal, NamedTuple
 
-from hybridlog_storage.catalog import ChunkEntry, RecordingEntry
+from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database, ReadConcern
 from hybridlog_storage.topic_places import SHARED, TopicPlace, text_of
 
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
-CHUNKS: Final = f"{CATALOG_PREFIX}chunks"
 STORE: Final = f"{CATALOG_PREFIX}store"
 """Collection that names the store that owns a database."""
 _AT_ONCE: Final = 500  # entries decoded at once; each takes some kilobytes as a dictionary
@@ -34,7 +31,6 @@ State = Literal["open", "clearing", "indexing", "complete", "removing"]
 """State of a recording's index: being recorded, documents being removed for a rebuild, being
 indexed, complete, being removed for good."""
 _DESTROYS: Final = frozenset({"clearing", "removing"})
-_KEY: Final = re.compile("[0-9a-f]{16}")
 _TURN: Final = {"_id": "turn"}
 _FIELDS: Final = {"_id": "fields"}
 _UNCERTAIN_CHANNEL: Final = [
@@ -59,6 +55,25 @@ _SHOWN: Final = (
 """Values of an entry that may change while its segments stay."""
 
 
+class Through(NamedTuple):
+    """A chunk up to which, in the order of the file, an index has all documents.
+
+    Attributes:
+        segment: Number of its segment.
+        chunk: Number in the segment; -1 for none.
+        offset: Byte of the chunk record.
+        messages: Number of messages up to there.
+    """
+
+    segment: int
+    chunk: int
+    offset: int
+    messages: int
+
+
+NOTHING: Final = Through(0, -1, 0, 0)
+
+
 @dataclass(frozen=True, slots=True)
 class Indexed:
     """The state of a recording's index.
@@ -70,9 +85,9 @@ class Indexed:
         turn: Counts how often its documents were removed or rebuilt.
         topics: Topics of its documents, as far as known.
         span: First and last log time of its documents, ns, as far as known; None without any.
-        has_list: Whether the list of its chunks may still exist although it is complete.
         shown: Name, tags, notes and marks in the mirror.
         damage: Chunks that could not be read for indexing: reason by segment and number.
+        through: Of an incomplete index, the last chunk that it has.
     """
 
     id: str
@@ -81,9 +96,9 @@ class Indexed:
     turn: int
     topics: tuple[str, ...] = ()
     span: tuple[int, int] | None = None
-    has_list: bool = False
     shown: Mapping[str, Any] = field(default_factory=dict)
     damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    through: Through = NOTHING
 
     def mirrors(self, entry: RecordingEntry) -> bool:
         """True if the mirror of a recording with the same segments is current."""
@@ -134,9 +149,9 @@ class IndexState:
                 int(index.get("turn", 0)),
                 tuple(sorted(topics)),
                 (min(firsts), max(lasts)) if firsts and lasts else None,
-                bool(index.get("has_list")),
                 {name: document.get(name) for name in _SHOWN},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
+                Through(**index["through"]) if "through" in index else NOTHING,
             )
         return found
 
@@ -190,7 +205,6 @@ class IndexState:
         *,
         turn: int,
         segments: Mapping[str, str] | None = None,
-        has_list: bool = False,
         damage: Mapping[tuple[int, int], str] | None = None,
     ) -> None:
         """Mirror a recording and store the progress of its index.
@@ -200,7 +214,6 @@ class IndexState:
             state: Progress of the index.
             turn: Greater than before if documents are about to be removed.
             segments: Digest of each indexed segment, by its number as text.
-            has_list: Whether the list of its chunks is about to be dropped.
             damage: Chunks that could not be read: reason by segment and number.
         """
         unreadable = [
@@ -214,7 +227,6 @@ class IndexState:
                 "state": state,
                 "turn": turn,
                 "segments": dict(segments or {}),
-                **({"has_list": True} if has_list else {}),
                 **({"damage": unreadable} if unreadable else {}),
             },
         }
@@ -240,36 +252,9 @@ class IndexState:
         except (AttributeError, KeyError, TypeError, ValueError):
             return False
 
-    def drop_list(self, key: str) -> None:
-        """Drop the list of chunks of a complete recording."""
-        self.forget_chunks(key)
-        self._db.update(RECORDINGS, {"_id": key}, {"$unset": {"index.has_list": 1}})
-
-    def put_chunks(self, chunks: Sequence[ChunkEntry]) -> None:
-        """Add indexed chunks to the list."""
-        self._db.replace_all(
-            CHUNKS,
-            [
-                {
-                    "_id": _place(chunk.recording[:16], chunk.segment, chunk.number),
-                    "rec": chunk.recording[:16],
-                    "seg": chunk.segment,
-                    "chunk": chunk.number,
-                    "offset": chunk.offset,
-                }
-                for chunk in chunks
-            ],
-        )
-
-    def places(self, key: str) -> dict[tuple[int, int], int]:
-        """Offset of each indexed chunk, by segment and number."""
-        asked = {"_id": _all_of(key)}
-        found = self._db.find(CHUNKS, asked, {"seg": 1, "chunk": 1, "offset": 1})
-        return {(d["seg"], d["chunk"]): d["offset"] for d in found}
-
-    def forget_chunks(self, key: str) -> None:
-        """Drop the list of chunks of a complete or removed recording."""
-        self._db.delete(CHUNKS, {"_id": _all_of(key)})
+    def put_through(self, key: str, through: Through) -> None:
+        """Store that the index of a recording has all documents up to a chunk."""
+        self._db.update(RECORDINGS, {"_id": key}, {"$set": {"index.through": through._asdict()}})
 
     def clear(
         self,
@@ -278,7 +263,7 @@ class IndexState:
         span: tuple[int, int] | None = None,
         but: Collection[int] = (),
     ) -> None:
-        """Remove the index documents of a recording, and the list of its chunks.
+        """Remove the index documents of a recording.
 
         Args:
             key: Key of the recording, or another value of `_meta.rec` in foreign documents.
@@ -290,8 +275,6 @@ class IndexState:
         asked: dict[str, object] = {"_meta.rec": key}
         if but:
             asked["_meta.ref.seg"] = {"$nin": sorted(but)}
-        if isinstance(key, str) and _KEY.fullmatch(key):
-            self.forget_chunks(key)
         if places is None:
             for collection in self.document_collections():
                 self._db.delete(collection, asked)
@@ -344,12 +327,3 @@ def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
 
 def _label(entry: RecordingEntry) -> str:
     return os.fsencode(entry.label).decode("utf-8", "backslashreplace")
-
-
-def _place(key: str, segment: int, chunk: int) -> bytes:
-    return bytes.fromhex(key) + struct.pack(">II", segment, chunk)
-
-
-def _all_of(key: str) -> dict[str, bytes]:
-    """A filter for all chunks of a recording; MongoDB orders binary values by length first."""
-    return {"$gte": _place(key, 0, 0), "$lte": _place(key, 0xFFFFFFFF, 0xFFFFFFFF)}

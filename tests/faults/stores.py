@@ -28,7 +28,7 @@ from hybridlog_storage.catalog import _crc as crc_of
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database
 from hybridlog_storage.directory import StoreDirectory
-from hybridlog_storage.index_state import CHUNKS, RECORDINGS, STORE, IndexState
+from hybridlog_storage.index_state import RECORDINGS, STORE, IndexState
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.topic_places import SHARED, TOPICS, TopicPlaces
 from tests.faults.logs import Content
@@ -331,7 +331,6 @@ def _check_tables(store: hl.Store) -> None:
 def _check_database(store: hl.Store, database: Database) -> None:
     """Nothing is in it that is of no recording, and of each recording there is all."""
     entries = {entry.key: entry for entry in store.recordings() if entry.label}
-    _check(not list(database.find(CHUNKS)), f"chunks are left: {list(database.find(CHUNKS))}")
     mirror = {document["_id"]: document for document in database.find(RECORDINGS)}
     _check(mirror.keys() == entries.keys(), f"mirrored are {mirror.keys()}")
     for key, entry in entries.items():

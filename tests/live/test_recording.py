@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +23,18 @@ from mcap.reader import make_reader
 import hybridlog as hl
 from hybridlog import index_writer
 from hybridlog.demo.write import write_bag
-from hybridlog.index_writer import Lag
 from hybridlog.indexing import ChunkIndexer
-from hybridlog.live import LiveRecording, memory_reservation
+from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog.tables.reader import Tables
 from hybridlog.tables.writer import TableWriter
-from hybridlog_storage import append_file, chunk_builder, segment_writer
-from hybridlog_storage.buffers import SLAB, Buffers
+from hybridlog_storage import append_file, segment_writer
 from hybridlog_storage.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.copying import COPIED_AT_ONCE
 from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
-from hybridlog_storage.index_state import CHUNKS
+from hybridlog_storage.index_state import NOTHING, IndexState
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segment_file import SegmentFile
 from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
@@ -331,153 +330,8 @@ def test_the_index_falls_behind_and_catches_up(
     assert store.verify().findings == []
 
 
-@pytest.fixture
-def each_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No chunk waits for others to be indexed with it."""
-    monkeypatch.setattr(index_writer, "_FEW_BYTES", 0)
-
-
-@pytest.mark.usefixtures("each_by_itself")
-def test_what_was_let_go_does_not_keep_others_waiting(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Chunks in memory come first, or those behind them would have to be let go as well."""
-    monkeypatch.setattr(index_writer, "_MOST_BACKLOG", 2)
-    made: list[int] = []
-    began, go_on = threading.Event(), threading.Event()
-    real_documents = ChunkIndexer.documents_of
-
-    def held_up(self: ChunkIndexer, chunks: list[StoredChunk], *args: Any) -> Any:
-        began.set()
-        go_on.wait(30)
-        made.extend(int(chunk.seq[0]) for chunk in chunks)
-        return real_documents(self, chunks, *args)
-
-    real_read = Lag.read
-
-    def slow(self: Lag, chunk: Any) -> StoredChunk:
-        if len(made) == 2:  # now that there is room, more comes
-            speak(6, 7)
-        return real_read(self, chunk)
-
-    monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
-    monkeypatch.setattr(Lag, "read", slow)
-    own = channel("/talk")
-    payloads = [text(bytes([n]) * 200_000) for n in range(7)]
-    with store.start("talk", settings=SegmentSettings(chunk_size=100_000)) as recording:
-        totals = recording._capture.writer.totals
-
-        def speak(first: int, last: int) -> None:
-            for number in range(first, last):
-                recording.write(own, payloads[number], log_time=number)
-            wait_for(lambda: totals.chunks == last)
-
-        speak(0, 6)
-        began.wait(30)
-        go_on.set()
-        wait_for(lambda: recording.lag == 0)
-    assert made == [0, 1, 2, 6, 3, 4, 5]
-    assert [m.raw for m in store.topic("/talk")] == payloads
-    assert store.verify().findings == []
-
-
-@pytest.mark.usefixtures("each_by_itself")
-def test_chunks_are_let_go_only_beyond_the_backlog(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So many bytes of them; and nothing is made or read before the disk can spare it."""
-    busy = True
-    monkeypatch.setattr(LiveRecording, "_is_under_pressure", lambda *_: busy)
-    # What memory the process has at hand depends on the tests before.
-    monkeypatch.setattr(memory_reservation.buffers, "is_short", lambda *_: False)
-    read, made = [], []
-    real = Lag.read
-
-    def seen(self: Lag, chunk: Any) -> StoredChunk:
-        read.append(chunk)
-        return real(self, chunk)
-
-    monkeypatch.setattr(Lag, "read", seen)
-    real_documents = ChunkIndexer.documents_of
-
-    def counted(self: ChunkIndexer, *args: Any) -> Any:
-        made.append(args)
-        return real_documents(self, *args)
-
-    monkeypatch.setattr(ChunkIndexer, "documents_of", counted)
-    own = channel("/talk")
-    payloads = [text(os.urandom(1 << 18)) for _ in range(40)]
-    settings = SegmentSettings(chunk_size=1 << 18)
-    backlog = 32
-    budget = 8 * (backlog * ((1 << 18) + 100))  # and what stands before each message
-    with store.start("talk", settings=settings, budget_bytes=budget) as recording:
-        for number, payload in enumerate(payloads):
-            recording.write(own, payload, log_time=number)
-        wait_for(lambda: recording._capture.writer.totals.chunks == 40)
-        time.sleep(0.2)
-        assert not made
-        assert not read
-        busy = False
-        wait_for(lambda: recording.lag == 0)
-        assert len(read) == 40 - backlog
-    assert [m.raw for m in store.topic("/talk")] == payloads
-    assert store.verify().findings == []
-
-
-@pytest.mark.usefixtures("each_by_itself")
-def test_few_chunks_wait_for_the_index_where_memory_is_short(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They lie in memory that is needed for what comes; they are read again afterwards."""
-    read: list[object] = []
-    real = Lag.read
-
-    def seen(self: Lag, chunk: Any) -> StoredChunk:
-        read.append(chunk)
-        return real(self, chunk)
-
-    monkeypatch.setattr(Lag, "read", seen)
-    go_on = threading.Event()
-    real_documents = ChunkIndexer.documents_of
-
-    def held_up(self: ChunkIndexer, *args: Any) -> Any:
-        go_on.wait(30)
-        return real_documents(self, *args)
-
-    monkeypatch.setattr(ChunkIndexer, "documents_of", held_up)
-    own = channel("/talk")
-    size = 1 << 18
-    payloads = [text(os.urandom(size - 100)) for _ in range(64)]
-    pool = Buffers()
-    monkeypatch.setattr(memory_reservation, "buffers", pool)
-    monkeypatch.setattr(chunk_builder, "buffers", pool)
-    monkeypatch.setattr(memory_reservation.MemoryReservation, "observe", lambda *_: None)
-    settings = SegmentSettings(chunk_size=size)
-    with store.start("talk", settings=settings, budget_bytes=8 * 40 * size) as recording:
-        totals = recording._capture.writer.totals
-        assert pool._given == {SLAB: 40 * size}
-
-        def speak() -> None:  # not on the main thread, where a message waits for a tick
-            for number, payload in enumerate(payloads):
-                recording.write(own, payload, log_time=number)
-                wait_for(lambda number=number: totals.chunks >= number)  # the last one is open
-
-        thread = threading.Thread(target=speak)
-        thread.start()
-        thread.join()
-        wait_for(lambda: totals.chunks == 64)
-        assert pool._given == {SLAB: 40 * size}
-        go_on.set()
-        wait_for(lambda: recording.lag == 0)
-        # Of those that were there half waited in memory, but for what was being written.
-        assert 64 - 22 <= len(read) <= 64 - 17
-    assert [m.raw for m in store.topic("/talk")] == payloads
-    assert store.verify().findings == []
-
-
 @pytest.mark.parametrize("size", [150_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
-@pytest.mark.usefixtures("each_by_itself")
 def test_the_index_waits_while_messages_wait_for_their_turn(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool, size: int
 ) -> None:
@@ -599,8 +453,9 @@ def test_a_processor_is_left_to_who_brings_messages(
     slowly(ChunkIndexer, "documents_of")
     slowly(TableWriter, "add")
     payloads = [text(bytes([n]) * 2000) for n in range(30)]
+    monkeypatch.setattr(index_writer, "_GROUP_BYTES", 0)
+    monkeypatch.setattr(live, "_index_interval_s", lambda _: 0.01)
     with store.start("talk", settings=SegmentSettings(chunk_size=2000)) as recording:
-        monkeypatch.setattr(index_writer, "_FEW", 0)
         for payload in payloads:
             recording.write(channel("/talk"), payload)
     assert most == side_by_side
@@ -863,7 +718,8 @@ def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
         assert isinstance(report.failure, DatabaseError)
     assert store.database is None
     assert [m.raw for m in store.topic("/talk")] == [text(b"kept")] * 5
-    assert len(list(store.topic("/talk").documents())) == 5
+    with pytest.raises(DatabaseError, match="refuses it"):
+        list(store.topic("/talk").documents())
     assert store.topic("/talk").where("data == 'kept'").count() == 5  # the segments know
     with hl.open(store.directory.path) as again:
         assert again.topic("/talk").where("data == 'kept'").count() == 5
@@ -879,7 +735,7 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         database, key = store.database_for("This"), recording.id[:16]
-        assert database.delete(CHUNKS, {"rec": key}) == 1
+        IndexState(database).put_through(key, NOTHING)
         assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
         kill_mongod(store.directory.path)
         recording.write(speech, text(b"after"), log_time=2)
@@ -892,19 +748,25 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     assert not store.verify().findings
 
 
-def test_chunks_of_few_messages_are_indexed_together(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each topic has a chunk a flush, and one insert every few of them."""
-    inserted: Counter[str] = Counter()
+@pytest.fixture
+def inserted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Number of inserts, by collection."""
+    found: Counter[str] = Counter()
     real = Database.insert_raw
 
     def counted(self: Database, collection: str, *args: Any, **given: Any) -> int:
-        inserted[collection] += 1
+        found[collection] += 1
         return real(self, collection, *args, **given)
 
     monkeypatch.setattr(Database, "insert_raw", counted)
-    monkeypatch.setattr(live, "_index_delay", lambda _: 1e9)
+    return found
+
+
+def test_documents_of_many_chunks_are_sent_together(
+    store: hl.Store, inserted: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each topic has a chunk a flush, and one insert for all of an interval."""
+    monkeypatch.setattr(live, "_index_interval_s", lambda _: 1e6)
     topics = [channel(f"/topic{number}") for number in range(3)]
     with store.start("talk", flush_interval_s=0.05) as recording:
         totals = recording._capture.writer.totals
@@ -914,47 +776,59 @@ def test_chunks_of_few_messages_are_indexed_together(
             wait_for(lambda n=number: totals.chunks == 3 * (n + 1))
         assert recording.lag == 15
         assert not inserted
-        monkeypatch.setattr(live, "_index_delay", lambda _: 0.0)
-        # Nobody need close it, or say more.
-        wait_for(lambda: recording.lag == 0)
-        del inserted["hybridlog.topics"]
-        assert inserted == {collection_of(own.topic): 1 for own in topics}
-        assert totals.chunks == 15
+    assert {name: inserted[name] for name in inserted if name.startswith("topic")} == {
+        collection_of(own.topic): 1 for own in topics
+    }
     assert [m.raw[4] for m in store.topic("/topic1")] == list(range(5))
     assert store.verify().findings == []
 
 
-@pytest.mark.parametrize("most", ["_FEW_CHUNKS", "_FEW_WAITING"])
-def test_no_more_than_so_many_chunks_wait_for_others(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, most: str
+@pytest.mark.parametrize("bound", ["_INTERVAL_BYTES", "a segment"])
+def test_the_index_does_not_wait_for_the_interval(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, bound: str
 ) -> None:
-    monkeypatch.setattr(index_writer, most, 4 if most == "_FEW_CHUNKS" else 8000)
-    monkeypatch.setattr(live, "_index_delay", lambda _: 1e9)
-    together: list[int] = []
-    real = ChunkIndexer.documents_of
-
-    def seen(self: ChunkIndexer, chunks: list[StoredChunk], *args: Any) -> Any:
-        together.append(len(chunks))
-        return real(self, chunks, *args)
-
-    monkeypatch.setattr(ChunkIndexer, "documents_of", seen)
+    """When many bytes were flushed, or a segment was sealed."""
+    monkeypatch.setattr(live, "_index_interval_s", lambda _: 1e6)
+    settings = SegmentSettings(segment_size=20_000)
+    if bound == "_INTERVAL_BYTES":
+        monkeypatch.setattr(index_writer, bound, 20_000)
+        settings = SegmentSettings()
     own = channel("/talk")
-    with store.start("talk", flush_interval_s=0.05) as recording:
+    with store.start("talk", flush_interval_s=0.05, settings=settings) as recording:
         totals = recording._capture.writer.totals
-        for number in range(10):
-            recording.write(own, text(bytes([number]) * 2000), log_time=number)
+        for number in range(15):
+            recording.write(own, text(os.urandom(2000)), log_time=number)
             wait_for(lambda n=number: totals.chunks == n + 1)
-        wait_for(lambda: together == [4, 4])
-    assert together == [4, 4, 2]
-    assert recording.close().indexed == 10
+        wait_for(lambda: recording.lag < 8)
+    assert recording.close().indexed == 15
+    assert store.verify().findings == []
+
+
+def test_memory_has_no_chunks_that_wait(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However far the index is behind; of sealed segments not even their places."""
+    busy = True
+    monkeypatch.setattr(LiveRecording, "_is_under_pressure", lambda *_: busy)
+    own = channel("/talk")
+    payloads = [text(os.urandom(20_000)) for _ in range(60)]
+    settings = SegmentSettings(chunk_size=20_000, segment_size=200_000)
+    with store.start("talk", flush_interval_s=0.05, settings=settings) as recording:
+        for number, payload in enumerate(payloads):
+            recording.write(own, payload, log_time=number)
+        wait_for(lambda: recording._capture.writer.totals.chunks == 60)
+        index = recording._capture.index
+        held = [astuple(place) for places in index._places.values() for place in places]
+        assert len(held) == 60
+        assert all(isinstance(value, int | tuple) for one in held for value in one)
+        busy = False
+        wait_for(lambda: recording.lag == 0)
+        assert len(index._places) <= 1
+    assert [m.raw for m in store.topic("/talk")] == payloads
     assert store.verify().findings == []
 
 
 def test_tables_get_chunks_in_the_order_of_the_file(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of chunks that wait, too: together, or when one comes that does not wait."""
-    monkeypatch.setattr(live, "_index_delay", lambda _: 1e9)
     added: list[int] = []
     real = TableWriter.add
 
@@ -967,35 +841,16 @@ def test_tables_get_chunks_in_the_order_of_the_file(
     with store.start("talk", flush_interval_s=0.05) as recording:
         totals = recording._capture.writer.totals
 
-        def say(own: Channel, size: int) -> None:
+        for own, size in ((slow, 2000), (slow, 2000), (large, 1_200_000), (slow, 2000)):
             before = totals.chunks
             recording.write(own, text(b"y" * size))
-            wait_for(lambda: totals.chunks == before + 1)
-
-        say(slow, 2000)
-        say(slow, 2000)
-        assert not added
-        say(large, 1_200_000)
-        wait_for(lambda: len(added) == 3)
-        say(slow, 2000)
-        assert len(added) == 3
+            wait_for(lambda before=before: totals.chunks == before + 1)
     assert len(added) == 4
     assert added == sorted(set(added))
     (entry,) = store.recordings()
     tables = Tables(store.directory.path)
     assert all(tables.of(entry, own.topic) for own in (slow, large))
     assert store.verify().findings == []
-
-
-def test_a_chunk_of_many_messages_waits_for_none(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(live, "_index_delay", lambda _: 1e9)
-    own = channel("/talk")
-    with store.start("talk", flush_interval_s=0.5) as recording:
-        for number in range(1000):
-            recording.write(own, text(b"%d" % number), log_time=number)
-        wait_for(lambda: recording.stored[0] - recording.lag > 900)
 
 
 @pytest.mark.embedded
@@ -1022,23 +877,6 @@ def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
     assert store.topic("/speech").count() == 199
 
 
-def test_a_recording_of_more_chunks_than_are_kept_is_counted_whole(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hybridlog.index_writer._MOST_LATEST", 2)
-    settings = SegmentSettings(chunk_size=1 << 12)
-    recording = store.start("many", settings=settings)
-    own = channel("/talk")
-    for number in range(100):
-        recording.write(own, text(b"x" * 2000), log_time=10**18 + number)
-    report = recording.close()
-    (found,) = report.entry.channels
-    assert report.entry.chunks > 20
-    assert (found.stats.messages, found.stats.first, found.stats.last) == (100, 10**18, 10**18 + 99)
-    assert store.recordings()[0].channels == report.entry.channels
-    assert store.verify().findings == []
-
-
 def test_a_database_that_is_away_is_asked_once_for_what_is_expected(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1052,7 +890,8 @@ def test_a_database_that_is_away_is_asked_once_for_what_is_expected(
         with monkeypatch.context() as patch:
             patch.setattr(Database, "ensure_collection", away)
             recording.expect(*(channel(f"/topic{number}") for number in range(5)))
-            recording._capture.index._maker.submit(len, ()).result()
+            wait_for(lambda: recording.index_failure is not None)
+            time.sleep(0.1)
         assert len(asked) == 1
         recording.write(channel("/topic1"), text(b"x"), log_time=1)
     assert store.topic("/topic1").where("data == 'x'").count() == 1

@@ -13,7 +13,7 @@ from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry, 
 from hybridlog_storage.collection_names import CATALOG_PREFIX
 from hybridlog_storage.database import Database
 from hybridlog_storage.index_documents import key_bound
-from hybridlog_storage.index_state import CHUNKS, RECORDINGS, STORE, Indexed, IndexState
+from hybridlog_storage.index_state import NOTHING, RECORDINGS, STORE, Indexed, IndexState, Through
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongod import EmbeddedMongod
 from hybridlog_storage.topic_places import TopicPlace
@@ -111,7 +111,7 @@ def test_a_state_comes_back(state: IndexState, step: str) -> None:
     assert found is not None
     assert (found.id, found.state, found.turn) == (ONE, step, 3)
     assert dict(found.segments) == {"0": "sha256:a"}
-    assert (found.has_list, dict(found.damage)) == (False, {})
+    assert dict(found.damage) == {}
     assert found.mirrors(entry)
     assert not found.is_whole(entry)
 
@@ -144,7 +144,7 @@ def test_the_mirror_shows_a_recording_as_it_was_or_as_it_is(
     state: IndexState, name: str, value: object
 ) -> None:
     entry = recording()
-    state.put(entry, "complete", turn=4, segments=DIGESTS, damage={(0, 1): "x"}, has_list=True)
+    state.put(entry, "complete", turn=4, segments=DIGESTS, damage={(0, 1): "x"})
     changed = replace(entry, **{name: value})
     before = indexed(state)
     assert before is not None
@@ -177,7 +177,7 @@ def test_what_the_mirror_says_otherwise_is_seen(state: IndexState, database: Dat
         {"$set": {"channels": 5}}, {"$set": {"spans": [[0, 5]]}}, {"$push": {"notes": "x"}},
         {"$set": {"end.losses": [{"cause": "x"}]}}, {"$unset": {"channels.0.stats.skew_sum": 1}},
     ):  # fmt: skip
-        state.put(entry, "complete", turn=1, segments=DIGESTS, has_list=True, damage={(0, 1): "x"})
+        state.put(entry, "complete", turn=1, segments=DIGESTS, damage={(0, 1): "x"})
         assert state.is_mirrored(entry)
         database.update(RECORDINGS, {"_id": ONE[:16]}, change)
         assert not state.is_mirrored(entry), change
@@ -247,48 +247,18 @@ def test_whoever_asks_sees_that_documents_were_about_to_go(state: IndexState) ->
     assert state.turn() == 3
 
 
-# The list of chunks, while a recording is being indexed.
-
-
-def test_each_chunk_has_its_place(state: IndexState) -> None:
-    places = [(1, 0), (0, 2), (0, 10), (300, 70000), (0, 0), (1, 256)]
-    state.put_chunks([chunk(*place) for place in places])
-    state.put_chunks([chunk(5, 5, OTHER)])
-    assert state.places(ONE[:16]) == {(s, n): n * 1000 for s, n in places}
-    assert state.places(OTHER[:16]) == {(5, 5): 5000}
-    assert state.places("0" * 16) == {}
-
-
-def test_a_chunk_that_is_noted_again_is_noted_once(state: IndexState) -> None:
-    state.put_chunks([])
-    state.put_chunks([chunk(0, 0), chunk(0, 1)])
-    state.put_chunks([replace(chunk(0, 1), offset=5)])
-    assert state.places(ONE[:16]) == {(0, 0): 0, (0, 1): 5}
-
-
-@pytest.mark.parametrize("other", ["0123456789abcdee", "0123456789abcdf0", "00" * 8, "ff" * 8])
-def test_the_lists_of_others_are_left_alone(state: IndexState, other: str) -> None:
-    """Of those whose keys stand next to it, too."""
-    key = other + "5" * 16
-    for of in (ONE, key):
-        state.put_chunks([chunk(0, 0, of), chunk(0xFFFFFFFF, 0xFFFFFFFF, of)])
-    state.forget_chunks(ONE[:16])
-    assert state.places(ONE[:16]) == {}
-    assert len(state.places(other)) == 2
-
-
-def test_the_list_goes_when_the_recording_is_complete(
-    state: IndexState, database: Database
-) -> None:
-    state.put_chunks([chunk(0, 0), chunk(0, 0, OTHER)])
-    state.put(recording(), "complete", turn=1, segments=DIGESTS, has_list=True)
-    found = indexed(state)
-    assert found is not None
-    assert found.has_list
-    state.drop_list(ONE[:16])
-    again = indexed(state)
-    assert again == replace(found, has_list=False)
-    assert [d["rec"] for d in database.find(CHUNKS, {})] == [OTHER[:16]]
+def test_an_index_says_through_which_chunk_it_is(state: IndexState) -> None:
+    state.put(recording(), "open", turn=1)
+    before = indexed(state)
+    assert before is not None
+    assert before.through == NOTHING
+    for through in (Through(0, 5, 2**40, 7), Through(300, 0, 8, 2**40)):
+        state.put_through(ONE[:16], through)
+        assert indexed(state) == replace(before, through=through)
+    state.put(recording(), "complete", turn=1, segments=DIGESTS)
+    after = indexed(state)
+    assert after is not None
+    assert after.through == NOTHING
 
 
 # Documents.
@@ -303,7 +273,6 @@ def filled(state: IndexState, database: Database) -> IndexState:
             for at in range(5):
                 made = document(of, at, at, at)
                 database.replace(name, {"_id": made["_id"]}, made)
-    state.put_chunks([chunk(0, 0), chunk(0, 0, OTHER)])
     return state
 
 
@@ -319,7 +288,6 @@ def test_clearing_removes_the_documents_of_one_recording(
     assert left(database, ONE) == []
     assert left(database, ONE, "two") == list(range(5))
     assert left(database, OTHER) == list(range(5))
-    assert (filled.places(ONE[:16]), len(filled.places(OTHER[:16]))) == ({}, 1)
 
 
 def test_clearing_leaves_the_segments_that_are_to_stay(
@@ -347,7 +315,6 @@ def test_documents_of_what_is_no_recording_can_be_cleared(
     filled.clear(key)
     assert database.count("one", {"_id": made["_id"]}) == 0
     assert left(database, ONE) == left(database, OTHER) == list(range(5))
-    assert len(filled.places(ONE[:16])) == 1
 
 
 def test_a_recording_leaves_the_mirror_last_and_alone(
@@ -364,8 +331,8 @@ def test_collections_of_topics_are_not_ours(filled: IndexState, database: Databa
     filled.put(recording(), "complete", turn=1)
     filled.claim({"id": "x"})
     assert sorted(filled.document_collections()) == ["one", "two"]
-    assert {RECORDINGS, CHUNKS, STORE} <= set(database.list_collections())
-    assert all(name.startswith(CATALOG_PREFIX) for name in (RECORDINGS, CHUNKS, STORE))
+    assert {RECORDINGS, STORE} <= set(database.list_collections())
+    assert all(name.startswith(CATALOG_PREFIX) for name in (RECORDINGS, STORE))
 
 
 # Whose it is.

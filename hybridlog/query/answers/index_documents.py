@@ -1,6 +1,6 @@
 """Index documents as MongoDB holds them, in the order of the messages.
 
-Without MongoDB, they are made of the messages.
+In a store without MongoDB, they are made of the messages.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _matching(
     try:
         planner.index.connect(parts)
     except DatabaseError:
-        if any(part.needs_index for part in parts):
+        if not session.connection.has_none or any(part.needs_index for part in parts):
             raise
         yield from _made(planner, parts)
         return
