@@ -35,7 +35,13 @@ def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
     from hybridlog.tables.reader import Tables
 
     tables = Tables(directory.path)
-    return {t for t in _possible(entry) if tables.of(entry, t) is None}
+    possible = _possible(entry)
+    return {
+        topic
+        for topic in topics_of(entry)
+        if not tables.has_all(entry, topic)
+        or (topic in possible and tables.of(entry, topic) is None)
+    }
 
 
 def _possible(entry: RecordingEntry) -> set[str]:
@@ -102,7 +108,9 @@ def made_for(
     found = tables.of(entry, topic)
     if found is not None or entry.status == "open" or not directory.is_writable:
         return found
-    if topic not in _possible(entry) or not make(directory, entry, {topic}):
+    if topic not in _possible(entry) and tables.has_all(entry, topic):
+        return None
+    if not make(directory, entry, {topic}):
         return None
     tables.forget(entry, [topic])
     found = tables.of(entry, topic)

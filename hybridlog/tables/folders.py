@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import logging
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ from hybridlog.tables.layout import (
     TABLES,
     About,
     Section,
+    is_of_folder,
     parts_folder,
 )
 from hybridlog.tables.parquet_file import (
@@ -39,6 +41,7 @@ MAX_SHARED_ROWS: Final = 50_000
 """Maximum number of rows of several recordings in one file."""
 MAX_SHARED_BYTES: Final = 4 << 20
 """Size from which a shared file gets no more recordings."""
+_SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{6,}}){re.escape(SUFFIX)}", re.ASCII)
 _log = logging.getLogger(__name__)
 
 
@@ -164,10 +167,11 @@ class TableFolders:
         """Add rows to the newest shared file, or to a new one."""
         assert addition.section is not None
         number = 0
-        if shared:
-            path = place / shared[-1]
+        numbers = [int(found[1]) for name in shared if (found := _SHARED_NAME.fullmatch(name))]
+        if numbers:
+            path = place / f"{SHARED}{max(numbers):06d}{SUFFIX}"
             reader = _reader(path)
-            number = int(path.stem.removeprefix(SHARED)) + (reader is not None)
+            number = max(numbers) + (reader is not None)
             if (
                 reader is not None
                 and reader.size_bytes < MAX_SHARED_BYTES
@@ -334,7 +338,10 @@ def recordings_of(root: Path) -> set[str]:
 def _reader(path: Path) -> ParquetFileReader | None:
     """A shared file; one that cannot be read is removed, since all of it can be made again."""
     try:
-        return ParquetFileReader(path)
+        reader = ParquetFileReader(path)
+        if not is_of_folder(path.parent.name, reader.schema):
+            raise StoreError(f"The table {path} is of another folder.")
+        return reader
     except FileNotFoundError:
         return None
     except StoreError as error:

@@ -46,6 +46,7 @@ from hybridlog.tables.layout import (
     TABLES,
     Section,
     TopicCounts,
+    is_of_folder,
     parts_folder,
     table_schema,
     type_prefix,
@@ -643,6 +644,8 @@ class _Folder:
             file = ColumnFile(self._path / name, depth=self._depth + 1)
         except (FileNotFoundError, StoreError):
             return None
+        if not is_of_folder(self._path.name, file.schema):
+            return None
         self._cache.opened(file)
         return file
 
@@ -733,13 +736,7 @@ class Tables:
         channels = self._channels_of(recording, topic)
         if recording.status == "open" or not has_one_definition(channels):
             raise FileNotFoundError
-        with self._lock:
-            types = {channel.type for channel in channels}
-            rows = [rows for folder in self._of_types(types) for rows in folder.rows(recording.id)]
-            if not any(topic in one.section.topics for one in rows):
-                folders = self._look(types, recording.id)
-                rows = [rows for folder in folders for rows in folder.rows(recording.id)]
-            damaged = [path for folder in self._of_types(types) for path in folder.damaged]
+        rows, damaged = self._rows_of(recording, topic, channels)
         table = self._table(recording, topic, rows)
         if table is None:
             if damaged:
@@ -751,6 +748,32 @@ class Tables:
                 f"The tables of {topic} have {table.rows} messages, the segments {messages}."
             )
         return table
+
+    def has_all(self, recording: RecordingEntry, topic: str) -> bool:
+        """True if files have all messages of a topic, whatever their definitions are."""
+        channels = self._channels_of(recording, topic)
+        try:
+            rows, _ = self._rows_of(recording, topic, channels)
+        except StoreError:
+            return False
+        own = [one.section for one in rows if topic in one.section.topics]
+        messages = sum(channel.stats.messages for channel in channels)
+        return (
+            all(one.segments.items() <= recording.digests.items() for one in own)
+            and sum(one.topics[topic].rows for one in own) == messages
+        )
+
+    def _rows_of(
+        self, recording: RecordingEntry, topic: str, channels: Sequence[ChannelEntry]
+    ) -> tuple[list[_Rows], list[str]]:
+        """The rows of a recording in the folders of a topic, and damaged files there."""
+        types = {channel.type for channel in channels}
+        with self._lock:
+            rows = [rows for folder in self._of_types(types) for rows in folder.rows(recording.id)]
+            if not any(topic in one.section.topics for one in rows):
+                folders = self._look(types, recording.id)
+                rows = [rows for folder in folders for rows in folder.rows(recording.id)]
+            return rows, [path for folder in self._of_types(types) for path in folder.damaged]
 
     def _table(
         self, recording: RecordingEntry, topic: str, found: Sequence[_Rows]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from shutil import copy
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.maintenance import tables as making
@@ -17,7 +19,8 @@ from hybridlog.tables import writer as writing
 from hybridlog.tables.parquet_file import ParquetFileReader
 from hybridlog_storage import files
 from hybridlog_storage.errors import StoreError
-from tests.tables.logs import BASE, SECOND, varied, write_log
+from hybridlog_storage.messages import Schema
+from tests.tables.logs import BASE, SECOND, STATE, varied, write_log
 from tests.tables.test_writer import compare, files_of
 
 COUNT = 8
@@ -179,3 +182,71 @@ def test_footers_do_not_grow_with_each_merge(several: hl.Store) -> None:
 def test_listing_views_makes_none(several: hl.Store) -> None:
     assert ("a",) in several.sql("SHOW tables;").rows()
     assert not several.sql_engine.content()._views
+
+
+def test_rows_of_a_topic_with_two_definitions_are_made_again(
+    store: hl.Store, tmp_path: Path
+) -> None:
+    other = Schema("test/State", "ros1msg", b"int32 one\n")
+    with (tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for place, schema in enumerate((STATE, other)):
+            known = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channel = writer.register_channel("/two", "ros1", known)
+            for n in range(5):
+                data = bytes(4) if place else varied(n)
+                writer.add_message(channel, BASE + n, data, BASE + n)
+        writer.finish()  # type: ignore[no-untyped-call]
+    store.record(tmp_path / "two.mcap", name="two")
+    record(store, tmp_path, 0)
+    paths = files_of(store)
+    assert len(paths) == 2
+    rows = {path: pq.read_metadata(path).num_rows for path in paths}
+    assert sorted(rows.values()) == [5, 35]
+    for path in paths:
+        path.unlink()
+    store.refresh()
+    assert store.topic("/two").where("i8 > 0").count() == 2
+    assert store.topic("/a").where("i8 > 0").count() == 6
+    assert store.topic("/b").where("i8 > 0").count() == 6
+    assert {path: pq.read_metadata(path).num_rows for path in files_of(store)} == rows
+    inodes = [path.stat().st_ino for path in files_of(store)]
+    store.refresh()
+    assert store.topic("/two").where("i8 > 1").count() == 1
+    assert [path.stat().st_ino for path in files_of(store)] == inodes
+    for path in paths:
+        path.unlink()
+    assert making.missing(store.directory, store.entry("two")) == {"/two"}
+
+
+def test_files_that_were_exchanged_are_made_again(store: hl.Store, tmp_path: Path) -> None:
+    other = Schema("test/State", "ros1msg", b"int32 one\n")
+    record(store, tmp_path, 0)
+    said = [(BASE + n, "/c", bytes(4)) for n in range(5)]
+    log = write_log(tmp_path / "other.mcap", said, {"/c": ("ros1", other)})
+    store.record(log, name="other")
+    one, two = files_of(store)
+    rows = [pq.read_metadata(path).num_rows for path in (one, two)]
+    one.rename(tmp_path / "kept")
+    two.rename(one)
+    (tmp_path / "kept").rename(two)
+    store.refresh()
+    assert store.topic("/a").where("i8 > 0").count() == 6
+    assert store.topic("/b").where("i8 > 0").count() == 6
+    assert store.topic("/c").where("one = 0").count() == 5
+    assert [pq.read_metadata(path).num_rows for path in (one, two)] == rows
+
+
+@pytest.mark.parametrize("name", ["shared-old", "shared-000000 (1)", "shared-000000_1"])
+def test_a_file_with_an_odd_name_is_in_no_ones_way(
+    store: hl.Store, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    record(store, tmp_path, 0)
+    (path,) = files_of(store)
+    copy(path, path.with_name(f"{name}.parquet"))
+    record(store, tmp_path, 1)
+    assert not caplog.records
+    assert pq.read_metadata(path).num_rows == 60
+    store.refresh()
+    assert store.topic("/a").where("i8 > 0").count() == 12
