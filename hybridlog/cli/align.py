@@ -80,6 +80,7 @@ if TYPE_CHECKING:
     help="Only these fields of a topic, with commas between them. Repeatable.",
 )
 @table_options
+@options.verbose
 def command(
     *,
     base: str,

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import click
+
 from hybridlog.cli import output
+from hybridlog.cli.options import VERBOSE
 
 if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
@@ -13,13 +16,17 @@ if TYPE_CHECKING:
 
 
 def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
-    """Print what an answer cost, as far as it cost anything.
+    """Print what an answer cost, with `--verbose`; without, the latched messages in front.
 
     Args:
         counters: Of the query.
         elapsed: Seconds, including the opening of the store.
         count: The answer was a number, not messages.
     """
+    if not click.get_current_context().meta.get(VERBOSE):
+        if counters.latched and not count:
+            output.note(f"{output.counted(counters.latched, 'latched message')} in front")
+        return
     used = []
     if not count:
         given = counters.messages - counters.reduced

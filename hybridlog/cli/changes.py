@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
+@options.verbose
 def command(
     *, fields: str, pause: str, tolerance: float, at_least: str | None, **parameters: Any
 ) -> None:

@@ -142,6 +142,7 @@ class _Choices:
 @options.force
 @options.mongo
 @options.quiet
+@options.verbose
 def command(**parameters: Any) -> None:
     """Fetch messages by topic, time and content.
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
+@options.verbose
 def command(*, longer_than: str | None, periods: float | None, **parameters: Any) -> None:
     """Show when no message of a topic came for long."""
 

@@ -48,8 +48,19 @@ cache_size = click.option(
     help="Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
     "made with, or 256.",
 )
+VERBOSE: Final = f"{__name__}.verbose"
+"""Key in `click.Context.meta`: True with `--verbose`."""
+
 as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON, for scripts.")
 quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, no tables; errors only.")
+verbose = click.option(
+    "--verbose",
+    "-v",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda ctx, _, value: ctx.meta.update({VERBOSE: value}),
+    help="Say what the answer has cost.",
+)
 force = click.option("--force", "-f", is_flag=True, help="Overwrite existing files.")
 strict = click.option(
     "--strict",

@@ -66,6 +66,7 @@ _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 @options.force
 @options.mongo
 @options.quiet
+@options.verbose
 def command(
     *,
     topic: tuple[str, ...],

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 @options.where
 @options.choice
 @table_options
+@options.verbose
 def command(
     *,
     topic: tuple[str, ...],

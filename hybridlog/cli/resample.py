@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 @options.choice
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
 @table_options
+@options.verbose
 def command(
     *,
     topic: tuple[str, ...],

@@ -39,6 +39,7 @@ _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 @options.mongo
 @options.as_json
 @options.quiet
+@options.verbose
 def command(
     *,
     topic: tuple[str, ...],

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
+@options.verbose
 def command(
     *,
     name: str | None,

@@ -239,7 +239,7 @@ def test_a_slice_of_another_topic(logs: Logs, tmp_path: Path) -> None:
     store = logs.store.directory.path
     path = tmp_path / "slice.mcap"
     asked = ("fetch", "-t", "base", "--where", "/left/pose: on == true and right/pose: x > -100")
-    done = run(*asked, "--within", "4ms", "-o", path, store=store)
+    done = run(*asked, "--within", "4ms", "-o", path, "-v", store=store)
     query = logs.store.topic("base").where(asked[-1], within="4ms")
     assert [m.payload for m in read_mcap(path)] == [m.raw for m in query]
     cost = query.counters.bytes_read + query.spent.bytes_read

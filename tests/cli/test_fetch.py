@@ -73,14 +73,14 @@ def test_json_lines(store: Path, scans: list[Seen], decoded: list[Any]) -> None:
 
 def test_the_closing_line(store: Path, scans: list[Seen], start: int) -> None:
     wanted = slice_of(scans, start)
-    done = run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", store=store)
+    done = run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", "-v", store=store)
     assert done.raw == b"".join(m.payload for m in wanted)
     (line,) = done.err.splitlines()
     size = sum(len(m.payload) for m in wanted) / 1000
     assert line.startswith(f"{len(wanted)} messages, {size:.1f} kB of payload, ")
     assert " read from disk in " in line
     assert line.endswith(" s")
-    assert run(*SCAN, "--between", "+1s", "+2s", "-q", "-F", "raw", store=store).err == ""
+    assert run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", store=store).err == ""
 
 
 def test_times(store: Path, seen: list[Seen], scans: list[Seen], start: int) -> None:

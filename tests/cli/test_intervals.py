@@ -43,7 +43,7 @@ def speeds(seen: list[Seen]) -> list[tuple[int, float]]:
 def test_intervals_as_json(store: Path, seen: list[Seen], speeds: list[tuple[int, float]]) -> None:
     done = run(
         "intervals", "-t", "odom", "-r", "robot", "--where", "twist.twist.linear.x > 0.5",
-        "--json", store=store,
+        "--json", "-v", store=store,
     )  # fmt: skip
     want: list[list[int]] = []
     ends = [*[time for time, _ in speeds][1:], seen[-1].log_time + 1]
