@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def command(
     *, topic: str, store: Path | None, choice: Choice, mongo: str | None, as_json: bool
 ) -> None:
-    """Show the Parquet files of a topic, and SQL that reads them with DuckDB."""
+    """Show a topic's Parquet files, and SQL for DuckDB."""
     from hybridlog.snapshot import UNFINISHED
 
     with opened_store(store, mongo, quiet=as_json) as opened:

@@ -12,7 +12,6 @@ import numpy as np
 
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.tables.layout import PARTS, parts_folder, type_prefix
-from hybridlog.tables.writer import TableWriter, topics_of
 from hybridlog_storage import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog.tables.parquet_file import ParquetFileReader
     from hybridlog.tables.reader import Tables, TopicTable
+    from hybridlog.tables.writer import TableWriter
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
     from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.chunk_table import ChunkTable
@@ -47,6 +47,7 @@ def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
 def _possible(entry: RecordingEntry) -> set[str]:
     """Topics that have a table when all is well: those with one definition."""
     from hybridlog.tables.reader import has_one_definition
+    from hybridlog.tables.writer import topics_of
 
     by_topic: dict[str, list[ChannelEntry]] = {topic: [] for topic in topics_of(entry)}
     for channel in entry.channels:
@@ -76,6 +77,8 @@ def make(
         return True
     try:
         with directory.writing(entry.label, entry.id) as label:
+            from hybridlog.tables.writer import TableWriter
+
             entry = replace(entry, label=label)
             writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=False)
             try:
@@ -163,6 +166,8 @@ class TableChecker:
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:
         """Problems of the existing tables, by topic. Reads every byte of them."""
+        from hybridlog.tables.writer import topics_of
+
         found: dict[str, str] = {}
         for topic in sorted(topics_of(entry)):
             try:

@@ -525,7 +525,7 @@ def test_the_commands(logs: Logs, tmp_path: Path) -> None:
         fields={"base": ["x"], "left/pose": ["state", "y"], "right/pose": ["state", "y"]},
     ).to_arrow()
     path = tmp_path / "x.parquet"
-    done = run(*asked, "-o", path, store=store)
+    done = run(*asked, "-o", path, "-v", store=store)
     assert str(pq.read_table(path).to_pylist()) == str(want.to_pylist())
     cost, *why = done.err.splitlines()
     assert cost.endswith(" s")

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather
@@ -17,7 +18,7 @@ import pyarrow.parquet
 import pytest
 
 from hybridlog.cli.answer_notes import print_cost
-from hybridlog.cli.options import check_latched
+from hybridlog.cli.options import VERBOSE, check_latched
 from hybridlog.query.counters import Counters
 from hybridlog_storage.errors import UsageError
 from tests.independent import Seen, read_bag, read_mcap
@@ -137,7 +138,7 @@ def test_thinning(store: Path, scans: list[Seen]) -> None:
     times = [m.log_time for m in scans]
 
     def fetched(*options: str) -> list[int]:
-        done = run(*SCAN, "--fields", "scan_time", *options, store=store)
+        done = run(*SCAN, "--fields", "scan_time", *options, "-v", store=store)
         assert done.err.startswith(f"{len(done.lines)} message")
         return [json.loads(line)["log_time_ns"] for line in done.lines]
 
@@ -145,7 +146,7 @@ def test_thinning(store: Path, scans: list[Seen]) -> None:
     assert fetched("-n", "0") == []
     assert fetched("--every", "7") == times[::7]
     assert fetched("--reverse", "--every", "3", "--limit", "4") == times[::-1][::3][:4]
-    limited = run(*SCAN, "--limit", "2", "-F", "raw", store=store)
+    limited = run(*SCAN, "--limit", "2", "-F", "raw", "-v", store=store)
     assert limited.raw == scans[0].payload + scans[1].payload
     assert f"2 messages, {len(limited.raw) / 1000:.1f} kB of payload" in limited.err
 
@@ -249,7 +250,7 @@ def test_raw_directory(store: Path, scans: list[Seen], tmp_path: Path) -> None:
 
 def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:
     asked = ("-t", "scan", "-t", "tf_static", "-r", "robot", "--between", "+2s", "+3s")
-    done = run("fetch", *asked, "-o", tmp_path / "x.mcap", store=store)
+    done = run("fetch", *asked, "-o", tmp_path / "x.mcap", "-v", store=store)
     static = next(m for m in seen if m.topic == "/tf_static")
     found = read_mcap(tmp_path / "x.mcap")
     assert found[0].payload == static.payload
@@ -261,9 +262,11 @@ def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path
     done = run("fetch", *asked, "-o", tmp_path / "z.mcap", "--no-latched", store=store)
     assert read_mcap(tmp_path / "z.mcap") == found[1:]
     assert "latched" not in done.err
+    done = run("fetch", *asked, "-o", tmp_path / "x.mcap", "--force", store=store)
+    assert done.err == "1 latched message in front\n"
     # The message at a time is one message.
     at = ("fetch", "-t", "tf_static", "-r", "robot", "--at", "+2s", "-o", tmp_path / "at.mcap")
-    assert "1 message, " in run(*at, store=store).err
+    assert "1 message, " in run(*at, "-v", store=store).err
 
 
 def test_options_about_latched_messages_without_any() -> None:
@@ -423,7 +426,9 @@ def test_json_is_asked_as_it_stands(store: Path) -> None:
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    print_cost(Counters(messages=251, reduced=12), 0.1, count=False)
+    with click.Context(click.Command("fetch")).scope() as context:
+        context.meta[VERBOSE] = True
+        print_cost(Counters(messages=251, reduced=12), 0.1, count=False)
     assert capsys.readouterr().err.startswith("239 messages, ")
 
 

@@ -94,7 +94,7 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "s"
     run("record", logs / "odd.mcap", "-q", store=store)
     settings = store / "hybridlog.toml"
-    settings.write_text(settings.read_text().replace("format = 2", "format = 99"))
+    settings.write_text(settings.read_text().replace("format = 3", "format = 99"))
     for command in (("ls",), ("record", logs / "small.bag"), ("fetch", "-t", "x")):
         done = run(*command, store=store, code=5)
         assert "format 99" in done.err

@@ -151,7 +151,7 @@ def test_a_plot_of_text_is_as_wide_as_the_screen(store: Path) -> None:
 
 
 def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
-    command = ("fetch", "-t", "scan", "-r", "robot", "--fields", "angle_min,scan_time")
+    command = ("fetch", "-t", "scan", "-r", "robot", "--fields", "angle_min,scan_time", "-v")
     code, shown = on_terminal(*command, "--store", store, width=80)
     assert code == 0
     lines = plain(shown).splitlines()
@@ -183,7 +183,7 @@ def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
 
 
 def test_the_message_at_a_time_is_one_on_a_terminal(store: Path) -> None:
-    command = ("fetch", "-t", "scan", "-r", "robot", "--at", "+3s")
+    command = ("fetch", "-t", "scan", "-r", "robot", "--at", "+3s", "-v")
     code, shown = on_terminal(*command, "--store", store)
     assert code == 0
     text = plain(shown)
