@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
-from hybridlog.tables.layout import PARTS, parts_folder, type_prefix
+from hybridlog.tables.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog_storage import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
@@ -47,7 +47,6 @@ def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
 def _possible(entry: RecordingEntry) -> set[str]:
     """Topics that have a table when all is well: those with one definition."""
     from hybridlog.tables.reader import has_one_definition
-    from hybridlog.tables.writer import topics_of
 
     by_topic: dict[str, list[ChannelEntry]] = {topic: [] for topic in topics_of(entry)}
     for channel in entry.channels:
@@ -166,8 +165,6 @@ class TableChecker:
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:
         """Problems of the existing tables, by topic. Reads every byte of them."""
-        from hybridlog.tables.writer import topics_of
-
         found: dict[str, str] = {}
         for topic in sorted(topics_of(entry)):
             try:

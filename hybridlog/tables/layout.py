@@ -27,6 +27,7 @@ from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED
 
 if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
 
 TABLES: Final = "tables"
@@ -137,6 +138,11 @@ def table_schema_of(channel: Channel) -> str:
     """The hash of `table_schema` for a channel."""
     schema = schema_hash(channel.schema) if channel.schema is not None else None
     return table_schema(channel.message_encoding, schema, channel.metadata)
+
+
+def topics_of(entry: RecordingEntry) -> set[str]:
+    """Topics of a recording that have messages."""
+    return {c.topic for c in entry.channels if c.stats.messages}
 
 
 def column_names(

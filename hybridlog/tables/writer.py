@@ -35,6 +35,7 @@ from hybridlog.tables.layout import (
     parts_folder,
     shape_folder,
     table_schema_of,
+    topics_of,
     type_prefix,
 )
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
@@ -650,11 +651,6 @@ class TableWriter:
                 failed.add(topic.name)
         messages = entry.messages_by_topic()
         return failed | {name for name in rows if rows[name] != messages[name]}
-
-
-def topics_of(entry: RecordingEntry) -> set[str]:
-    """Topics of a recording that have messages."""
-    return {c.topic for c in entry.channels if c.stats.messages}
 
 
 def _are_long(pieces: Sequence[Piece]) -> bool:
