@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,22 +66,27 @@ def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str
     recordings = {one.recording.id for one in channels}
     schemas = [one.channel.schema for one in channels]
     prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
+    (name,) = topics or {""}
     folders: dict[Path, dict[str, Any]] = {}
+    others: set[Path] = set()
     for file in files_of(store.directory.path, prefixes) if prefixes else ():
-        rows = sum(
-            counts.rows
-            for section in file.about.recordings
-            for name, counts in section.topics.items()
-            if section.id in recordings and name in topics
-        )
+        sections = [one for one in file.about.recordings if name in one.topics]
+        rows = sum(one.topics[name].rows for one in sections if one.id in recordings)
+        if not all(one.id in recordings for one in sections):
+            others.add(file.path.parent)
         if rows:
             folder = file.path.parent
             found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
             found["rows"] += rows
             found["files"].append(str(file.path))
-    (name,) = topics or {""}
+    chosen = f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
     for folder, found in folders.items():
-        files, quoted = (text.replace("'", "''") for text in (f"{folder}/*.parquet", name))
-        # The only text in it is quoted, and nothing is run here.
-        found["statement"] = f"select * from '{files}' where topic = '{quoted}'"  # noqa: S608
+        files = _quoted(f"{escape(str(folder))}/*.parquet")
+        # The only texts in it are quoted, and nothing is run here.
+        statement = f"select * from {files} where topic = {_quoted(name)}"  # noqa: S608
+        found["statement"] = statement + (chosen if folder in others else "")
     return list(folders.values())
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

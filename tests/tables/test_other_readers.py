@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import duckdb
@@ -402,3 +403,12 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
     assert len(duckdb.sql(statement)) == 160
     one = json.loads(shown("-t", "/large", "-r", "1", "--json"))
     assert [item["rows"] for item in one] == [600]
+    assert [len(duckdb.sql(item["statement"])) for item in one] == [600]
+    assert "recording" not in shown("-t", "/large")
+
+
+def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) -> None:
+    place = tmp_path / "it's [1]*?"
+    copytree(many.directory.path, place)
+    (item,) = json.loads(answer("tables", "-t", "/small", "--json", store=place).out)
+    assert len(duckdb.sql(item["statement"])) == 160
