@@ -290,10 +290,10 @@ class IndexWriter:
         try:
             due = 0.0
             while True:
-                has_ended = self._has_ended
                 topic = ""
                 with suppress(Empty):
                     topic = self._calls.get(timeout=max(due - time.monotonic(), 0))
+                has_ended = self._has_ended  # after the call, or its end would be waited for
                 if topic and not has_ended:
                     self._prepare(topic)
                     continue
