@@ -1103,8 +1103,8 @@ class Laid:
     """Where records lie in a segment, read record by record.
 
     Attributes:
-        described: Where the metadata record ends that says which recording this is.
-        chunks: Its chunks.
+        described: Where the arrival record ends that proves which recording this is.
+        chunks: Its chunks with messages.
         end: Where the data section ends.
     """
 
@@ -1126,18 +1126,22 @@ class Laid:
     def out(cls, content: bytes) -> Laid:
         described = 0
         chunks: list[LaidChunk] = []
+        last: tuple[int, int] = (0, 0)
         at = 8
         while True:
             opcode, length = struct.unpack_from("<BQ", content, at)
             end = at + 9 + length
             if opcode == 0x0F:
                 return cls(described, chunks, at)
-            if opcode == 0x0C and not described:
-                described = end
-            elif opcode == 0x06:
-                chunks.append(LaidChunk(at, end, 0))
+            if opcode == 0x06:
+                last = at, end
             elif opcode == 0x90:
-                chunks[-1] = replace(chunks[-1], arrivals_end=end)
+                # One of no chunk is behind other records, or behind a chunk of definitions.
+                (chunk,) = struct.unpack_from("<Q", content, at + 9)
+                if chunk:
+                    assert chunk == last[0]
+                    chunks.append(LaidChunk(*last, end))
+                described = described or end
             at = end
 
 
