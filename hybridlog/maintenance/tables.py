@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
     """Topics whose tables are missing, or differ from the catalog."""
     from hybridlog.tables.reader import Tables
-    from hybridlog.tables.writer import topics_of
 
     tables = Tables(directory.path)
     possible = _possible(entry)

@@ -364,7 +364,9 @@ def _without(section: Section, rows: Any, goes: Callable[[str], bool]) -> tuple[
             kept[topic] = counts
             tables.append(rows.slice(before, counts.rows))
         before += counts.rows
-    return replace(section, topics=kept), pa.concat_tables([rows.slice(0, 0), *tables])
+    # Without rows it is of no segments.
+    one = replace(section, segments=section.segments if kept else {}, topics=kept)
+    return one, pa.concat_tables([rows.slice(0, 0), *tables])
 
 
 def _joined(one: Section, rows: Any, other: Section, others: Any) -> tuple[Section, Any]:

@@ -730,8 +730,8 @@ class Tables:
         """The table of a topic in a recording.
 
         Raises:
-            FileNotFoundError: no table exists.
-            StoreError: the table is damaged, or the catalog does not confirm it.
+            FileNotFoundError: no table of these segments exists.
+            StoreError: the table is damaged, or has another number of rows.
         """
         channels = self._channels_of(recording, topic)
         if recording.status == "open" or not has_one_definition(channels):
@@ -778,10 +778,10 @@ class Tables:
     def _table(
         self, recording: RecordingEntry, topic: str, found: Sequence[_Rows]
     ) -> TopicTable | None:
-        """The table of a topic from some files; None without rows of it.
+        """The table of a topic from some files; None without rows of it, or with stale ones.
 
         Raises:
-            StoreError: the catalog does not confirm it.
+            StoreError: its files do not fit together.
         """
         own = [rows for rows in found if topic in rows.section.topics]
         if not own:
@@ -790,7 +790,7 @@ class Tables:
         parts: list[TablePart] = []
         for rows in own:
             if not rows.section.segments.items() <= recording.digests.items():
-                raise StoreError(f"Segments of the table {rows.file.path} are missing.")
+                return None
             counts = counts.plus(rows.section.topics[topic])
             parts += rows.of(topic)
         table = TopicTable(topic, parts, counts, self._cache)

@@ -196,7 +196,7 @@ def test_topics_of_one_file_are_made_alone(few: hl.Store) -> None:
 
 
 def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
-    """A topic that is made again makes no other one valid again."""
+    """Stale rows are no damage; a topic that is made again makes no other one valid again."""
     (entry,) = few.recordings()
     stale = dict.fromkeys(entry.digests, f"sha256:{'0' * 64}")
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
@@ -204,9 +204,38 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     (section,) = reader.about.recordings
     folders = TableFolders(few.directory.path, entry.id, entry.digests)
     folders._write(path, [replace(section, segments=stale)], [reader.table()])
+    assert not making.TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
     assert making.make(few.directory, entry, ["/a"])
     assert making.missing(few.directory, entry) == {"/b"}
+
+
+def test_rows_of_a_lost_segment_are_made_again_once(store: hl.Store, tmp_path: Path) -> None:
+    """The new ones are of the segments that are left."""
+    said = [(BASE + n, "/a" if n % 3 else "/b", varied(n)) for n in range(90)]
+    log = write_log(tmp_path / "long.mcap", said)
+    store.record(log, name="long", settings=logs.SETTINGS)
+    _, path = store.directory.segments("long")[1]
+    before = contents(store)
+    content = path.read_bytes()
+    path.unlink()
+    store.refresh()
+    assert [f.place for f in store.verify().findings] == ["segment 1"]
+    entry = store.entry("long")
+    for topic in ("/a", "/b"):
+        assert store.topic(topic).where("i8 > -100").count()
+    tables = Tables(store.directory.path)
+    assert all(tables.of(entry, topic) is not None for topic in ("/a", "/b"))
+    after = contents(store)
+    assert after != before
+    store.refresh()
+    assert store.topic("/a").where("i8 > -100").count()
+    assert contents(store) == after
+    path.write_bytes(content)
+    store.refresh()
+    assert not store.verify().findings
+    assert making.make(store.directory, store.entry("long"))
+    assert contents(store) == before
 
 
 def test_a_store_that_cannot_be_written_makes_none(
