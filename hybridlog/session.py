@@ -374,6 +374,7 @@ class Session:
 
         Raises:
             DatabaseError: as for `database_for`, if it was reached.
+            StoreError: it holds the index of another store, or this store is a copy.
         """
         from hybridlog.index_writer import IndexTarget
 
@@ -386,6 +387,8 @@ class Session:
                 return IndexTarget(failure=self._unavailable, renew=self._another_database)
             if self.connection.has_none:
                 return IndexTarget()
+            if isinstance(self._unavailable, StoreError):
+                raise self._unavailable
         database = self.database_for(purpose, writes=True)
         return IndexTarget(database, renew=self._another_database)
 
