@@ -210,9 +210,7 @@ class TableFolders:
                 is_stale = not one.segments.items() <= self._digests.items()
                 one, own = _without(one, own, _all if is_stale else goes)  # noqa: PLW2901
                 if section is not None:
-                    if one.topics:
-                        section, rows = _joined(one, own, section, rows)
-                    one, own = section, rows  # noqa: PLW2901 - the segments may be others now
+                    one, own = _joined(one, own, section, rows)  # noqa: PLW2901
                     section = None
                 if not one.topics:
                     continue
