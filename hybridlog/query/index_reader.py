@@ -226,6 +226,7 @@ class IndexReader:
         found = self._session.places(_PURPOSE).of({part.topic for part in parts})
         for part in parts:
             if not found[part.topic].is_listed and part.recording.status not in UNFINISHED:
+                self._index(parts)  # tells if their documents are missing altogether
                 raise DatabaseError(
                     f"The index does not list {part.topic}: run `hybridlog index rebuild`."
                 )
