@@ -133,23 +133,21 @@ def test_a_count_is_refused_while_documents_go(case: Case) -> None:
 def test_what_goes_while_it_is_counted_is_noticed(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hybridlog.query.engines.tables import TablesEngine
     from hybridlog_storage.database import Database
 
-    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
     with case.open() as store, case.open() as other:
         store.connect()
         other.connect()
-        query = store.query(["/number"], ["a"]).where("n >= 0")
-        count, removed = Database.count_each, []
+        query = store.query(["/number"], ["a"]).where({"$expr": {"$gte": ["$n", 0]}})
+        find, removed = Database.find_each, []
 
-        def counted(self: Database, *args: object, **options: object) -> list[int]:
+        def found(self: Database, *args: object) -> Iterator[bytes]:
             if not removed:
                 removed.append(True)
                 other.remove("a")
-            return count(self, *args, **options)  # type: ignore[arg-type]
+            return find(self, *args)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(Database, "count_each", counted)
+        monkeypatch.setattr(Database, "find_each", found)
         with pytest.raises(IndexChangedError, match="removed"):
             query.count()
         with pytest.raises(TopicError):

@@ -161,7 +161,7 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
 def test_what_the_index_lacks_is_told_where_mongodb_answers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hybridlog.live.recording._index_delay", lambda _: 3600.0)
+    monkeypatch.setattr("hybridlog.live.recording._index_interval_s", lambda _: 3600.0)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         recording = store.start("own", flush_interval_s=0.1)
         for number in range(5):
