@@ -54,7 +54,8 @@ def command(
         output.say(f"{item['statement']};")
         output.say()
     if others:
-        output.note(f"Tables of {others} unfinished recordings follow when they end.")
+        went = output.counted(others, "unfinished recording")
+        output.note(f"Tables of {went} follow at the end.")
 
 
 def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
