@@ -18,6 +18,7 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
+from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.segment_writer import SegmentSettings
 from hybridlog_storage.settings import (
     EMBEDDED,
@@ -233,3 +234,18 @@ def test_a_store_is_adopted_where_mongodb_is(
         found = store.verify()
         assert (found.findings, found.index) == ([], True)
         assert store.topic("scan").where({"$expr": True}).count() == store.topic("scan").count()
+
+
+def test_as_many_were_removed_as_recorded_without_mongodb(bag: Path, tmp_path: Path) -> None:
+    """One connection removes the documents of what is gone, and adds those of what is new."""
+    path = tmp_path / "store"
+    with hl.open(path, create=True, mongo=EMBEDDED) as store:
+        first = store.record(bag, name="first").entry
+    with hl.open(path, mongo=NONE) as store:
+        store.remove("first")
+        store.record(bag, name="second")
+    with hl.open(path, mongo=EMBEDDED) as store:
+        database = store.connect()
+        second = store.entry("second")
+        assert IndexState(database).of().keys() == {second.key} != {first.key}
+        assert sum(count for *_, count in store.index_contents()) == second.messages

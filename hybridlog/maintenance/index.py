@@ -83,7 +83,8 @@ def bring_up_to_date(
     """
     tables.remove_unfinished(directory, snapshot)
     state = IndexState(database)
-    is_other = state.count() != len(snapshot)
+    count = state.count()
+    is_other = count != len(snapshot)
     behind = [
         one
         for one in snapshot.summaries
@@ -94,6 +95,9 @@ def bring_up_to_date(
     if not behind and not has_strangers:
         return False
     known = state.of(None if has_strangers else [one.key for one in behind])
+    if wanted is None and not has_strangers and count - len(known) != len(snapshot) - len(behind):
+        has_strangers = True  # as many recordings are gone as have been added
+        known = state.of(None)
     has_changed = False
     settled = []
     for summary in behind:
