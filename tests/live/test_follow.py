@@ -256,7 +256,7 @@ def test_a_killed_recorder_ends_it(path: Path) -> None:
 def test_ctrl_c_and_a_closed_pipe_end_it(path: Path) -> None:
     with (
         talking(path) as (one, _),
-        follow(path, "-t", "a", "--between", "start", "end") as followed,
+        follow(path, "-t", "a", "--between", "start", "end", "-v") as followed,
         follow(path, "-t", "a", "--between", "start", "end") as piped,
     ):
         followed.wait(1)
