@@ -32,7 +32,7 @@ def store(tmp_path: Path) -> StoreDirectory:
 def test_a_new_store(tmp_path: Path) -> None:
     made = StoreDirectory.create(tmp_path / "deep/er/store")
     values = tomllib.loads((made.path / "hybridlog.toml").read_text())
-    assert values == {"format": 2, "store_id": made.settings.store_id}
+    assert values == {"format": 3, "store_id": made.settings.store_id}
     assert made.settings.mongo is None
     assert made.labels() == []
     again = StoreDirectory.create(made.path)
@@ -70,7 +70,7 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [(b"", "format"), (b"format = 1\nstore_id = 'x'", "no longer read")]
+    ("content", "words"), [(b"", "format"), (b"format = 1\nstore_id = 'x'", "never released")]
 )
 def test_settings_that_are_none(store: StoreDirectory, content: bytes, words: str) -> None:
     (store.path / "hybridlog.toml").write_bytes(content)
