@@ -23,6 +23,7 @@ import numpy as np
 from hybridlog.connection import Connection
 from hybridlog.entries import channels_of, summary_of, take_inventory
 from hybridlog.maintenance.opening import (
+    catch_up,
     current_entry,
     open_catalog,
     put_again,
@@ -533,7 +534,7 @@ class Session:
         if snapshot is None:
             return self._latest
         if self._has_names_changed() and time.monotonic() >= self._looks_at:
-            self.invalidate()
+            self.catch_up()
         elif snapshot.is_open.any():
             self._latest = _Moment(snapshot)
         return self._latest
@@ -605,7 +606,7 @@ class Session:
             self._schemas |= running.schemas
             now = summary_of(entry, summary.look)
             if now != summary:
-                moment.snapshot = snapshot.with_summary(now, running.topics)
+                moment.snapshot = snapshot.with_changes([now], {now.topics: running.topics})
                 if now.topics != summary.topics:
                     self._remember_meanings()
                 if entry.status not in UNFINISHED:
@@ -1183,19 +1184,69 @@ class Session:
         if "tables" in vars(self):
             self.tables.forget(recording, topics)
 
-    # Closing.
+    # Changes.
 
-    def invalidate(self) -> None:
-        """Drop everything that was read, so that the next question reads the store again."""
-        self._latest = _Moment()
+    def catch_up(self, *recordings: str) -> None:
+        """See which recordings came, went, or got another name, and how some others are now.
+
+        All else that was read stays, so this costs little in a store of thousands.
+
+        Args:
+            recordings: Ids of recordings that were changed.
+        """
+        with self._following:
+            before = self._latest.snapshot
+            if before is None:
+                self.invalidate()
+                return
+            changed, names = self.directory.changed(), self.directory.names()
+            labels = {*names}.symmetric_difference(before.by_label)  # copies are among them
+            known = [before.by_id[one] for one in recordings if one in before.by_id]
+            labels.update(before.summaries[place].label for place in known)
+            now = catch_up(self.directory, self.catalog, before, labels, self.repairs)
+            if now is None or self.directory.names() != names:
+                self.invalidate()
+                return
+            self._changed, self._names = changed, names
+            self._begin(_Moment(now))
+            places = {before.by_label[label] for label in labels & before.by_label.keys()}
+            self._forget({before.summaries[place].id for place in places})
+
+    def _begin(self, moment: _Moment) -> None:
+        """Begin a moment, also in a block of this thread that asks about an earlier one."""
+        self._latest = moment
         if getattr(self._pinned, "moment", None) is not None:
-            self._pinned.moment = self._latest
-        self._entries = {}
+            self._pinned.moment = moment
         self._uncertain = None
         self._is_indexed = False
         self._indexed.clear()
         self._index_version = None
         self._places = None
+
+    def _forget(self, recordings: Collection[str]) -> None:
+        """Drop what was read of some recordings, by their ids."""
+        for recording in recordings:
+            self._channels.pop(recording, None)
+            self._by_topic.pop(recording, None)
+            entry = self._entries.pop(recording, None)
+            topics = {channel.topic for channel in entry.channels} if entry is not None else set()
+            self._tables_tried -= {(recording, topic) for topic in topics}
+        with self._lock:
+            self._contents.clear()
+            for key in [key for key in self._segments if key[0] in recordings]:
+                del self._segments[key]
+        self._columns.clear()
+        self.recent_chunks.clear()
+        if "tables" in vars(self):
+            self.tables.look_again()
+        self._remember_meanings()
+
+    # Closing.
+
+    def invalidate(self) -> None:
+        """Drop everything that was read, so that the next question reads the store again."""
+        self._begin(_Moment())
+        self._entries = {}
         self._channels.clear()
         self._by_topic.clear()
         with self._lock:

@@ -7,11 +7,12 @@ about, not on what else is in the store.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +33,20 @@ def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str]:
     return one.span is None, one.span or (0, 0), one.label
 
 
+def _columns(
+    summaries: Sequence[RecordingSummary], topics: Iterable[str]
+) -> dict[str, NDArray[Any]]:
+    """What a snapshot has as columns, by the name of its attribute."""
+    numbers = {digest: number for number, digest in enumerate(topics)}
+    bounds = np.array([one.extent for one in summaries], np.int64).reshape(-1, 2)
+    return {
+        "begin": bounds[:, 0].copy(),
+        "end": bounds[:, 1].copy(),
+        "is_open": np.array([one.status in UNFINISHED for one in summaries], np.bool_),
+        "_set": np.array([numbers[one.topics] for one in summaries], np.intp),
+    }
+
+
 class Snapshot:
     """The summaries of all recordings. Unchangeable, so it is safe for many threads.
 
@@ -49,54 +64,64 @@ class Snapshot:
     def __init__(
         self,
         summaries: Iterable[RecordingSummary],
-        topics: Mapping[str, Sequence[TopicType]],
+        topics: Mapping[str, Collection[TopicType]],
     ) -> None:
         self.summaries = sorted(summaries, key=_order)
         self._topics = topics
-        numbers = {digest: number for number, digest in enumerate(topics)}
-        extents = [summary.extent for summary in self.summaries]
-        bounds = np.array(extents, np.int64).reshape(-1, 2)
-        self.begin: NDArray[np.int64] = bounds[:, 0].copy()
-        self.end: NDArray[np.int64] = bounds[:, 1].copy()
-        open_ones = [one.status in UNFINISHED for one in self.summaries]
-        self.is_open: NDArray[np.bool_] = np.array(open_ones, np.bool_)
-        self._set = np.array([numbers[one.topics] for one in self.summaries], np.intp)
+        self.begin: NDArray[np.int64]
+        self.end: NDArray[np.int64]
+        self.is_open: NDArray[np.bool_]
+        self._set: NDArray[np.intp]
+        for name, values in _columns(self.summaries, topics).items():
+            setattr(self, name, values)
         self._having: dict[frozenset[str], NDArray[np.intp]] = {}
 
     def __len__(self) -> int:
         return len(self.summaries)
 
-    def with_summary(self, summary: RecordingSummary, topics: Collection[TopicType]) -> Snapshot:
-        """All recordings, one of them as it is now.
+    def with_changes(
+        self,
+        changed: Iterable[RecordingSummary],
+        topics: Mapping[str, Collection[TopicType]],
+        gone: Collection[str] = (),
+    ) -> Snapshot:
+        """All recordings, some of them as they are now.
 
         Args:
-            summary: Its summary; a recording with its id is there.
-            topics: Its topics and their types.
+            changed: Summaries of recordings that are new, or have changed.
+            topics: Their topics and types, by hash.
+            gone: Ids of recordings that are gone.
         """
-        place = self.by_id[summary.id]
-        known = self._topics
-        if summary.topics not in known:
-            known = {**known, summary.topics: sorted(topics)}
-        around = self.summaries[max(place - 1, 0) : place + 2]
-        now = [summary if one.id == summary.id else one for one in around]
-        if now != sorted(now, key=_order) or self.summaries[place].label != summary.label:
-            rest = (one for one in self.summaries if one.id != summary.id)
-            return Snapshot([*rest, summary], known)
-        found = copy(self)  # in the same order: nothing else is worked out again
+        changed = sorted(changed, key=_order)
+        same = {*gone, *(one.id for one in changed)} & self.by_id.keys()
+        places = sorted((self.by_id[recording] for recording in same), reverse=True)
+        found = copy(self)
         found.summaries = self.summaries.copy()
-        found.summaries[place] = summary
-        found.begin, found.end = self.begin.copy(), self.end.copy()
-        found.is_open = self.is_open.copy()
-        found.begin[place], found.end[place] = summary.extent
-        found.is_open[place] = summary.status in UNFINISHED
-        if summary.tags != self.summaries[place].tags:
-            vars(found).pop("tags", None)
-        if summary.topics != self.summaries[place].topics:
-            sets = self._set.copy()
-            sets[place] = list(known).index(summary.topics)
-            vars(found).update(_topics=known, _set=sets, _having={})
-            for name in ("topics", "schemas"):
-                vars(found).pop(name, None)
+        for place in places:
+            del found.summaries[place]
+        before = [bisect_left(found.summaries, _order(one), key=_order) for one in changed]
+        for place, one in reversed([*zip(before, changed, strict=True)]):
+            found.summaries.insert(place, one)
+        new = {digest: sorted(of) for digest, of in topics.items() if digest not in self._topics}
+        known = {**self._topics, **new}
+        columns = _columns(changed, known)
+        for name, values in columns.items():
+            columns[name] = np.insert(np.delete(getattr(self, name), places), before, values)
+        used = np.unique(columns["_set"])
+        if len(used) < len(known):
+            held = [*known.items()]
+            known = dict(held[number] for number in used.tolist())
+            columns["_set"] = np.searchsorted(used, columns["_set"])
+        vars(found).update(columns, _topics=known, _having={})
+        stale = {"tags", "by_id", "by_label"}
+        if before == places[::-1] and [one.label for one in changed] == [
+            self.summaries[place].label for place in before
+        ]:
+            stale = {"tags"}  # each is where it was
+        if known.keys() != self._topics.keys():
+            stale |= {"topics", "schemas"}
+        for name in stale:
+            vars(found).pop(name, None)
         return found
 
     @lazy

@@ -652,7 +652,7 @@ class Store:
 
     def _after(self, report: RecordReport) -> None:
         """Update the store after the end of a recording."""
-        self.refresh()
+        self.session.catch_up(report.entry.id)
         connected = self.session.connected
         if report.failure is None and (connected is None or connected.ping()):
             if connected is not None:
@@ -915,7 +915,7 @@ class Store:
         from hybridlog.maintenance import removal
 
         if recording not in self.repairs.copies:
-            self.refresh()
+            self.session.catch_up()
             self.session.snapshot()
         try:
             if recording in self.repairs.copies:
@@ -928,7 +928,7 @@ class Store:
             self.refresh()
             self.connect()  # a new connection removes the rest
         finally:
-            self.refresh()
+            self.session.catch_up()
 
     def rename(self, recording: str, name: str) -> RecordingEntry:
         """Rename a recording; its directory gets a label made from the name."""
@@ -959,14 +959,14 @@ class Store:
     def _edit(self, recording: str | RecordingEntry, *lines: journal.Event) -> RecordingEntry:
         from hybridlog.maintenance import edit, index
 
-        self.refresh()
+        self.session.catch_up()
         (entry,) = self.select([recording])
         edit.append(self.directory, self.catalog, entry, lines)
         connected = self.session.connected
         if connected is not None and self.session.connection.may_write:
             with suppress(ConnectionLostError):  # the next connection mirrors it
                 index.mirror(self.catalog, connected, entry.id)
-        self.refresh()
+        self.session.catch_up(entry.id)
         return self.entry(entry.id)
 
     def mark(
@@ -986,7 +986,7 @@ class Store:
         """
         from hybridlog.maintenance import edit
 
-        self.refresh()
+        self.session.catch_up()
         (entry,) = self.select([recording])
         start, end = extent_of(entry)
         time = parse_time(moment, start=start, end=end)
@@ -996,7 +996,7 @@ class Store:
             if error.is_recording:
                 raise StoreError(f"{error} To mark it now, mark it without --at.") from error
             raise
-        self.refresh()
+        self.session.catch_up(entry.id)
         return self.entry(entry.id)
 
     def import_from(
@@ -1026,8 +1026,10 @@ class Store:
                 chosen = chosen if recordings.is_everything else chosen.check()
             else:
                 chosen = source.select(recordings)
-            report = imports.run(source.directory, self.directory, chosen, progress)
-        self.refresh()
+            self.session.catch_up()
+            present = {one.id: one.label for one in self.session.snapshot().summaries}
+            report = imports.run(source.directory, self.directory, chosen, present, progress)
+        self.session.catch_up()
         return report
 
     def repair(

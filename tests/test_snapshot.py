@@ -162,8 +162,12 @@ def test_a_recording_that_has_changed_is_as_if_it_had_been_so(
     was = told(before)
     now, kinds = made(place, change, **({"label": "other"} if is_renamed else {}))
     rest = [one for one, _ in all_made if one.id != now.id]
-    wanted = Snapshot([*rest, now], {**known, now.topics: kinds})
-    after = before.with_summary(now, kinds)
+    used = {one.topics for one in rest}
+    left = {digest: of for digest, of in known.items() if digest in used}
+    wanted = Snapshot([*rest, now], {**left, now.topics: kinds})
+    assert told(before.with_changes([], {}, [now.id])) == told(Snapshot(rest, left))
+    assert told(Snapshot(rest, left).with_changes([now], {now.topics: kinds})) == told(wanted)
+    after = before.with_changes([now], {now.topics: kinds})
     assert told(after) == told(wanted)
     assert (after.topics, after.schemas) == (wanted.topics, wanted.schemas)
     assert told(before) == was

@@ -95,7 +95,8 @@ class Synced(Sequence[tuple["Message", ...]]):
         found: list[list[_Found]] = []
         known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
         places = sorted(set.intersection(*shared))
-        for place in sorted(set.intersection(*map(partial(_in_range, session), questions))):
+        in_range = set.union(*map(partial(_in_range, session), questions))
+        for place in sorted(in_range.intersection(places)):
             recording = snapshot.summaries[place].id
             columns = [
                 _times_of(session, replace(q, recordings=(recording,)), clock, self.counters)

@@ -155,7 +155,7 @@ def _snapshot(directory: StoreDirectory) -> Snapshot:
             running.follow()
             if running.entry is not None:
                 now = summary_of(running.entry, summary.look)
-                found = found.with_summary(now, running.topics)
+                found = found.with_changes([now], {now.topics: running.topics})
         return found
 
 

@@ -84,9 +84,9 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     question = planner.question
     groups: Iterator[Iterable[Block]]
     decoder = Decoder(planner)
-    parts = planner.parts()
-    if len(parts) == 1 and not question.reverse and _come_from_tables(planner, parts):
-        groups = ([block] for block in _table_blocks(planner, parts[0]))
+    part = planner.only_part()
+    if part is not None and not question.reverse and _come_from_tables(planner, [part]):
+        groups = ([block] for block in _table_blocks(planner, part))
     else:
         groups = (decoder.blocks(run) for run in planner.runs())
     groups = chain([decoder.empty()], groups)

@@ -49,6 +49,7 @@ def run(
     source: StoreDirectory,
     target: StoreDirectory,
     entries: Iterable[RecordingEntry],
+    known: Mapping[str, str],
     progress: Progress | None = None,
 ) -> ImportReport:
     """Copy recordings from one store into another.
@@ -60,6 +61,7 @@ def run(
         source: The store to read.
         target: The store to write.
         entries: Recordings of `source`.
+        known: Labels of recordings of `target`, by id.
         progress: Called with the bytes copied and checked.
 
     Raises:
@@ -68,7 +70,7 @@ def run(
     """
     target.check_writable()
     report = ImportReport()
-    present = _present(target, {})
+    present = _present(target, known)
     for entry in entries:
         if entry.id in present:
             report.known.append(present[entry.id])
@@ -111,7 +113,9 @@ def _present(directory: StoreDirectory, known: Mapping[str, str]) -> dict[str, s
     """
     ids = {label: recording for recording, label in known.items()}
     found = {}
-    for label in directory.labels():
+    for label in directory.names():
+        if label.startswith("."):
+            continue
         with suppress(StoreError):
             found[ids.get(label) or directory.id_of(label)] = label
     return found

@@ -10,6 +10,7 @@ import os
 import re
 import time
 from collections.abc import Collection, Mapping
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -124,6 +125,48 @@ def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairR
         tables.remove_unfinished(directory, snapshot)
         tables.remove_all(directory, gone - found.keys())
     return snapshot
+
+
+def catch_up(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    snapshot: Snapshot,
+    labels: AbstractSet[str],
+    report: RepairReport,
+) -> Snapshot | None:
+    """All recordings after changes of some of them, as of `repair_on_open`.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        snapshot: All recordings before.
+        labels: Names in the store that came, went, or whose files were changed.
+        report: Collects problems and repairs.
+
+    Returns:
+        All recordings; None if only `repair_on_open` can tell.
+    """
+    if report.copies or report.unreadable:
+        return None
+    known = labels & snapshot.by_label.keys()
+    old = {snapshot.summaries[snapshot.by_label[label]].id for label in known}
+    try:
+        looks = directory.looks(sorted(labels))
+        new = {directory.id_of(label) for label in looks.keys() - known}
+        rows = {summary.label: summary for summary in catalog.summaries(old | new)}
+        found = _find(directory, catalog, looks, rows, report)
+        is_twice = any(len(copies) > 1 for copies in found.values())
+        elsewhere = found.keys() & snapshot.by_id.keys() - old
+        if is_twice or elsewhere or report.unreadable:
+            return None
+        for summary in rows.values():
+            if summary.id not in found:
+                catalog.remove(summary.id)
+        changed = [summary for (summary,) in found.values()]
+        topics = {summary.topics: catalog.topics(summary.topics) for summary in changed}
+    except StoreError:
+        return None
+    return snapshot.with_changes(changed, topics, old)
 
 
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:

@@ -138,6 +138,17 @@ class Planner:
         channels = [one for one in self.examples if one.channel.topic in wanted]
         return narrowed(self.session, self.question, found, channels)
 
+    def only_part(self) -> Part | None:
+        """The only part of the question; None if it has several, or none.
+
+        Raises:
+            TimeError: as for `parts`.
+            TopicError: as for `parts`.
+        """
+        found = self._matching_ranges()
+        parts = [*self.parts_in(*found[0])] if len(found) == 1 else []
+        return self.batch_hint(parts)[0] if len(parts) == 1 else None
+
     def parts_in(
         self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
     ) -> Iterator[Part]:

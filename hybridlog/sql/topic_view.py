@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import isqrt
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -108,10 +109,7 @@ class TopicView:
         self._columns = {column.name: column for column in view_columns(kind)}
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
-        guarantees = [
-            _is_label(label) & _within(span) for label, span in zip(labels, spans, strict=True)
-        ]
-        self._chooser = _Chooser(self.schema, guarantees)
+        self._chooser = _RecordingChooser(self.schema, labels, spans)
 
     def rows(
         self, columns: Sequence[str], where: Any, reading: Reading
@@ -173,8 +171,49 @@ class _Chooser:
         return sorted(int(part.path) for part in self._parts.get_fragments(filter=where))
 
 
-def _is_label(label: str) -> Any:
-    return pc.field("recording") == label
+class _RecordingChooser:
+    """Chooses recordings as `_Chooser` chooses parts: first groups of them, then among these.
+
+    Args:
+        schema: Columns of the expression.
+        labels: Label of each recording.
+        spans: First and last log time of each, ns; None if unknown.
+    """
+
+    def __init__(
+        self, schema: Any, labels: Sequence[str], spans: Sequence[tuple[int, int] | None]
+    ) -> None:
+        self._schema = schema
+        self._labels = labels
+        self._spans = spans
+        count, size = len(labels), max(isqrt(len(labels)), 1)
+        self._groups = [range(at, min(at + size, count)) for at in range(0, count, size)]
+        self._chooser = _Chooser(schema, [self._guarantee(group) for group in self._groups])
+        self._inside: dict[int, _Chooser] = {}
+
+    def chosen(self, where: Any) -> Iterator[int]:
+        """Numbers of the recordings, in order."""
+        for number in self._chooser.chosen(where):
+            group = self._groups[number]
+            if where is None:
+                yield from group
+                continue
+            if number not in self._inside:
+                alone = [self._guarantee(range(one, one + 1)) for one in group]
+                self._inside[number] = _Chooser(self._schema, alone)
+            yield from (group[place] for place in self._inside[number].chosen(where))
+
+    def _guarantee(self, group: range) -> Any:
+        """An expression that holds for all rows of some recordings."""
+        labels = self._labels[group.start : group.stop]
+        spans = [span for span in self._spans[group.start : group.stop] if span is not None]
+        within = pc.scalar(True)
+        if len(spans) == len(group):
+            within = _within((min(first for first, _ in spans), max(last for _, last in spans)))
+        recording, low, high = pc.field("recording"), min(labels), max(labels)
+        if low == high:
+            return (recording == low) & within
+        return (recording >= low) & (recording <= high) & within
 
 
 def _within(span: tuple[int, int] | None) -> Any:

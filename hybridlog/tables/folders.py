@@ -243,7 +243,10 @@ class TableFolders:
             tables: The rows of each.
             before: The file that it replaces.
         """
-        table = pa.concat_tables([one.cast(tables[0].schema) for one in tables])
+        schema = tables[0].schema
+        table = pa.concat_tables(
+            [one if one.schema.equals(schema) else one.cast(schema) for one in tables]
+        )
         kept = None if before is None else before.kept()
         in_front = False
         if kept is not None and before is not None:

@@ -17,7 +17,7 @@ import hashlib
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -216,6 +216,9 @@ class Section:
         return self.begin, self.id
 
 
+_OF_SECTION: Final = tuple(one.name for one in fields(Section))
+
+
 @dataclass(frozen=True, slots=True)
 class About:
     """The description of a file of tables, stored in the file itself.
@@ -242,7 +245,7 @@ class About:
     @property
     def rows(self) -> int:
         """Rows of all recordings."""
-        return sum(section.rows for section in self.recordings)
+        return sum(bound[0] for bound in self.bounds)
 
     def section(self, recording: str) -> Section | None:
         """The rows of a recording; None without any."""
@@ -250,7 +253,12 @@ class About:
 
     def to_json(self) -> str:
         """The description as JSON text."""
-        return json.dumps(asdict(self), separators=(",", ":"))
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        # Not by `asdict`, which copies each number.
+        values["recordings"] = [
+            {name: getattr(section, name) for name in _OF_SECTION} for section in self.recordings
+        ]
+        return json.dumps(values, separators=(",", ":"))
 
     @classmethod
     def from_json(cls, text: bytes) -> About:
@@ -270,7 +278,7 @@ class About:
             is_sound = (
                 0 <= begin <= end <= values["body"]
                 and all(len(bound) == 5 for bound in about.bounds)
-                and sum(bound[0] for bound in about.bounds) == about.rows
+                and sum(section.rows for section in about.recordings) == about.rows
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise StoreError("the description of the table cannot be read") from error

@@ -703,6 +703,13 @@ class Tables:
         self._remember(key, found, generation)
         return found
 
+    def look_again(self) -> None:
+        """Look for all tables again; files that are as before stay open."""
+        with self._lock:
+            self._generation += 1
+            self._found.clear()
+            self._by_type.clear()
+
     def forget(self, recording: RecordingEntry, topics: Collection[str]) -> None:
         """Look for tables of a recording again."""
         with self._lock:

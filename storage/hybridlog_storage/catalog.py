@@ -827,17 +827,19 @@ class Catalog:
 
         self._change(work)
 
-    def summaries(self) -> list[RecordingSummary]:
-        """The summaries of all recordings, unordered; without damaged ones.
+    def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
+        """Summaries of recordings, unordered; without damaged ones.
+
+        Args:
+            recordings: Their ids; None for all.
 
         Raises:
             CatalogError: More than single rows is damaged.
         """
         with self._reading():
             self._follow()
-            asked = "select summary, crc, indexed, damage, id from summaries"
-            rows = self._db.execute(asked).fetchall()
-            lists = self._db.execute("select id, chunks, crc from damage").fetchall()
+            rows = self._rows("summary, crc, indexed, damage, id", "summaries", recordings)
+            lists = self._rows("id, chunks, crc", "damage", recordings)
             whole = {row[0]: row[2] for row in lists if _crc(*row[:2]) == row[2]}
             # The index has the list of unreadable chunks, too.
             good = [
@@ -852,6 +854,15 @@ class Catalog:
             RecordingSummary.from_values(row, index)
             for row, (_, index) in zip(values, good, strict=True)
         ]
+
+    def _rows(
+        self, columns: str, table: str, recordings: Collection[str] | None
+    ) -> list[tuple[Any, ...]]:
+        asked = f"select {columns} from {table}"  # noqa: S608 - names of ours
+        if recordings is None:
+            return self._db.execute(asked).fetchall()
+        found = [self._db.execute(f"{asked} where id = ?", (one,)) for one in recordings]
+        return [row for rows in found for row in rows]
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
         """A set of topics and their types, by its hash.
