@@ -24,6 +24,7 @@ class Cost:
         statements: SQL statements that the catalog got.
         opened: Files and folders opened or listed, below the store.
         bytes_read: Bytes read from files of the store.
+        looks: Files whose status was asked for.
         root: The store.
     """
 
@@ -32,6 +33,7 @@ class Cost:
     statements: list[str] = field(default_factory=list)
     opened: list[str] = field(default_factory=list)
     bytes_read: int = 0
+    looks: int = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -61,7 +63,14 @@ sys.addaudithook(_hear)
 @contextmanager
 def _counting_reads(cost: Cost) -> Iterator[None]:
     """Count what the calls return that segments, tables and journals are read with."""
+    status = os.stat
+
+    def looked(*arguments: Any, **options: Any) -> Any:
+        cost.looks += 1
+        return status(*arguments, **options)
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "stat", looked)
         for name in ("pread", "preadv", "read"):
             patch.setattr(os, name, _counted(getattr(os, name), cost))
         yield

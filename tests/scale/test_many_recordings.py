@@ -13,8 +13,9 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.sql import topic_view
 from tests.imports import ROOT
-from tests.scale.cost import cost_of
+from tests.scale.cost import Cost, cost_of
 
 DAY = 86_400 * 10**9
 START = 18_262 * DAY  # 2020-01-01
@@ -80,6 +81,9 @@ ASKED: dict[str, Work] = {
     "sync of a day": lambda store: [
         *store.sync([store.topic(name).between(*day(4)) for name in ("pose", "imu")], clock="log")
     ],
+    "align of a day": lambda store: store.align(
+        store.topic("pose").between(*day(4)), ["imu"]
+    ).to_arrow(),
     "first of all": lambda store: store.topic("pose").first(),
     "last of all": lambda store: store.topic("pose").reverse().first(),
     "one recording": lambda store: store.query(["/pose"], ["day00004"]).count(),
@@ -147,14 +151,97 @@ CHANGES: dict[str, Work] = {
 }
 
 
+def check_alike(costs: dict[int, Cost], *, looks: bool = True) -> None:
+    """Check that work costs as much with many recordings as with few."""
+    few, many = costs[FEW].counts, costs[MANY].counts
+    # A shared file is written once or twice, and the index reads a segment in one pass or two.
+    assert abs(many.pop("opened") - few.pop("opened")) < 20
+    assert many == few
+    assert not looks or abs(costs[MANY].looks - costs[FEW].looks) < 20
+
+
+LOOKS_AT_ALL = {"verify of one", "reindex of one", "repair of one"}
+"""They compare all recordings with their files first."""
+
+
 @pytest.mark.parametrize("name", CHANGES)
 def test_work_on_one_recording_costs_the_same(stores: dict[int, Path], name: str) -> None:
-    counts = {}
+    costs = {}
     for count, path in stores.items():
         with hl.open(path, require_database=True) as store:
             store.verify(["day00003"])  # what Python loads is loaded
-            counts[count] = cost_of(store, lambda store=store: CHANGES[name](store)).counts
-    assert counts[MANY] == counts[FEW]
+            costs[count] = cost_of(store, lambda store=store: CHANGES[name](store))
+    check_alike(costs, looks=name not in LOOKS_AT_ALL)
+
+
+def test_a_recording_is_imported_without_a_look_at_the_others(
+    stores: dict[int, Path], tmp_path: Path
+) -> None:
+    for name, number in (("before", 5_000), ("more", 5_001)):
+        write_day(tmp_path / f"{name}.mcap", number)
+        with hl.open(tmp_path / f"from-{name}", create=True, mongo="none") as store:
+            store.record(tmp_path / f"{name}.mcap")
+    imports, answers, removals = {}, {}, {}
+    for count, path in stores.items():
+        with hl.open(path, mongo="none") as store:
+            store.import_from(tmp_path / "from-before")
+            asked = store.topic("pose").where("data > 4.5").between(*day(5_001))
+            imports[count] = cost_of(
+                store, lambda store=store: store.import_from(tmp_path / "from-more")
+            )
+            answers[count] = cost_of(store, lambda asked=asked: asked.count())
+            assert asked.count() == MESSAGES - 5
+            removals[count] = cost_of(store, lambda store=store: store.remove("more"))
+            store.remove("before")
+            assert store.topic("pose").count() == count * MESSAGES
+    for costs in (imports, answers, removals):
+        check_alike(costs)
+
+
+def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) -> None:
+    with hl.open(stores[MANY], mongo="none") as store:
+        asked = store.topic("pose").where("data > 4.5")
+        assert asked.count() == MANY * (MESSAGES - 5)
+        store.tag("day00004", place="roof")
+        cost = cost_of(store, asked.count)
+    assert cost.looks < 20
+    assert len(cost.statements) < 5
+    assert not [path for path in cost.opened if path.endswith(".parquet")]
+
+
+def test_sql_of_a_day_tests_groups_of_recordings(
+    stores: dict[int, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    inside = topic_view._within
+    monkeypatch.setattr(topic_view, "_within", lambda span: made.append(span) or inside(span))
+    with hl.open(stores[MANY], mongo="none") as store:
+        asked = f"select count(*) from pose where t >= {day(4)[0]} and t < {day(4)[1]}"
+        cost = cost_of(store, lambda: store.sql(asked).rows())
+        assert store.sql(asked).rows() == [(MESSAGES,)]
+        assert len(cost.statements) < 50  # of recordings from which sizes are estimated
+        named = "select count(*) from pose where recording = 'day00007'"
+        assert store.sql(named).rows() == [(MESSAGES,)]
+    assert len(made) < MANY / 2
+
+
+def test_many_at_once_are_counted_in_each_file_once(stores: dict[int, Path]) -> None:
+    with hl.open(stores[MANY], mongo="none") as store:
+        asked = store.topic("pose").where("data > 4.5")
+        first, again = (cost_of(store, asked.count) for _ in range(2))
+        verified = cost_of(store, store.verify)
+    for cost in (first, verified):
+        tables = [path for path in cost.opened if path.endswith(".parquet")]
+        assert len(tables) == len({*tables})
+    assert not [path for path in again.opened if path.endswith((".parquet", ".mcap"))]
+
+
+def test_a_small_recording_takes_little_room(stores: dict[int, Path]) -> None:
+    path = stores[MANY]
+    kept = ["catalog.sqlite", "recordings", "tables"]
+    found = [f for name in kept for f in [path / name, *(path / name).rglob("*")] if f.is_file()]
+    assert sum(f.stat().st_size for f in found) <= MANY * 30_000
+    assert len(found) <= MANY * 4
 
 
 def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Path) -> None:
@@ -165,15 +252,13 @@ def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Pa
     for count, path in stores.items():
         with hl.open(path, require_database=True) as store:
             store.record(tmp_path / "before.mcap")
-            counts[count] = cost_of(
-                store, lambda store=store: store.record(tmp_path / "more.mcap")
-            ).counts
+            counts[count] = cost_of(store, lambda store=store: store.record(tmp_path / "more.mcap"))
             store.remove("before")
             store.connect()
-            removals[count] = cost_of(store, lambda store=store: store.remove("more")).counts
+            removals[count] = cost_of(store, lambda store=store: store.remove("more"))
             assert store.topic("pose").count() == count * MESSAGES
-    assert counts[MANY] == counts[FEW]
-    assert removals[MANY] == removals[FEW]
+    for costs in (counts, removals):
+        check_alike(costs)
 
 
 LIMITED = """
