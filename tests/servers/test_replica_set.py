@@ -21,7 +21,7 @@ from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set
 
 NUMBERS = count()
 MESSAGES = 4000  # of each of three topics
-KILLED_AT = 4  # inserts
+KILLED_AT = 3  # inserts
 
 
 @pytest.fixture(scope="module")

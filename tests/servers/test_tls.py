@@ -116,7 +116,7 @@ def test_everything_works_and_the_password_stays_where_it_is(
     assert counted.out.split() == [str(MESSAGES - 100)]
     rows = run(*where, "--format", "jsonl", "--quiet", store=store, **env)
     assert len(rows.lines) == MESSAGES - 100
-    indexed = run("index", "/number", "n", store=store, **env)
+    indexed = run("index", "add", "/number", "n", store=store, **env)
     verified = run("verify", store=store, **env)
     again = run("index", "rebuild", store=store, **env)
     said += [counted, rows, indexed, verified, again, run("verify", store=store, **env)]

@@ -14,7 +14,6 @@ from tests.servers.mongods import Mongod, eventually
 ROOT = Path(__file__).parents[2]
 SOME = (
     "tests/test_field_indexes.py",
-    "tests/query/test_counting.py::test_a_short_range_is_read_by_its_keys_whatever_indexes_there_are",
     "tests/storage/test_mongod.py",  # left out
 )
 
