@@ -36,6 +36,7 @@ from hybridlog.query.query import Query
 from hybridlog.recorder import RecordOptions
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.errors import (
+    AlreadyRecordedError,
     DatabaseError,
     DefinitionError,
     HybridlogError,
@@ -808,7 +809,7 @@ def test_by_time_without_mongodb(base: Path, store: hl.Store, robot: Truth) -> N
             sliced.where({"header.seq": {"$bitsAllSet": 1}}).count()
         with pytest.raises(DatabaseError):
             list(sliced.documents())
-        with pytest.raises(DatabaseError):
+        with pytest.raises(AlreadyRecordedError):
             away.record(base / "robot.bag")
         assert not away.verify().index
     with pytest.raises(DatabaseError):
@@ -818,7 +819,7 @@ def test_by_time_without_mongodb(base: Path, store: hl.Store, robot: Truth) -> N
 AS_A_READER = """
 import sys
 import hybridlog as hl
-from hybridlog_storage.errors import DatabaseError
+from hybridlog_storage.errors import HybridlogError
 
 store, log = sys.argv[1:]
 with hl.open(store) as opened:
@@ -827,7 +828,7 @@ with hl.open(store) as opened:
     print(query.count(), sum(len(m.raw) for m in query))
     try:
         opened.record(log, again=True)
-    except DatabaseError:
+    except HybridlogError:
         print("refused")
 """
 

@@ -96,7 +96,7 @@ def test_reading_payloads_is_given_up(
         if is_compact:
             assert store.compact()
         asked = {**SCAN, "where": "ranges[7] < 3 or ranges[7] > 3.1"}
-        module = "payloads/reader" if is_compact else "query/chunk_scan"
+        module = "tables/reader" if is_compact else "query/chunk_scan"
         assert_stops(store, monkeypatch, "ask", asked, module)
 
 
