@@ -29,7 +29,7 @@ _EMBEDDED_TIMEOUT_S = 2.0
 
 
 class IndexAddress(NamedTuple):
-    """Where other programs find the index.
+    """The address of the index for other programs.
 
     Attributes:
         uri: As `pymongo.MongoClient` takes it, without a password.

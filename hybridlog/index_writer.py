@@ -52,7 +52,7 @@ _RETRY_S = 2.0  # between attempts after the database has failed
 
 @dataclass(frozen=True, slots=True)
 class IndexTarget:
-    """Where the index documents of a new recording go.
+    """The database for the index documents of a new recording.
 
     Attributes:
         database: The index; None if it is unavailable now, or the recording gets none.

@@ -36,7 +36,7 @@ def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str]:
 def _columns(
     summaries: Sequence[RecordingSummary], topics: Iterable[str]
 ) -> dict[str, NDArray[Any]]:
-    """What a snapshot has as columns, by the name of its attribute."""
+    """Columns of a snapshot, a row for each recording, by the name of the attribute."""
     numbers = {digest: number for number, digest in enumerate(topics)}
     bounds = np.array([one.extent for one in summaries], np.int64).reshape(-1, 2)
     return {

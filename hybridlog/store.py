@@ -757,7 +757,7 @@ class Store:
 
     @_again_if_lost
     def index_address(self) -> IndexAddress:
-        """Where other programs find the index, up to date with all recordings.
+        """The address of the index for other programs, after it was brought up to date.
 
         The embedded MongoDB keeps its address, waits ten minutes for the first client, and runs
         as long as one is connected.

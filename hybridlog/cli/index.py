@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,6 +17,8 @@ from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hybridlog.choice import Choice
     from hybridlog.field_indexes import FieldIndex
 
@@ -28,6 +30,13 @@ _FIELDS = click.argument(
     help="Its fields, the most selective first.",
 )
 _TOPIC = click.argument("topic", metavar="TOPIC", shell_complete=complete_topic, help="A topic.")
+
+
+def _options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that commands of the group share."""
+    for option in (options.quiet, options.as_json, options.mongo, options.store):
+        command = option(command)
+    return command
 
 
 @click.group()
@@ -43,10 +52,7 @@ def command() -> None:
     shell_complete=complete_topic,
     help="A topic; without, all.",
 )
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
+@_options
 def list_(
     *, topic: str | None, store: Path | None, mongo: str | None, as_json: bool, quiet: bool
 ) -> None:
@@ -59,10 +65,7 @@ def list_(
 @command.command()
 @_TOPIC
 @_FIELDS
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
+@_options
 def add(
     *,
     topic: str,
@@ -81,10 +84,7 @@ def add(
 @command.command()
 @_TOPIC
 @_FIELDS
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
+@_options
 def remove(
     *,
     topic: str,
@@ -104,10 +104,7 @@ def remove(
 
 
 @command.command()
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
+@_options
 def address(*, store: Path | None, mongo: str | None, as_json: bool, quiet: bool) -> None:
     """Print the address of the index for other programs, and what is in it.
 

@@ -54,8 +54,8 @@ def command(
         output.say(f"{item['statement']};")
         output.say()
     if others:
-        went = output.counted(others, "unfinished recording")
-        output.note(f"Tables of {went} follow at the end.")
+        left = output.counted(others, "unfinished recording")
+        output.note(f"Without {left}: rows are added when a recording ends.")
 
 
 def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:

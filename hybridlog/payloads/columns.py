@@ -208,7 +208,7 @@ def _padding(
 
 
 def _recipe(layout: PointLayout | None, parts: Split, records: Records) -> dict[str, pa.Array[Any]]:
-    """What the original bytes need besides the arrays, and the points of unpacked clouds."""
+    """Columns of the original bytes besides the arrays, and of the points of unpacked clouds."""
     rows, arrays = parts.at.shape
     bounds = np.arange(rows + 1, dtype=np.int64) * arrays
     columns = {

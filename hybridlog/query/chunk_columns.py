@@ -106,7 +106,7 @@ class ChunkColumns:
         stamps: NDArray[np.void] | None = None,
         timed: Collection[int] = (),
     ) -> NDArray[np.bool_]:
-        """Which chunks may have messages in a time range.
+        """True for chunks that may have messages in a time range.
 
         Args:
             bounds: `[begin, end)`, ns; None for all times.

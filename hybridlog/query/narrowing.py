@@ -31,7 +31,7 @@ _MIN_RECORDINGS = 16
 """Fewer recordings are asked by their columns: a command costs as much."""
 _MIN_MATCHES = 100
 _MATCHES_SHARE = 4
-"""MongoDB looks at one document for so many recordings, so that this costs little if in vain."""
+"""MongoDB reads at most one match for so many recordings: a search in vain stays cheap."""
 _EXACT = 2**53
 """Integers up to this are exact as doubles."""
 _SINGLE = re.compile(r"(byte|char|string|time|duration|float(32|64)|u?int(8|16|32|64))")

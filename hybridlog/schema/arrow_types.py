@@ -135,7 +135,7 @@ def with_values(array: Array, values: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """How values of several types become values of one.
+    """Rules for the common type of values of several types.
 
     Attributes:
         leaf: The type for values that are neither structs nor lists.

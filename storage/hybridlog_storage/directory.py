@@ -206,7 +206,7 @@ class StoreDirectory:
             raise unreadable(error, self.path, f"The store {self.path}") from error
 
     def changed(self) -> tuple[int, bool]:
-        """When a recording got or lost its name last, ns, and whether that is a while ago.
+        """Time at which a recording got or lost its name last, ns, and if that is a while ago.
 
         Within a tick of the file system's clock another change would show the same time.
         """
