@@ -56,7 +56,6 @@ def test_a_record_of_the_kernel_tells_connections(path: Path) -> None:
 
 
 def test_as_a_command(path: Path) -> None:
-    (path / "mongod" / "mongod.json").unlink(missing_ok=True)
     told = run("index", "address", "--json", store=path).json
     assert told["recordings"] == 1
     assert [(one["topic"], one["documents"]) for one in told["topics"]] == [
