@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hybridlog.processors import processors
+from hybridlog_storage.threads import processors
 
 TAKEN_SHARE = 0.05
 """A host that takes more of the processors' time away than this disturbs a run."""

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from hybridlog.processors import processors
+from hybridlog_storage.threads import processors
 
 _PACKAGES = ("hybridlog", "mcap", "numpy", "pandas", "psycopg", "pyarrow", "pymongo", "rosbags")
 _ROOT = Path(__file__).parents[1]
@@ -74,7 +74,7 @@ def _version(package: str) -> str:
 
 def _mongod_version() -> str:
     from hybridlog_storage.errors import MissingDependencyError
-    from hybridlog_storage.mongod import find_mongod
+    from hybridlog_storage.mongo.mongod import find_mongod
 
     try:
         return _said([str(find_mongod()), "--version"], r"db version v(\S+)")

@@ -24,17 +24,17 @@ import hybridlog as hl
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
 from hybridlog.across.match import HOWS, How, match
-from hybridlog.indexing import ChunkIndexer
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
 from hybridlog.tables.writer import TableWriter
-from hybridlog_storage.chunk import StoredChunk, pack
-from hybridlog_storage.chunk_builder import ChunkBuilder
-from hybridlog_storage.compression import Compressor
-from hybridlog_storage.index_documents import DocumentAssembler, Origin, Placed
 from hybridlog_storage.messages import Batch, Channel, Schema
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed
+from hybridlog_storage.segments.chunk import StoredChunk, pack
+from hybridlog_storage.segments.chunk_builder import ChunkBuilder
+from hybridlog_storage.segments.compression import Compressor
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 SMALL, IMU, DRIVE = "small.bag", "imu.bag", "drive.bag"
 _MAKE: dict[str, Callable[[Path], None]] = {

@@ -33,9 +33,9 @@ from benchmarks.backends.conversion import message_plan
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags
 from benchmarks.side import run_side
-from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.database import Database
-from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
 Size = Callable[[int, int], int]
 ROUNDS = 3

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.query import Query
-    from hybridlog.recorder import RecordOptions
+    from hybridlog.record.recorder import RecordOptions
     from hybridlog.store import Store
     from hybridlog.store import open_store as open  # noqa: A004
 
@@ -26,7 +26,7 @@ __version__ = "0.1.0"
 _PLACES = {
     "Message": ("hybridlog.message", "Message"),
     "Query": ("hybridlog.query.query", "Query"),
-    "RecordOptions": ("hybridlog.recorder", "RecordOptions"),
+    "RecordOptions": ("hybridlog.record.recorder", "RecordOptions"),
     "Store": ("hybridlog.store", "Store"),
     "open": ("hybridlog.store", "open_store"),
 }

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Question
     from hybridlog.session import Session
-    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.chunk_table import ChunkTable
     from hybridlog_storage.messages import Channel
-    from hybridlog_storage.open_segment import Flushed
-    from hybridlog_storage.segment_reader import SegmentSummary
+    from hybridlog_storage.segments.attachments import Attachment
+    from hybridlog_storage.segments.chunk_table import ChunkTable
+    from hybridlog_storage.segments.open_segment import Flushed
+    from hybridlog_storage.segments.segment_reader import SegmentSummary
 
 
 @dataclass(frozen=True, slots=True)

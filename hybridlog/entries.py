@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.losses import Cause, extent_of, joined, topics_of
+from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
     ChannelStats,
@@ -26,20 +26,20 @@ from hybridlog_storage.catalog import (
     channel_entry,
     channel_totals,
 )
-from hybridlog_storage.directory import PAYLOADS
+from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_file import Sealed, sealed_channels
-from hybridlog_storage.segment_format import MOVED_SIZE
-from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
+from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
+from hybridlog_storage.segments.segment_format import MOVED_SIZE
+from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.directory import Listing, StoreDirectory
+    from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.journal import JournalState, PayloadFile, SealedSegment
+    from hybridlog_storage.segments.chunk_table import ChunkTable
 
     Stamps = Callable[[RecordingEntry, int, ChunkTable], NDArray[Any] | None]
     Reason = Callable[[int, Channel], str | None]

@@ -83,7 +83,7 @@ class Message:
 
     def _repr_html_(self) -> str:
         """The message in a notebook: its fields, and a thumbnail of an image."""
-        from hybridlog.notebook import message_html
+        from hybridlog.drawing.notebook import message_html
 
         title = f"{self.topic} {self.type} {format_time(self.log_time_ns)}, {len(self._view)} B"
         problem = ""
@@ -96,7 +96,7 @@ class Message:
 
     def _thumbnail(self) -> bytes:
         """A small PNG of an image; empty for other messages, and for what cannot be shown."""
-        from hybridlog.arrays import IMAGES, to_numpy
+        from hybridlog.arrays.message_arrays import IMAGES, to_numpy
         from hybridlog.drawing.pixels import thumbnail
 
         is_image = self.type.replace("/msg/", "/") in IMAGES
@@ -174,7 +174,7 @@ class Message:
         Raises:
             PayloadError: another type, or sizes that do not fit the data.
         """
-        from hybridlog.arrays import to_numpy
+        from hybridlog.arrays.message_arrays import to_numpy
 
         return to_numpy(self.type, self.decode())
 

@@ -73,7 +73,7 @@ class Recordings(Sequence["RecordingEntry"]):
 
     def _repr_html_(self) -> str:
         """The recordings in a notebook."""
-        from hybridlog.notebook import recordings_html
+        from hybridlog.drawing.notebook import recordings_html
 
         return recordings_html(f"{len(self)} recordings", self.summaries)
 

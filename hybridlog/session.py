@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
-from hybridlog.connection import Connection
 from hybridlog.entries import channels_of, summary_of, take_inventory
+from hybridlog.index.connection import Connection
 from hybridlog.maintenance.opening import (
     catch_up,
     current_entry,
@@ -38,8 +38,8 @@ from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import listed
-from hybridlog_storage import files
 from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     CatalogError,
     ConnectionBrokenError,
@@ -57,7 +57,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.forks import begins_anew
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_reader import SegmentReader, place_of
+from hybridlog_storage.segments.segment_reader import SegmentReader, place_of
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
@@ -65,22 +65,22 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.field_indexes import FieldIndex
-    from hybridlog.index_version import GuardedIndex, IndexVersion
-    from hybridlog.index_writer import IndexTarget
+    from hybridlog.index.field_indexes import FieldIndex
+    from hybridlog.index.index_version import GuardedIndex, IndexVersion
+    from hybridlog.index.index_writer import IndexTarget
     from hybridlog.payloads.reader import ArrayTable
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
-    from hybridlog.running import RunningRecording
+    from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import Snapshot
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.topic_places import TopicPlaces
+    from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.summary import RecordingSummary
-    from hybridlog_storage.topic_places import TopicPlaces
 
 _SHOWN = 5  # recordings in a message
 _MAX_OPEN_SEGMENTS = 256
@@ -282,7 +282,7 @@ class Session:
                 raise
 
     def _connect(self, recordings: Collection[RecordingEntry] | None) -> Database:
-        from hybridlog import field_indexes
+        from hybridlog.index import field_indexes
         from hybridlog.maintenance import index
 
         if self.connected is None:
@@ -377,7 +377,7 @@ class Session:
             DatabaseError: as for `database_for`, if it was reached.
             StoreError: it holds the index of another store, or this store is a copy.
         """
-        from hybridlog.index_writer import IndexTarget
+        from hybridlog.index.index_writer import IndexTarget
 
         if self.connected is not None and self.connection.may_write:
             if self.connected.ping():
@@ -414,7 +414,7 @@ class Session:
             DatabaseError: it is unavailable; has the purpose and the reason.
             IndexChangedError: documents of these recordings are missing, or being removed.
         """
-        from hybridlog.index_version import GuardedIndex
+        from hybridlog.index.index_version import GuardedIndex
 
         database = self.connected or self.database_for(purpose)
         try:
@@ -439,7 +439,7 @@ class Session:
         Raises:
             DatabaseError: it is unavailable; has the purpose and the reason.
         """
-        from hybridlog_storage.topic_places import TopicPlaces
+        from hybridlog_storage.mongo.topic_places import TopicPlaces
 
         database = self.connected or self.database_for(purpose)
         if self._places is None:
@@ -456,7 +456,7 @@ class Session:
             keys: Keys of the recordings.
             anew: True to read it from the database now.
         """
-        from hybridlog.index_version import IndexVersion
+        from hybridlog.index.index_version import IndexVersion
 
         found = self._index_version = IndexVersion.of(
             database, keys, None if anew else self._index_version
@@ -469,7 +469,7 @@ class Session:
         Returns:
             The turn of the index before it was asked, and their keys.
         """
-        from hybridlog_storage.index_state import IndexState
+        from hybridlog_storage.mongo.index_state import IndexState
 
         assert self.connected is not None
         state = IndexState(self.connected)
@@ -591,7 +591,7 @@ class Session:
             summary = snapshot.summaries[place]
             running = self._running.get(recording)
             if running is None:
-                from hybridlog.running import RunningRecording
+                from hybridlog.record.running import RunningRecording
 
                 running = self._running[recording] = RunningRecording(
                     self.directory, summary.label, partial(self._read_entry, summary)

@@ -10,24 +10,24 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeAlias, TypeVar, cast
 
-from hybridlog import consent, field_indexes
-from hybridlog.choice import Choice
-from hybridlog.connection import IndexAddress
 from hybridlog.entries import text
-from hybridlog.field_indexes import FieldIndex
-from hybridlog.losses import extent_of
+from hybridlog.index import consent, field_indexes
+from hybridlog.index.connection import IndexAddress
+from hybridlog.index.field_indexes import FieldIndex
 from hybridlog.maintenance.report import (
     CompactedTopic,
     Progress,
     RepairReport,
 )
+from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
+from hybridlog.record.losses import extent_of
 from hybridlog.session import Session, of_one_moment
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
@@ -49,22 +49,22 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.attachments import StoredAttachment, StoredMetadata
-    from hybridlog.choice import During, Tags, Texts
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.imports import ImportReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
-    from hybridlog.recorder import RecordOptions, RecordReport
+    from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.sources.base import Source
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
-    from hybridlog_storage.database import Database
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
-    from hybridlog_storage.topic_places import TopicPlace
 
 DEFAULT_STORE = "hybridlog-store"
 _CLIENTS_WAIT_S = 600.0
@@ -201,7 +201,7 @@ class Store:
 
     def _repr_html_(self) -> str:
         """The store in a notebook: its latest recordings."""
-        from hybridlog.notebook import recordings_html
+        from hybridlog.drawing.notebook import recordings_html
 
         summaries = self.summaries()
         title = f"Store {self.directory.path}: {len(summaries)} recordings"
@@ -319,7 +319,7 @@ class Store:
     @of_one_moment
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
-        from hybridlog.choosing import choose
+        from hybridlog.query.choosing import choose
         from hybridlog.recordings import Recordings
 
         chosen = choose(self.session, choice)
@@ -333,7 +333,7 @@ class Store:
     @of_one_moment
     def is_one(self, names: Sequence[str]) -> bool:
         """True if a choice by these names is of one recording, whatever the store holds."""
-        from hybridlog.choosing import is_exact
+        from hybridlog.query.choosing import is_exact
 
         return len(names) == 1 and is_exact(self.session, names[0])
 
@@ -612,7 +612,7 @@ class Store:
             SourceError: Nothing could be read.
             AlreadyRecordedError: Its content is in the store already.
         """
-        from hybridlog.recorder import RecordOptions, record
+        from hybridlog.record.recorder import RecordOptions, record
         from hybridlog.sources.detect import open_source
         from hybridlog.sources.fingerprint import fingerprint
 

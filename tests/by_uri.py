@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pymongo import MongoClient
 
-from hybridlog import consent
+from hybridlog.index import consent
 from hybridlog_storage.settings import EMBEDDED, StoreSettings
 
 PREFIX = "hltest_"

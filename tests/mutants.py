@@ -110,7 +110,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/recorder.py",
+        "hybridlog/record/recorder.py",
         (
             "nothing-behind-the-last-message",
             "        self._copy_extras()\n        for channel in",
@@ -138,7 +138,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/index_writer.py",
+        "hybridlog/index/index_writer.py",
         (
             "missed-messages-are-none",
             "return self._flushed - self.indexed if self.failure is not None else 0",
@@ -181,7 +181,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "hybridlog/losses.py",
+        "hybridlog/record/losses.py",
         ("a-loss-begins-late", "min(row.first, first)", "row.first", LEDGER),
         ("a-loss-ends-early", "max(row.last, last)", "row.last", LEDGER),
         ("a-row-ends-early", 'max(before["to"], row["to"])', 'row["to"]', LEDGER),
@@ -189,7 +189,7 @@ MUTANTS = [
         ("rows-of-wishes-never-come", "row.last - row.first >= _SLOW_NS", "False", LEDGER),
     ),
     *_of(
-        "storage/hybridlog_storage/append_file.py",
+        "storage/hybridlog_storage/disk/append_file.py",
         (
             "a-file-ends-in-zeros",
             "                files.system.truncate(self._fd, self.position)\n",
@@ -204,7 +204,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "storage/hybridlog_storage/durability.py",
+        "storage/hybridlog_storage/disk/durability.py",
         (
             "a-write-that-was-cut-short-skips-a-byte",
             "return [view[done:], *views[index + 1 :]]",
@@ -433,7 +433,7 @@ FORMAT_2 = [
         ),
     ),
     *_of(
-        "storage/hybridlog_storage/recovery.py",
+        "storage/hybridlog_storage/segments/recovery.py",
         (
             "another-summary-takes-its-place",
             "        if segment.complete().digest != digest:\n            return False\n",
@@ -449,7 +449,7 @@ FORMAT_2 = [
         ("a-recovery-is-not-announced", "        tell(found)\n", "", SEGMENTS),
     ),
     *_of(
-        "storage/hybridlog_storage/segment_file.py",
+        "storage/hybridlog_storage/segments/segment_file.py",
         (
             "a-sealed-segment-has-no-name",
             "            files.sync_folder(final.parent)\n        except OSError",
@@ -470,7 +470,7 @@ FORMAT_2 = [
         ),
     ),
     *_of(
-        "storage/hybridlog_storage/segment_reader.py",
+        "storage/hybridlog_storage/segments/segment_reader.py",
         (
             "stored-bytes-are-believed",
             "            if crc32(record) != place.crc:\n",
@@ -530,7 +530,7 @@ FORMAT_2 = [
         ),
     ),
     *_of(
-        "storage/hybridlog_storage/index_state.py",
+        "storage/hybridlog_storage/mongo/index_state.py",
         (
             "an-index-of-other-segments-is-whole",
             'return self.state == "complete" and dict(self.segments) == entry.digests',
@@ -539,7 +539,7 @@ FORMAT_2 = [
         ),
     ),
     *_of(
-        "storage/hybridlog_storage/files.py",
+        "storage/hybridlog_storage/disk/files.py",
         (
             "symlinks-of-files-are-followed",
             "system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)",
@@ -672,7 +672,7 @@ MAINTENANCE = [
         ),
     ),
     *_of(
-        "storage/hybridlog_storage/chunk_table.py",
+        "storage/hybridlog_storage/segments/chunk_table.py",
         (
             "a-part-may-end-before-it-begins",
             ' or (parts["first"] > parts["last"]).any()',
@@ -731,7 +731,7 @@ STEPS_NEAR = f"{INTERVALS}::test_steps_that_are_near_are_one_change"
 
 SILENT = [
     *_of(
-        "storage/hybridlog_storage/open_segment.py",
+        "storage/hybridlog_storage/segments/open_segment.py",
         (
             "a-segment-that-was-taken-back-is-not-read-anew",
             "        is_cut = self.is_cut()\n",
@@ -1128,7 +1128,7 @@ SILENT = [
         ),
     ),
     *_of(
-        "hybridlog/running.py",
+        "hybridlog/record/running.py",
         (
             "flushed-messages-count-as-sealed-ones",
             "channels = {channel.id: replace(channel) for channel in sealed.channels}",

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hybridlog_storage.files import System
+from hybridlog_storage.disk.files import System
 
 SECTOR = 512
 

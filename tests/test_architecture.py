@@ -23,7 +23,7 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 
 # Where each third-party package may be imported: a module, or a package and all below it.
 ALLOWED = {
-    "PIL": ("hybridlog.arrays", "hybridlog.drawing.images"),
+    "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
     "bson": (
         "hybridlog.message",  # whole index documents, for people,
         "hybridlog.query.answers.index_documents",  # and those as MongoDB has them
@@ -32,26 +32,26 @@ ALLOWED = {
         "hybridlog.schema.protobuf_codec",
         "hybridlog.schema.reduced_codec",
         "hybridlog.schema.ros_codec",
-        "hybridlog_storage.database",
+        "hybridlog_storage.mongo.database",
     ),
     "click": ("hybridlog.cli",),
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog.drawing.pixels", "hybridlog_storage.checksum"),
-    "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.compression"),
+    "lz4": ("hybridlog.sources.rosbag1", "hybridlog_storage.segments.compression"),
     "matplotlib": ("hybridlog.drawing.figure", "hybridlog.query.query"),
     "mcap": (
         "hybridlog.export.mcap",
         "hybridlog.sources",
-        "hybridlog_storage.attachments",
-        "hybridlog_storage.chunk_builder",
-        "hybridlog_storage.mcap_content",
-        "hybridlog_storage.mcap_scan",
-        "hybridlog_storage.open_segment",
-        "hybridlog_storage.recovery",
-        "hybridlog_storage.segment_file",
-        "hybridlog_storage.segment_format",
-        "hybridlog_storage.segment_reader",
-        "hybridlog_storage.segment_writer",
+        "hybridlog_storage.segments.attachments",
+        "hybridlog_storage.segments.chunk_builder",
+        "hybridlog_storage.mcap.mcap_content",
+        "hybridlog_storage.mcap.mcap_scan",
+        "hybridlog_storage.segments.open_segment",
+        "hybridlog_storage.segments.recovery",
+        "hybridlog_storage.segments.segment_file",
+        "hybridlog_storage.segments.segment_format",
+        "hybridlog_storage.segments.segment_reader",
+        "hybridlog_storage.segments.segment_writer",
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "pandas": ("hybridlog.frames",),
@@ -74,7 +74,7 @@ ALLOWED = {
         "hybridlog.sql",
         "hybridlog.tables",
     ),
-    "pymongo": ("hybridlog_storage.database",),
+    "pymongo": ("hybridlog_storage.mongo.database",),
     "re2": ("hybridlog.query.predicate.regex",),
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
@@ -87,11 +87,11 @@ ALLOWED = {
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",
     ),
-    "yaml": ("hybridlog.yaml_values",),
+    "yaml": ("hybridlog.sources.yaml_values",),
     "zstandard": (
         "hybridlog.sources",
-        "hybridlog_storage.compression",
-        "hybridlog_storage.segment_format",
+        "hybridlog_storage.segments.compression",
+        "hybridlog_storage.segments.segment_format",
     ),
 }
 
@@ -107,7 +107,7 @@ DISTRIBUTIONS = {
 
 # Modules of ours that only some may import when the program runs.
 WIRED_BY = {
-    "hybridlog_storage.mongod": ("hybridlog.connection",),
+    "hybridlog_storage.mongo.mongod": ("hybridlog.index.connection",),
     "hybridlog.store": ("hybridlog", "hybridlog.cli", "hybridlog.demo", "hybridlog.store"),
 }
 
@@ -127,7 +127,7 @@ def _places(name: str, imports: list[Import]) -> str:
 
 
 def test_modules_are_found() -> None:
-    assert {"hybridlog", "hybridlog.store", "hybridlog_storage.database"} <= set(MODULES)
+    assert {"hybridlog", "hybridlog.store", "hybridlog_storage.mongo.database"} <= set(MODULES)
     assert any(i.module == "numpy" for i in IMPORTS["hybridlog_storage.messages"])
     typed = [i for i in IMPORTS["hybridlog_storage.messages"] if i.module == "numpy.typing"]
     assert typed

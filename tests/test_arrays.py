@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
-from hybridlog.arrays import to_numpy
+from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 from tests.data import DATA, needs_data
 

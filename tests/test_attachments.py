@@ -21,10 +21,10 @@ import hybridlog as hl
 from hybridlog.attachments import StoredAttachment, file_names
 from hybridlog.cli.write_answer import write_answer
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.recovery import recover_segment
-from hybridlog_storage.segment_check import SegmentCheck
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.recovery import recover_segment
+from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.running import run
 
 SECOND = 10**9

@@ -13,8 +13,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.storage.chunk_entries import chunk_entries
 from tests.test_model import drafts_of, write_mcap
 

@@ -18,9 +18,9 @@ from click.testing import CliRunner
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.choice import Choice
 from hybridlog.cli.app import app
 from hybridlog.live import LiveOptions
+from hybridlog.query.choice import Choice
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
 from hybridlog.wording import listed

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog import consent
+from hybridlog.index import consent
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import StoreSettings, write_settings
 from tests.cli.running import run

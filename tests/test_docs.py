@@ -285,7 +285,7 @@ class Python:
 @contextlib.contextmanager
 def elsewhere(directory: Path, page: Path) -> Iterator[str]:
     """The URI of a MongoDB that is not the store's own, for a page that needs one."""
-    from hybridlog_storage.mongod import EmbeddedMongod
+    from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
     if "$MONGO_URI" not in page.read_text("utf-8"):
         yield ""
@@ -416,8 +416,10 @@ def test_the_map_of_the_source_tree() -> None:
     named = set(re.findall(r"^\| `([\w./]+)`", tree, flags=re.MULTILINE))
     for name in named:
         assert (ROOT / name).exists(), name
-    packages = [p.parent for p in (ROOT / "hybridlog").rglob("__init__.py")]
-    for package in [*packages, ROOT / "storage" / "hybridlog_storage"]:
+    packages = [
+        p.parent for root in ("hybridlog", "storage") for p in (ROOT / root).rglob("__init__.py")
+    ]
+    for package in packages:
         assert f"{package.relative_to(ROOT)}/" in named, package
 
 
@@ -538,10 +540,10 @@ def documented_classes() -> list[type]:
     from hybridlog.query.answers.lost import Lost
     from hybridlog.query.counters import Counters
     from hybridlog.query.intervals import Interval, Intervals
-    from hybridlog.recorder import RecordReport
+    from hybridlog.record.recorder import RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
-    from hybridlog_storage.segment_writer import SegmentSettings
+    from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
@@ -687,7 +689,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, demo_bag: Path) -> Iterat
     json_log(directory / "weather.mcap")
     shutil.copyfile(demo_bag, directory / "cut.bag")
     os.truncate(directory / "cut.bag", demo_bag.stat().st_size // 8)
-    from hybridlog_storage.segment_writer import SegmentSettings
+    from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     with hl.open(directory / "store", create=True) as store:
         several = SegmentSettings(segment_size=2 << 20, chunk_size=64 << 10)
@@ -1114,9 +1116,12 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
 def test_the_specification_names_what_there_is() -> None:
     from dataclasses import fields
 
-    from hybridlog.indexing import ARRAY_LIMIT
-    from hybridlog_storage import chunk_table, directory, index_state, journal, segment_format
+    from hybridlog.index.indexing import ARRAY_LIMIT
+    from hybridlog_storage import journal
     from hybridlog_storage.catalog import CATALOG, ChannelStats, RecordingEntry
+    from hybridlog_storage.disk import directory
+    from hybridlog_storage.mongo import index_state
+    from hybridlog_storage.segments import chunk_table, segment_format
     from hybridlog_storage.settings import FORMAT, StoreSettings
 
     text = (DOCS / "format.md").read_text("utf-8")

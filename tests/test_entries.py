@@ -33,12 +33,12 @@ from hybridlog.maintenance.opening import current_entry, describe_now, repair_on
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage import catalog, journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.journal import JOURNAL, Journal
 from hybridlog_storage.messages import Batch, Channel, Schema
-from hybridlog_storage.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 TOPICS = [Channel(topic, "ros1", TEXT) for topic in ("/a", "/b", "/c")]

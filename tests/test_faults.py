@@ -30,12 +30,12 @@ from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
-from hybridlog_storage.index_state import RECORDINGS, STORE, IndexState, Through
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState, Through
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent
 from tests.storage.chunk_entries import chunk_entries
 
@@ -1068,7 +1068,7 @@ def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
     path: Path, short: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another process opens the store after the directory is made, before it is locked."""
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
 
     make = StoreDirectory.new_recording
 

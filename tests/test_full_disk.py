@@ -14,9 +14,9 @@ import pytest
 import hybridlog as hl
 from hybridlog import session
 from hybridlog.maintenance.opening import repair_on_open
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DiskFullError
-from hybridlog_storage.files import System
 from hybridlog_storage.messages import Channel
 from tests.cli.within import answer
 

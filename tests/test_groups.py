@@ -11,9 +11,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.sharing import make_shared
 from hybridlog_storage.settings import StoreSettings, write_settings
-from hybridlog_storage.sharing import make_shared
 from tests.cli.running import wait_for
 from tests.other_user import User, needs_root, open_place
 

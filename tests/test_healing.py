@@ -33,7 +33,6 @@ from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Part
-from hybridlog_storage.database import Database
 from hybridlog_storage.errors import (
     ConnectionLostError,
     DatabaseError,
@@ -41,7 +40,8 @@ from hybridlog_storage.errors import (
     ResourceError,
     StoreError,
 )
-from hybridlog_storage.mongod import find_mongod
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.mongod import find_mongod
 from tests.cli.running import run
 from tests.damage import WAYS
 

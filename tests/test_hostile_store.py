@@ -20,9 +20,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
-from hybridlog_storage import mongod_keeper
 from hybridlog_storage.errors import HybridlogError, StoreError
-from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.mongo import mongod_keeper
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.cli.running import run, wait_for
 
 OLD = 1_000_000_000  # a time of reading that any reading changes
@@ -421,7 +421,7 @@ def test_a_record_leads_to_no_socket_of_another_store(
     import socket
     import tempfile
 
-    from hybridlog_storage.socket_directory import new_socket
+    from hybridlog_storage.disk.socket_directory import new_socket
 
     with tempfile.TemporaryDirectory(prefix="hl-", dir="/tmp") as name:
         monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", name)

@@ -26,10 +26,10 @@ from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog.session import Session
 from hybridlog.tables.folders import files_of
-from hybridlog_storage import directory as directory_module
-from hybridlog_storage import files, journal
-from hybridlog_storage.database import Database
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage import journal
+from hybridlog_storage.disk import directory as directory_module
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
     DatabaseError,
     HybridlogError,
@@ -38,10 +38,11 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.faults import logs
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"

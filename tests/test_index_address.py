@@ -12,7 +12,7 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog import store as store_module
-from hybridlog_storage import mongod_keeper
+from hybridlog_storage.mongo import mongod_keeper
 from tests.cli.running import run
 from tests.faults import logs
 

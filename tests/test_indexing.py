@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.indexing import ChunkIndexer, Documents
-from hybridlog_storage.chunk import StoredChunk
+from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.segments.chunk import StoredChunk
 
 STAMPED = (
     b"std_msgs/Header header\nint16 value\nint16[] values\n" + b"=" * 80 + b"\n"

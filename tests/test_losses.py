@@ -7,7 +7,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.losses import Cause, Ledger, joined
+from hybridlog.record.losses import Cause, Ledger, joined
 
 SECOND = 1_000_000_000
 notes = st.lists(

@@ -15,10 +15,10 @@ import pymongo
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage import topic_places
-from hybridlog_storage.database import Database
 from hybridlog_storage.errors import DatabaseError
-from hybridlog_storage.topic_places import OWN_COLLECTIONS, SHARED, TOPICS
+from hybridlog_storage.mongo import topic_places
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.topic_places import OWN_COLLECTIONS, SHARED, TOPICS
 from tests.many_topics import BASE, handles, mongod_of, topic, write_log
 
 FEW = 12

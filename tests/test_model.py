@@ -48,12 +48,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import hybridlog as hl
 from hybridlog.query.query import Query
 from hybridlog.query.topics import matcher
-from hybridlog.recorder import RecordOptions
+from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TimeError, TopicError
-from hybridlog_storage.index_state import IndexState, Through
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.index_state import IndexState, Through
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.storage.chunk_entries import chunk_entries
 
 BEGIN = 1_700_000_000 * 10**9

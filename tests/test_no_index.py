@@ -14,11 +14,11 @@ import hybridlog as hl
 from hybridlog.maintenance import index
 from hybridlog.maintenance.index import catch_up
 from hybridlog.query.topics import matcher
-from hybridlog_storage import topic_places
 from hybridlog_storage.catalog import CATALOG
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
+from hybridlog_storage.mongo import topic_places
+from hybridlog_storage.mongo.collection_names import collection_of
 from tests.cli.running import run
 from tests.many_topics import topic, write_log
 

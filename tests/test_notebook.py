@@ -16,9 +16,9 @@ from mcap.writer import Writer
 from PIL import Image
 
 import hybridlog as hl
+from hybridlog.drawing.notebook import message_html, recordings_html, shown
 from hybridlog.drawing.pixels import SIDE, thumbnail
 from hybridlog.message import Message
-from hybridlog.notebook import message_html, recordings_html, shown
 from hybridlog_storage.errors import TopicError
 from tests.test_snapshot import summary
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage import files
-from hybridlog_storage.database import Database
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests.power import PowerCut
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"

@@ -33,7 +33,7 @@ from hybridlog.query import chunk_scan
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.query import Query
-from hybridlog.recorder import RecordOptions
+from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -47,7 +47,7 @@ from hybridlog_storage.errors import (
     WhereError,
 )
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
 from tests.other_user import User, open_place
 

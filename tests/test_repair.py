@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.test_identity import COUNT, make_log, payload
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"

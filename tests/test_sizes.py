@@ -14,10 +14,10 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.topics import matcher
-from hybridlog_storage import topic_places
 from hybridlog_storage.catalog import CATALOG, Catalog
-from hybridlog_storage.database import CollectionStats, Database
-from hybridlog_storage.topic_places import SHARED
+from hybridlog_storage.mongo import topic_places
+from hybridlog_storage.mongo.database import CollectionStats, Database
+from hybridlog_storage.mongo.topic_places import SHARED
 from tests.cli.running import run
 from tests.many_topics import BASE
 

@@ -18,8 +18,8 @@ from hybridlog_storage.errors import (
     StoreError,
     WithoutMongoError,
 )
-from hybridlog_storage.index_state import IndexState
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
 from benchmarks.usage import wait_for_mongods, working_below
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog.live import LiveRecording
@@ -49,7 +49,7 @@ class Hybridlog(Backend):
 
     @classmethod
     def check(cls) -> None:
-        from hybridlog_storage.mongod import find_mongod
+        from hybridlog_storage.mongo.mongod import find_mongod
 
         try:
             find_mongod()

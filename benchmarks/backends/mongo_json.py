@@ -16,7 +16,7 @@ from benchmarks.backends.conversion import INSERTED_AT
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.requirements import need
 from benchmarks.backends.server import Server
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from bson.raw_bson import RawBSONDocument
@@ -256,7 +256,7 @@ def _keys(group: tuple[str, ...]) -> list[tuple[str, int]]:
 
 def _program() -> str:
     from hybridlog_storage.errors import MissingDependencyError
-    from hybridlog_storage.mongod import find_mongod
+    from hybridlog_storage.mongo.mongod import find_mongod
 
     try:
         return str(find_mongod())

@@ -18,7 +18,7 @@ from benchmarks.backends.conversion import T, without_nul
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.requirements import need
 from benchmarks.backends.server import Server
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from psycopg import Connection, Copy

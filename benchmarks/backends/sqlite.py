@@ -14,7 +14,7 @@ from benchmarks.backends.base import BackendFailedError, BackendMissingError
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.requirements import need
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel

@@ -24,7 +24,7 @@ from benchmarks.questions.base import (
     whole_minutes,
     windows_before,
 )
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     import pandas as pd

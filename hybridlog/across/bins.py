@@ -16,8 +16,8 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import FieldTypes
 from hybridlog.schema.arrow_types import is_number, is_time
 from hybridlog.schema.summary import Totals
-from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.times import placed
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hybridlog.choice import Choice
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost
 from hybridlog.cli.completion import complete_recording, complete_topic
@@ -18,6 +17,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output import notes
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
+from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from hybridlog.cli.query_options import recordings_of
 from hybridlog.cli.signals import if_stopped
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
     from hybridlog.maintenance.report import CompactedTopic
+    from hybridlog.query.choice import Choice
 
 
 @click.command()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from click.shell_completion import ShellComplete
 
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
 
 VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
 """Environment variable in which a shell asks for completions."""
@@ -116,7 +116,7 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
 
 def _store(context: click.Context) -> StoreDirectory:
     from hybridlog.store import store_path
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
 
     value: Path | None = context.params.get("store")
     # The shell has not expanded the tilde of the line that is being completed.
@@ -142,7 +142,7 @@ def _snapshot(directory: StoreDirectory) -> Snapshot:
 
     from hybridlog.entries import summary_of
     from hybridlog.maintenance.opening import open_catalog, snapshot_of
-    from hybridlog.running import RunningRecording
+    from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import UNFINISHED
 
     with closing(open_catalog(directory)) as catalog:

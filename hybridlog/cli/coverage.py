@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.losses import Cause, in_words
+from hybridlog.record.losses import Cause, in_words
 from hybridlog.wording import counted
 
 if TYPE_CHECKING:

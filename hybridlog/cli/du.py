@@ -12,7 +12,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
 
 
 @click.command()

@@ -17,13 +17,13 @@ from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.write_answer import write_answer
 from hybridlog.export.slices import Front
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
-from hybridlog_storage.unfinished import undone
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
 
 _EXACT = {"mcap", "bag"}

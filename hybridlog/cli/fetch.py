@@ -24,7 +24,7 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 

@@ -16,7 +16,7 @@ from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
 
 
 @click.command("import")

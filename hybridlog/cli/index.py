@@ -19,8 +19,8 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hybridlog.choice import Choice
-    from hybridlog.field_indexes import FieldIndex
+    from hybridlog.index.field_indexes import FieldIndex
+    from hybridlog.query.choice import Choice
 
 _FIELDS = click.argument(
     "field",

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridlog.choice import Choice
 from hybridlog.cli import coverage, options, output, recording_summary, sizes_table
 from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
-from hybridlog.losses import line_of, losses_of
+from hybridlog.query.choice import Choice
+from hybridlog.record.losses import line_of, losses_of
 from hybridlog.wording import MOST_LISTED
 from hybridlog_storage.errors import SegmentError
 
@@ -264,7 +264,7 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
         return [("coverage", words)]
     from hybridlog.cli.sparkline import bar
     from hybridlog.drawing.coverage import lost_parts
-    from hybridlog.losses import extent_of
+    from hybridlog.record.losses import extent_of
 
     return [("coverage", bar(lost_parts(entry, extent_of(entry), _LETTERS))), ("", words)]
 
@@ -272,7 +272,7 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
 def _densities(store: Store, entry: RecordingEntry) -> Density | None:
     """Messages of each topic over time; None for a recording without any, or a damaged one."""
     from hybridlog.drawing.density import density
-    from hybridlog.losses import extent_of
+    from hybridlog.record.losses import extent_of
 
     begin, end = extent_of(entry)
     if begin == end:
@@ -313,7 +313,7 @@ def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
 def _channel_row(
     channel: ChannelEntry, *, is_decoded: bool, narrow: bool, short: bool
 ) -> list[str]:
-    from hybridlog.latching import depth_of
+    from hybridlog.query.latching import depth_of
     from hybridlog_storage.messages import REDUCED, SUPPLIED, Channel
 
     stats = channel.stats

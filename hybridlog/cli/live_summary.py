@@ -10,7 +10,7 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.live_table import closing_rows
-from hybridlog.losses import Cause, line_of
+from hybridlog.record.losses import Cause, line_of
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.live.policy import Rule
     from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
     from hybridlog.live.sources.base import LiveSource
-    from hybridlog.recorder import RecordReport
+    from hybridlog.record.recorder import RecordReport
 
 _MAX_ROWS = 10  # of the ledger; `losses` prints all
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog.cli import output
-from hybridlog.losses import Cause
+from hybridlog.record.losses import Cause
 from hybridlog.wording import listed
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from hybridlog.live.recorder import RecorderState
     from hybridlog.live.statistics import TopicState
-    from hybridlog.recorder import RecordReport
+    from hybridlog.record.recorder import RecordReport
 
 _HEADINGS = ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost")
 _SPARE = ("jitter ms", "usual", "MB/s", "thinned")  # left out first where there is little room

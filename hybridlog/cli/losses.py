@@ -11,10 +11,10 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
-from hybridlog.losses import losses_of
+from hybridlog.record.losses import losses_of
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog_storage.catalog import RecordingEntry
 
 

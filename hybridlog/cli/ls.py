@@ -14,7 +14,7 @@ from hybridlog.cli.query_options import recordings_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog_storage.summary import RecordingSummary
 
 

@@ -18,7 +18,7 @@ from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
 
 _PLAY = "`hybridlog serve` plays to the one in the browser"

@@ -13,7 +13,7 @@ from hybridlog_storage.errors import WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
-    from hybridlog_storage.recovery import Recovered
+    from hybridlog_storage.segments.recovery import Recovered
 
 _MAX_LISTED = 3  # recordings that are reported one by one
 

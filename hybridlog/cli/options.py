@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import click
 
-from hybridlog.choice import Choice
 from hybridlog.cli.completion import (
     complete_condition,
     complete_recording,
@@ -18,6 +17,7 @@ from hybridlog.cli.completion import (
     complete_topic,
     complete_type,
 )
+from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 
 PATH: Final = click.Path(readable=False, path_type=Path)

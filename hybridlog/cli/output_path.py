@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
+from hybridlog_storage.disk.unfinished import is_published, undone
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.unfinished import is_published, undone
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:

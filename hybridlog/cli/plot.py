@@ -22,9 +22,9 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.choice import Choice
     from hybridlog.drawing.lines import Line
     from hybridlog.drawing.series import Series
+    from hybridlog.query.choice import Choice
 
 _FORMATS = ("png", "svg", "pdf", "html")
 _WIDTH, _HEIGHT = 1200, 400

@@ -16,7 +16,7 @@ from hybridlog.cli.query_options import asked
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.query.query import Query
 

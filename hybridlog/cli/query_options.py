@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from hybridlog.choice import Choice
+from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from hybridlog.cli.query_options import asked
 from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
 
 
 @click.command()

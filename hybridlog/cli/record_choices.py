@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from hybridlog.store import Store
-    from hybridlog_storage.segment_writer import SegmentSettings
+    from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ def segment_settings(choices: RecordChoices) -> SegmentSettings:
     Raises:
         UsageError: The chunk size is no size.
     """
-    from hybridlog_storage.segment_writer import SegmentSettings
+    from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     return SegmentSettings(
         chunk_size=output.parse_size(choices.chunk_size),

@@ -18,7 +18,7 @@ from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
 from hybridlog.cli.recording_summary import with_misfits
 from hybridlog.cli.signals import if_stopped
-from hybridlog.losses import losses_of
+from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
     DatabaseError,
@@ -33,7 +33,7 @@ from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 if TYPE_CHECKING:
     from hybridlog.cli.progress import Bar
     from hybridlog.query.topics import TopicMatcher
-    from hybridlog.recorder import RecordOptions, RecordReport
+    from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.sources.base import Source
     from hybridlog.sources.find import Found, Log
     from hybridlog.store import Store
@@ -175,7 +175,7 @@ class LogRecorder:
     def _record_one(
         self, store: Store, log: Log, progress: Callable[[int, int], None]
     ) -> RecordReport:
-        from hybridlog.recorder import RecordOptions
+        from hybridlog.record.recorder import RecordOptions
 
         choices = self._choices
         with anywhere():
@@ -232,8 +232,8 @@ def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
             raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
     if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
-        from hybridlog_storage.database import Database
-        from hybridlog_storage.index_state import IndexState
+        from hybridlog_storage.mongo.database import Database
+        from hybridlog_storage.mongo.index_state import IndexState
 
         with Database.connect(with_password(choices.mongo)) as database:
             check(IndexState(database).mark(), {"id": ""}, database)

@@ -15,7 +15,7 @@ from hybridlog.cli.query_options import recordings_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
 
 
 @click.command()

@@ -19,7 +19,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog_storage.summary import RecordingSummary
 
 _MOST_ROWS = 20

@@ -15,7 +15,7 @@ from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog.query.question import RecordedChannel
     from hybridlog.store import Store
 

@@ -14,7 +14,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     Raises:
         StoreError: It is being written, or is no segment of a store.
     """
-    from hybridlog_storage.segment_reader import SegmentReader
+    from hybridlog_storage.segments.segment_reader import SegmentReader
 
     stem = path.name.split(".")[0]
     if path.name.endswith(".open"):
@@ -81,7 +81,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
 
 def _check_magic(path: Path) -> None:
     """Tell another file from a damaged segment."""
-    from hybridlog_storage.mcap_scan import MAGIC
+    from hybridlog_storage.mcap.mcap_scan import MAGIC
 
     try:
         with path.open("rb") as file:

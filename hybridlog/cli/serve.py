@@ -17,9 +17,9 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
     from hybridlog.playback.played import PlayedLog
     from hybridlog.playback.server import PlaybackServer
+    from hybridlog.query.choice import Choice
 
 _MAX_SHOWN = 5  # topics
 

@@ -91,7 +91,7 @@ def install() -> None:
 
 def undo_unfinished() -> None:
     """Take back what a command has not completed when it is stopped, such as files."""
-    unfinished = sys.modules.get("hybridlog_storage.unfinished")
+    unfinished = sys.modules.get("hybridlog_storage.disk.unfinished")
     if unfinished is not None:
         unfinished.undo_unfinished()
 

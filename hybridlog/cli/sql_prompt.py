@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli.output import note, say
 from hybridlog.cli.sql_answer import print_remarks, write_answer
-from hybridlog.consent import state_directory
+from hybridlog.index.consent import state_directory
 from hybridlog.sql.completion import DELIMITERS, candidates
 from hybridlog.sql.memory_limit import limited_memory
 from hybridlog_storage.errors import HybridlogError

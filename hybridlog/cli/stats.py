@@ -18,8 +18,8 @@ from hybridlog.cli.query_options import asked, parse_fields
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.choice import Choice
     from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.choice import Choice
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 

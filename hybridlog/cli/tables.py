@@ -16,7 +16,7 @@ from hybridlog_storage.errors import TopicError
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
     from hybridlog.query.question import RecordedChannel
     from hybridlog.store import Store
 

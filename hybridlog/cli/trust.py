@@ -18,7 +18,7 @@ def command(*, store: Path | None, forget: bool) -> None:
     Until then, commands do not connect to it: a user's own stores only are trusted. The store
     does not contain the password: see HYBRIDLOG_MONGO_PASSWORD.
     """
-    from hybridlog import consent
+    from hybridlog.index import consent
     from hybridlog.store import store_path
     from hybridlog_storage.settings import is_uri, read_settings
 

@@ -14,7 +14,7 @@ from hybridlog.cli.query_options import named_or_chosen
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
+    from hybridlog.query.choice import Choice
 
 
 @click.command()

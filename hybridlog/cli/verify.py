@@ -17,8 +17,8 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from hybridlog.choice import Choice
     from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.choice import Choice
 
 
 @click.command()

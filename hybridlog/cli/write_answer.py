@@ -153,7 +153,7 @@ def _write_pictures(query: Query, form: str, target: Target, progress: Progress)
         PayloadError: no image is readable.
         DefinitionError: the same.
     """
-    from hybridlog.arrays import IMAGES
+    from hybridlog.arrays.message_arrays import IMAGES
     from hybridlog.drawing.images import picture
     from hybridlog.export.pictures import open_pictures_writer
 

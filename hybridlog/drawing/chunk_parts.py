@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.segments.chunk_table import ChunkTable
 
 _CHANNELS = 1 << 16  # ids of channels
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.losses import Cause, losses_of
+from hybridlog.record.losses import Cause, losses_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from hybridlog.arrays import COMPRESSED_IMAGES, IMAGES, depth_picture, to_numpy
+from hybridlog.arrays.message_arrays import COMPRESSED_IMAGES, IMAGES, depth_picture, to_numpy
 from hybridlog.drawing.pixels import pixels, png
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 
@@ -67,7 +67,7 @@ def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] =
     `uint16` are spread from least to greatest.
 
     Args:
-        message: Its type is one of `hybridlog.arrays.IMAGES`.
+        message: Its type is one of `hybridlog.arrays.message_arrays.IMAGES`.
         raw: False for a picture that every browser shows, and that is for the eye: formats
             which browsers lack are encoded anew, and 16 bits are spread over 8.
         form: Format for what is encoded.

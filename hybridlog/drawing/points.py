@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.arrays import attributes, plain_type, to_numpy
-from hybridlog.point_arrays import POINT_MAKERS
+from hybridlog.arrays.message_arrays import attributes, plain_type, to_numpy
+from hybridlog.arrays.point_arrays import POINT_MAKERS
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:

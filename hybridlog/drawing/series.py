@@ -16,8 +16,8 @@ from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
 from hybridlog.schema.kinds import NUMERIC, element_of
 from hybridlog.wording import listed
-from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.ordering import run_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa

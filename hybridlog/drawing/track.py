@@ -12,8 +12,8 @@ import numpy as np
 from hybridlog.frames.names import FIELD
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
-from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.ordering import run_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,14 +17,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hybridlog.export.base import FileWriter, Target, destination, failures
 from hybridlog.export.mcap import source_metadata
 from hybridlog.schema.completion import with_nested
+from hybridlog_storage.disk.unfinished import beside, scratch_directory
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.unfinished import beside, scratch_directory
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Channel, Schema
+    from hybridlog_storage.segments.attachments import Attachment
 
 _TIME_LIMIT = 2**32 * 10**9
 _LARGEST_DEFINITION = 256 << 10

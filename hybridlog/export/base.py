@@ -14,16 +14,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
 
+from hybridlog_storage.disk.unfinished import Unfinished, beside
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, UsageError
-from hybridlog_storage.unfinished import Unfinished, beside
 
 if TYPE_CHECKING:
     from types import TracebackType
 
     import pyarrow as pa
 
-    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Buffer, Channel
+    from hybridlog_storage.segments.attachments import Attachment
 
 Target: TypeAlias = "str | os.PathLike[str] | BinaryIO"
 """Target of a writer: a path, or a binary stream, which stays open."""

@@ -9,13 +9,13 @@ from mcap.writer import CompressionType, Writer
 
 from hybridlog.export.base import FileWriter, Sink, Target
 from hybridlog.schema.completion import with_nested
-from hybridlog_storage.segment_format import OUR_NAMES
+from hybridlog_storage.segments.segment_format import OUR_NAMES
 
 if TYPE_CHECKING:
     from mcap.records import AttachmentIndex, Statistics
 
-    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Channel, Schema
+    from hybridlog_storage.segments.attachments import Attachment
 
 _ChannelKey = tuple[str, str, int, tuple[tuple[str, str], ...]]
 

@@ -30,8 +30,8 @@ import pyarrow.compute as pc
 
 from hybridlog.export.base import FileWriter, Sink, Target, failures
 from hybridlog.schema.arrow_types import converted, is_bytes, is_list, is_numeric, is_text, is_time
+from hybridlog_storage.disk.unfinished import scratch_directory
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.unfinished import scratch_directory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.export.base import BatchWriter, FileWriter, Sink, Target, failures
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.disk.unfinished import beside
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.unfinished import beside
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Buffer, Channel

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.user_directories import user_directory
+from hybridlog_storage.disk.user_directories import user_directory
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

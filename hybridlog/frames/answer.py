@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from hybridlog.frames.builder import Block, TableBuilder
 from hybridlog.frames.names import is_summary, own_columns, summary_of, tag_columns
-from hybridlog.indexing import rows_by_channel
+from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
 from hybridlog.schema.column import STAMP

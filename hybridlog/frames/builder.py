@@ -11,7 +11,7 @@ from hybridlog.frames.columns import chunked, flat, in_order, with_summaries
 from hybridlog.frames.names import FIELD, TAG, arranged, free_name
 from hybridlog.schema.arrow_columns import TIME, numbers
 from hybridlog.schema.arrow_types import common_type, converted
-from hybridlog_storage.row_order import order_of
+from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

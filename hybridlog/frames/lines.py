@@ -12,7 +12,7 @@ from hybridlog.frames.answer import Decoder
 from hybridlog.frames.builder import Block
 from hybridlog.frames.columns import flat, summary_array, with_summaries
 from hybridlog.frames.names import arranged, free_name, summary_of
-from hybridlog.indexing import rows_by_channel
+from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import below, values_array
 from hybridlog.schema.arrow_types import plain_values

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.arrays import plain_type
+from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.arrays.point_arrays import scans_of
 from hybridlog.frames.answer import FIXED, to_arrow
-from hybridlog.point_arrays import scans_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -18,9 +18,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.socket_directory import is_our_socket, new_socket
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
-from hybridlog_storage.socket_directory import is_our_socket, new_socket
 from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:

@@ -36,8 +36,8 @@ from hybridlog.live.recording import (
 from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
-from hybridlog.losses import Cause
-from hybridlog.marks import mark_channel, mark_payload
+from hybridlog.record.losses import Cause
+from hybridlog.record.marks import mark_channel, mark_payload
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
@@ -47,9 +47,9 @@ from hybridlog_storage.messages import Channel
 if TYPE_CHECKING:
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
-    from hybridlog.recorder import RecordReport
+    from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
-    from hybridlog_storage.segment_writer import SegmentSettings
+    from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 _LOOK_S = 1.0
 _JUMP_S = 0.5

@@ -21,29 +21,29 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog.capture import Backpressure, Capture
-from hybridlog.index_writer import INTERVAL_S
+from hybridlog.index.index_writer import INTERVAL_S
 from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
 from hybridlog.live.fair_semaphore import FairSemaphore
 from hybridlog.live.frozen_objects import frozen_objects
 from hybridlog.live.memory_reservation import MemoryReservation
 from hybridlog.live.policy import SMALL_BYTES
-from hybridlog.losses import Cause, Ledger
-from hybridlog.processors import processors
-from hybridlog.recorder import RecordReport
-from hybridlog_storage.copying import COPIED_AT_ONCE
+from hybridlog.record.capture import Backpressure, Capture
+from hybridlog.record.losses import Cause, Ledger
+from hybridlog.record.recorder import RecordReport
+from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
-from hybridlog_storage.segment_format import LOSSES_METADATA, json_metadata
-from hybridlog_storage.segment_writer import AT_WORK, PACKERS, SegmentSettings
+from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_writer import AT_WORK, PACKERS, SegmentSettings
+from hybridlog_storage.threads import processors
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from hybridlog.index_writer import IndexTarget
+    from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.catalog import Catalog
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
 _LARGE = 1 << 17  # bytes from which a payload is copied into its chunk at once

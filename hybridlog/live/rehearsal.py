@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.latching import depth_of, publisher_of
 from hybridlog.live.snapshots import Trigger
 from hybridlog.query.answers.remarks import completeness
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.types import check
 from hybridlog.query.question import Question

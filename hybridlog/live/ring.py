@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import NamedTuple
 
-from hybridlog.latching import depth_of, publisher_of
+from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog_storage.messages import Channel
 
 _MAX_LATCHED = 32 << 20  # payload bytes of one publisher; its last message always stays

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from hybridlog.live.sources.base import Sink
-from hybridlog.losses import Cause
+from hybridlog.record.losses import Cause
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hybridlog.live.ring import BufferedMessage, Ring
-from hybridlog.losses import Cause, Ledger
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import numbers_at, to_bool
 from hybridlog.query.predicate.types import check
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
+from hybridlog.record.losses import Cause, Ledger
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -33,7 +33,7 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from hybridlog.live.recording import LiveRecording
     from hybridlog.query.predicate.tree import Predicate, Test
-    from hybridlog.recorder import RecordReport
+    from hybridlog.record.recorder import RecordReport
     from hybridlog_storage.messages import Channel
 
 _MAX_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into

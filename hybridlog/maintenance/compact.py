@@ -25,11 +25,12 @@ from hybridlog.payloads import files as payload_files
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
 from hybridlog.tables.layout import table_schema_of, topic_folder
-from hybridlog_storage import durability, files, journal
-from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage import journal
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import DefinitionError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -42,11 +43,11 @@ if TYPE_CHECKING:
     from hybridlog.payloads.columns import TopicColumns
     from hybridlog.payloads.writer import TopicWriter
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import PayloadFile
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.chunk_table import ChunkTable
 
 _MIN_SHARE = 0.5  # of the sequences in the bytes of a topic's messages
 _MIN_BYTES = 128 << 10  # of a topic's messages: the footer of a file takes some kilobytes

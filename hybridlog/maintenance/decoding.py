@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.entries import take_inventory
-from hybridlog.indexing import ChunkIndexer
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.opening import put_entry
 from hybridlog.payloads.contents import open_segment
 from hybridlog_storage.catalog import stamps_of
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
 
 
 def decode_again(

@@ -15,24 +15,25 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import finish_renaming, put_entry
-from hybridlog.marks import mark_channel, mark_payload
-from hybridlog_storage import files, journal
-from hybridlog_storage.chunk import pack
-from hybridlog_storage.chunk_builder import ChunkBuilder
-from hybridlog_storage.compression import Compressor
-from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog.record.marks import mark_channel, mark_payload
+from hybridlog_storage import journal
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import StoreError, TimeError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.messages import Batch, Channel
-from hybridlog_storage.segment_file import SegmentFile
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segments.chunk import pack
+from hybridlog_storage.segments.chunk_builder import ChunkBuilder
+from hybridlog_storage.segments.compression import Compressor
+from hybridlog_storage.segments.segment_file import SegmentFile
+from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.chunk import PackedChunk
-    from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.segment_file import Sealed
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.segments.chunk import PackedChunk
+    from hybridlog_storage.segments.segment_file import Sealed
 
 
 def append(

@@ -13,16 +13,17 @@ from typing import TYPE_CHECKING
 from hybridlog.entries import Inventory, take_inventory
 from hybridlog.maintenance.opening import clear_away
 from hybridlog.payloads.layout import IN_PAYLOADS
-from hybridlog_storage import durability, files, journal
-from hybridlog_storage.directory import IMPORTING, LOCK_WAIT_S, PAYLOADS, payload_names
+from hybridlog_storage import journal
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import IMPORTING, LOCK_WAIT_S, PAYLOADS, payload_names
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL, Journal
-from hybridlog_storage.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_check import SegmentCheck
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import PayloadFile
 
 _PIECE = 8 << 20  # bytes copied at once

@@ -17,7 +17,7 @@ from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.catalog import decoded_rows
-from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     CatalogError,
     HeldError,
@@ -26,18 +26,18 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.index_state import NOTHING, Indexed, IndexState, Through
-from hybridlog_storage.topic_places import TopicPlaces
+from hybridlog_storage.mongo.index_state import NOTHING, Indexed, IndexState, Through
+from hybridlog_storage.mongo.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.topic_places import TopicPlace
+    from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.summary import RecordingSummary
-    from hybridlog_storage.topic_places import TopicPlace
 
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
@@ -364,8 +364,8 @@ def _index(
     progress: Progress | None,
 ) -> None:
     """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
-    from hybridlog.index_writer import INTERVAL_S, DocumentSender
-    from hybridlog.indexing import ChunkIndexer
+    from hybridlog.index.index_writer import INTERVAL_S, DocumentSender
+    from hybridlog.index.indexing import ChunkIndexer
 
     topics = tables.missing(directory, entry)
     writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)

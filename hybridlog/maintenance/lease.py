@@ -18,8 +18,8 @@ from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
 
 
 def place_of(directory: StoreDirectory) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def become_another(path: Path, mongo: str | None) -> None:
         UsageError: It names a MongoDB, and no other one is given.
         StoreError: It cannot be written.
     """
-    from hybridlog import consent
+    from hybridlog.index import consent
 
     settings = read_settings(path)
     if is_uri(settings.mongo) and mongo is None:

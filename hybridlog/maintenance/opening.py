@@ -24,9 +24,10 @@ from hybridlog.entries import (
 from hybridlog.payloads import files as payload_files
 from hybridlog.payloads.layout import PARTS
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage import durability, files, journal
+from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog
-from hybridlog_storage.directory import LOCK, REMOVED
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import LOCK, REMOVED
 from hybridlog_storage.errors import (
     CatalogError,
     DiskFullError,
@@ -36,16 +37,16 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.segment_file import sealed_name
+from hybridlog_storage.segments.segment_file import sealed_name
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import RepairReport
     from hybridlog_storage.catalog import Described, RecordingEntry
-    from hybridlog_storage.directory import Listing, StoreDirectory
+    from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.journal import JournalState
-    from hybridlog_storage.recovery import Recovered
-    from hybridlog_storage.segment_file import Sealed
+    from hybridlog_storage.segments.recovery import Recovered
+    from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.summary import RecordingSummary
 
 _OURS = frozenset({LOCK})
@@ -479,7 +480,7 @@ def finish_renaming(directory: StoreDirectory, label: str, state: JournalState |
 def _recover_segments(
     directory: StoreDirectory, label: str, listing: Listing, state: JournalState | None
 ) -> list[Recovered]:
-    from hybridlog_storage.recovery import recover_segment
+    from hybridlog_storage.segments.recovery import recover_segment
 
     path = directory.recording(label)
     log = Journal(path)
@@ -610,7 +611,7 @@ def describe_inventory(
     Raises:
         SegmentError: The recording cannot be identified.
     """
-    from hybridlog.indexing import ChunkIndexer
+    from hybridlog.index.indexing import ChunkIndexer
 
     if not inventory.id:
         raise SegmentError(

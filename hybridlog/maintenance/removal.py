@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import forget
 from hybridlog.maintenance.opening import announce_removal
-from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import TopicError
-from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.mongo.index_state import IndexState
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
 
 
 def remove(

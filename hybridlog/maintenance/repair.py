@@ -12,12 +12,12 @@ from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, rebuild
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
 from hybridlog.payloads.contents import open_segment
-from hybridlog_storage import durability, files
-from hybridlog_storage.directory import LOCK_WAIT_S
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError
-from hybridlog_storage.index_state import IndexState
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.recovery import rebuild_summary
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.recovery import rebuild_summary
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from hybridlog.entries import Inventory, Misfit
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hybridlog_storage.errors import DiskFullError
 
 if TYPE_CHECKING:
-    from hybridlog_storage.recovery import Recovered
+    from hybridlog_storage.segments.recovery import Recovered
 
 Progress = Callable[[str, int, int], None]
 """Called with the recording's label, bytes done and bytes in all."""

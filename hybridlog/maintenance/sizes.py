@@ -17,7 +17,7 @@ import numpy as np
 from hybridlog.maintenance.opening import put_again
 from hybridlog.tables.layout import type_prefix
 from hybridlog_storage.errors import CatalogError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.topic_places import TopicPlaces
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.topic_places import TopicPlaces
+    from hybridlog_storage.segments.chunk_table import ChunkTable
 
 
 _Key = TypeVar("_Key")

@@ -12,7 +12,7 @@ import numpy as np
 
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.tables.layout import PARTS, parts_folder, topics_of, type_prefix
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
 if TYPE_CHECKING:
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog.tables.writer import TableWriter
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.chunk_table import ChunkTable
 
 
 def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:

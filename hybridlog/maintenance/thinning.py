@@ -24,9 +24,9 @@ from hybridlog.payloads.layout import thinned_name
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.segment_check import SegmentCheck
-from hybridlog_storage.segment_format import MOVED_SIZE
-from hybridlog_storage.segment_thinning import thin
+from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_format import MOVED_SIZE
+from hybridlog_storage.segments.segment_thinning import thin
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.directory import StoreDirectory
-    from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 
 
 def drop(

@@ -8,28 +8,28 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hybridlog.entries import take_inventory
-from hybridlog.indexing import ChunkIndexer, Documents
+from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
-from hybridlog_storage.directory import LOCK, PAYLOADS
+from hybridlog_storage.disk.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
-from hybridlog_storage.index_documents import recording_key, with_prefix
-from hybridlog_storage.index_state import IndexState
-from hybridlog_storage.segment_check import SegmentCheck
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.topic_places import TopicPlaces
+from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.topic_places import TopicPlaces
+from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.database import Database
-    from hybridlog_storage.directory import StoreDirectory
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
-    from hybridlog_storage.segment_reader import ChunkPlace
-    from hybridlog_storage.topic_places import TopicPlace
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.topic_places import TopicPlace
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import ChunkPlace
 
 _REPAIR = "run `hybridlog repair`"
 _RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"

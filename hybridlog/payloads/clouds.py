@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.point_arrays import MAX_FIELDS, POINT_TYPES
+from hybridlog.arrays.point_arrays import MAX_FIELDS, POINT_TYPES
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
 from hybridlog.tables.layout import column_names
 

@@ -37,15 +37,15 @@ from hybridlog.tables.layout import OWN, OWN_COLUMNS
 from hybridlog.tables.rows import Messages, own_columns
 from hybridlog.tables.rows import Piece as TablePiece
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 NEEDED = ("t", "seq", "pub", "channel", "sequence", "ref", RECIPE, POINTS)
 """Our columns that messages are made from."""

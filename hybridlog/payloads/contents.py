@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog_storage import journal
-from hybridlog_storage.directory import PAYLOADS
+from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,11 +6,11 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
-from hybridlog_storage import durability, files
-from hybridlog_storage.directory import PAYLOADS, payload_names
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import PAYLOADS, payload_names
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.segment_file import sealed_name
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

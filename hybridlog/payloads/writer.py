@@ -20,9 +20,9 @@ from hybridlog.tables.layout import (
     topic_folder,
 )
 from hybridlog.tables.parquet_file import ParquetFileWriter
-from hybridlog_storage import durability, files
+from hybridlog_storage.disk import durability, files
 from hybridlog_storage.journal import PayloadFile
-from hybridlog_storage.row_order import order_of
+from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.latching import depth_of
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.latching import depth_of
 from hybridlog_storage.errors import TimeError, TopicError
 
 if TYPE_CHECKING:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.runs import run_starts
-from hybridlog_storage.segment_reader import place_of
+from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.segments.segment_reader import place_of
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.chunk_table import ChunkTable
-    from hybridlog_storage.segment_reader import ChunkPlace
+    from hybridlog_storage.segments.chunk_table import ChunkTable
+    from hybridlog_storage.segments.segment_reader import ChunkPlace
 
 
 class Chunk(NamedTuple):

@@ -17,7 +17,7 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.chunk_table import ChunkTable
+    from hybridlog_storage.segments.chunk_table import ChunkTable
 
     Times = Callable[[int, int], Mapping[int, NDArray[np.int64]]]
     """Log times of a chunk's messages by channel, ascending, by segment and number of the chunk."""

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from hybridlog.query.counters import Counters
-from hybridlog_storage.copying import interleave, joined
-from hybridlog_storage.distinct import distinct
-from hybridlog_storage.row_order import order_of
+from hybridlog_storage.disk.copying import interleave, joined
+from hybridlog_storage.ordering import distinct, order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches
 
@@ -32,9 +31,9 @@ if TYPE_CHECKING:
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Clock, RecordedChannel, Span
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segment_reader import SegmentReader
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import SegmentReader
 
 _LOOK_AHEAD = 4
 _MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte

@@ -20,20 +20,20 @@ from hybridlog_storage.errors import (
     IndexChangedError,
     TopicError,
 )
-from hybridlog_storage.index_columns import KEY, key_columns
+from hybridlog_storage.mongo.index_columns import KEY, key_columns
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.index_version import GuardedIndex
+    from hybridlog.index.index_version import GuardedIndex
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.index_columns import KeyColumns
-    from hybridlog_storage.topic_places import TopicPlace
+    from hybridlog_storage.mongo.index_columns import KeyColumns
+    from hybridlog_storage.mongo.topic_places import TopicPlace
 
 _DOCUMENTS = 10_000
 """Documents in one answer of MongoDB."""

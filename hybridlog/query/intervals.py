@@ -20,8 +20,8 @@ from hybridlog.query.times import (
     parse_duration,
 )
 from hybridlog.schema.column import ranges
-from hybridlog_storage.distinct import run_starts
 from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:

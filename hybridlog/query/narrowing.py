@@ -16,12 +16,12 @@ import numpy as np
 
 from hybridlog.query.predicate.numbers import is_nan, is_number
 from hybridlog.query.predicate.tree import And, Compare, Member, Node, Value
-from hybridlog_storage.database import index_name
 from hybridlog_storage.errors import DatabaseError, WhereError
-from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.mongo.database import index_name
+from hybridlog_storage.mongo.index_state import IndexState
 
 if TYPE_CHECKING:
-    from hybridlog.field_indexes import FieldIndex
+    from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.query.ranges import Ranges
     from hybridlog.session import Session

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from hybridlog.choice import Choice
+from hybridlog.query.choice import Choice
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
@@ -48,13 +48,13 @@ if TYPE_CHECKING:
 
     from hybridlog.across.align import Aligned
     from hybridlog.attachments import Extras
-    from hybridlog.choice import During, Tags, Texts
     from hybridlog.message import Message
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.answers.lost import Lost
     from hybridlog.query.answers.match_times import MatchTimes
+    from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
@@ -92,7 +92,7 @@ class Query:
 
     def _repr_html_(self) -> str:
         """The question in a notebook; no message is read for it."""
-        from hybridlog.notebook import properties_html
+        from hybridlog.drawing.notebook import properties_html
 
         return properties_html("Query", self._described())
 
@@ -363,7 +363,7 @@ class Query:
         Raises:
             TopicError: no such recording exists, or none has the topic.
         """
-        from hybridlog.choosing import choose
+        from hybridlog.query.choosing import choose
 
         choice = Choice.of(names, tag=tag, has=has, type=type, during=during, where=where)
         chosen = choose(self.session, choice)

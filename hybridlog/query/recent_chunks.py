@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkKey
-    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 _MOST_BYTES = 32 << 20
 _ROW_BYTES = 44  # of a message's columns

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from hybridlog_storage.copying import joined
+from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import MAX_CHANNELS
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from mcap.records import Metadata
 
-    from hybridlog_storage.attachments import Attachment
     from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.segments.attachments import Attachment
 
 BATCH_BYTES = 2 << 20
 """Payload bytes at which a source closes a batch; a single payload may exceed it."""

@@ -20,10 +20,8 @@ from hybridlog.sources.base import (
     cannot_open,
 )
 from hybridlog.wording import listed
-from hybridlog_storage.attachments import Attachment, FileHandle
-from hybridlog_storage.distinct import distinct
 from hybridlog_storage.errors import SegmentError, SourceError
-from hybridlog_storage.mcap_scan import (
+from hybridlog_storage.mcap.mcap_scan import (
     MAGIC,
     ChunkContent,
     End,
@@ -35,6 +33,8 @@ from hybridlog_storage.mcap_scan import (
     scan,
 )
 from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
+from hybridlog_storage.ordering import distinct
+from hybridlog_storage.segments.attachments import Attachment, FileHandle
 from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:

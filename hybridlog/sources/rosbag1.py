@@ -47,10 +47,10 @@ from hybridlog.sources.rosbag1_records import (
     parse_header,
 )
 from hybridlog.wording import listed
-from hybridlog_storage.compression import is_implausible
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.mcap_content import MIN_RECORDS
+from hybridlog_storage.mcap.mcap_content import MIN_RECORDS
 from hybridlog_storage.messages import MAX_CHANNELS, MAX_PAYLOAD, Batch, Channel, Schema
+from hybridlog_storage.segments.compression import is_implausible
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.sources.base import Damage, cannot_open
 from hybridlog.sources.rosbag2_metadata import MAX_BYTES, NAME, BagMetadata, parse_metadata
-from hybridlog.yaml_values import YamlError
+from hybridlog.sources.yaml_values import YamlError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import PureWindowsPath
 
-from hybridlog.yaml_values import YamlError, parse_yaml
+from hybridlog.sources.yaml_values import YamlError, parse_yaml
 
 NAME = "metadata.yaml"
 

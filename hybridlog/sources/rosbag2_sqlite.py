@@ -24,8 +24,8 @@ from hybridlog.sources.base import (
 )
 from hybridlog.sources.rosbag2_metadata import parse_metadata
 from hybridlog.sources.spool import copy_start
+from hybridlog.sources.yaml_values import YamlError
 from hybridlog.wording import listed
-from hybridlog.yaml_values import YamlError
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, BinaryIO
 import zstandard
 
 from hybridlog.sources.base import cannot_open
+from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import NO_SPACE, SourceError
-from hybridlog_storage.unfinished import undone
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,13 +10,13 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Final, TypeVar
 
-from hybridlog.processors import processors
 from hybridlog_storage.errors import (
     MissingDependencyError,
     ResourceError,
     UsageError,
 )
 from hybridlog_storage.stopping import at_safe_points, safe_point
+from hybridlog_storage.threads import processors
 
 MEMORY: Final = 1 << 30
 """Default limit of DuckDB's memory, bytes."""

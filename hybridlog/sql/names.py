@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from hybridlog.tables.layout import column_names
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.mongo.collection_names import collection_of
 
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""

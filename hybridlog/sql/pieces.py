@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.losses import lost_spans
 from hybridlog.query.question import RecordedChannel
+from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
 from hybridlog.sql.columns import whole_message
 from hybridlog.sql.counts import Paths, ScanCounts
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog.tables.reader import TablePart, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
-    from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
 _FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.marks import MARKS
+from hybridlog.record.marks import MARKS
 from hybridlog.sql.counts import ScanCounts
 from hybridlog_storage.catalog import ChannelStats
 

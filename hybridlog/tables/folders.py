@@ -34,7 +34,7 @@ from hybridlog.tables.parquet_file import (
     ParquetFileReader,
     ParquetFileWriter,
 )
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
 
 MAX_SHARED_ROWS: Final = 50_000

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog_storage.catalog import schema_hash
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry

@@ -52,10 +52,10 @@ from hybridlog.tables.layout import (
     type_prefix,
 )
 from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, unreadable
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.row_order import order_of
+from hybridlog_storage.ordering import order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
 

@@ -13,7 +13,7 @@ from hybridlog.tables.layout import STATES
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.chunk import StoredChunk
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 WHOLE, REDUCED, UNREADABLE = 0, 1, 2
 """Indexes in `STATES`."""

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.indexing import rows_by_channel
+from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.tables.layout import (
@@ -39,11 +39,11 @@ from hybridlog.tables.layout import (
     type_prefix,
 )
 from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
-from hybridlog_storage import files
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.disk import files
 from hybridlog_storage.messages import ORIGINAL_ENCODING
 from hybridlog_storage.messages import REDUCED as REDUCED_ENCODING
-from hybridlog_storage.row_order import order_of
+from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from hybridlog.tables.fields import FieldShape
     from hybridlog.tables.parquet_file import ParquetFileWriter
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 GROUP_ROWS: Final = 131_072
 """Maximum number of rows in a row group."""

@@ -119,7 +119,7 @@ class PageQuestion:
         return f"{_NO_NAME.sub('_', self.recording.label)}_{times}.mcap"
 
     def _extent(self) -> Span:
-        from hybridlog.losses import extent_of
+        from hybridlog.record.losses import extent_of
 
         return extent_of(self.recording)
 

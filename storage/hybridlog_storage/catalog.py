@@ -27,10 +27,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.chunk_table import ChunkTable
-from hybridlog_storage.distinct import run_starts
+from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
     CatalogError,
     DiskFullError,
@@ -40,7 +38,9 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_reader import ChunkPlace
+from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.segments.chunk_table import ChunkTable
+from hybridlog_storage.segments.segment_reader import ChunkPlace
 from hybridlog_storage.summary import (
     RecordingSummary,
     TopicType,
@@ -52,7 +52,7 @@ from hybridlog_storage.summary import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog_storage.open_segment import Flushed
+    from hybridlog_storage.segments.open_segment import Flushed
 
 CATALOG: Final = "catalog.sqlite"
 """Name of the file in the store's directory."""

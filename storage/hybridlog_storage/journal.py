@@ -24,8 +24,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from hybridlog_storage import durability, files
 from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import StoreError, unreadable
 
 JOURNAL: Final = "journal"

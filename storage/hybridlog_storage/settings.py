@@ -1,7 +1,7 @@
 """The settings of a store: its file `hybridlog.toml`.
 
 The file may come from another user, or be read by others of a group. So it holds no
-password, and a URI in it is only a proposal (`hybridlog.consent`).
+password, and a URI in it is only a proposal (`hybridlog.index.consent`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final, TypeGuard
 from urllib.parse import quote
 
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, UsageError, unreadable
 
 FORMAT: Final = 3
@@ -54,7 +54,7 @@ class StoreSettings:
         store_id: Random id of the store.
         mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None
             for the embedded one.
-        shared: Whether a group shares the store (`hybridlog_storage.sharing`).
+        shared: Whether a group shares the store (`hybridlog_storage.disk.sharing`).
         requires: Features that a reader must know to read the store.
         optional: Features that a reader may ignore.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.

@@ -1,4 +1,4 @@
-"""A thread pool that can be joined again after an interrupted wait.
+"""Processors, and a thread pool that can be joined again after an interrupted wait.
 
 If a signal handler raises an exception in `Thread.join`, Python before 3.13 marks the
 thread as ended, and the next join returns at once. Cleanup would then run while the thread
@@ -7,6 +7,7 @@ still writes.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -47,3 +48,10 @@ class Threads(ThreadPoolExecutor):
         with self._idle:
             self._left -= 1
             self._idle.notify_all()
+
+
+def processors() -> int:
+    """Processors available to this process if the system reports them, else all processors."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -14,7 +14,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 MS = 10**6
 BASE = 1_748_937_600 * 10**9

@@ -21,7 +21,7 @@ from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import UNKNOWN, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs, Said

@@ -14,7 +14,7 @@ from hybridlog.query.answers.lost import Lost
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
 
 BASE = 1_750_000_000 * 10**9

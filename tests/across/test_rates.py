@@ -35,7 +35,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.question import Part
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs

@@ -25,9 +25,9 @@ import pytest
 from benchmarks.backends import mongo_json, postgres, postgres_server, sqlite
 from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
 from benchmarks.backends.registry import BACKENDS
-from hybridlog_storage import mongod
-from hybridlog_storage.collection_names import collection_of
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.mongo import mongod
+from hybridlog_storage.mongo.collection_names import collection_of
 from tests.imports import ROOT
 from tests.test_faults import kill_mongod, wait_for
 

@@ -48,7 +48,7 @@ from benchmarks.questions.sqlite import SqliteUdfAsker, _time_diff, get_val
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import queries, reading
 from benchmarks.studies.runs import Context
-from hybridlog_storage.collection_names import collection_of
+from hybridlog_storage.mongo.collection_names import collection_of
 
 SMALL = queries.Settings(sessions=1, minutes=1.5, repetitions=2)
 SHORT = reading.Settings(seconds=2.0, repetitions=2)

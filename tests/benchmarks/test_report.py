@@ -19,7 +19,7 @@ from benchmarks.numbers import Spread
 from benchmarks.questions.askers import ASKERS
 from benchmarks.report import Report, escaped, write
 from benchmarks.samples import DAMAGE, Journal, Sample
-from hybridlog.processors import processors
+from hybridlog_storage.threads import processors
 from tests.imports import ROOT
 
 HEADER = {

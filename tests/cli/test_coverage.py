@@ -10,7 +10,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.live.control_server import ControlServer
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 from .running import run, wait_for
 

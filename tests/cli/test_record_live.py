@@ -27,7 +27,7 @@ from hybridlog.cli.app import app
 from hybridlog.cli.live_table import closing_rows, drawn, summary
 from hybridlog.live.recorder import RecorderState
 from hybridlog.live.statistics import TopicState
-from hybridlog.recorder import RecordReport
+from hybridlog.record.recorder import RecordReport
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import UsageError
 from tests.cli import odd_log

@@ -9,8 +9,8 @@ from typing import NoReturn
 import pytest
 
 from hybridlog.cli import signals
+from hybridlog_storage.disk.unfinished import beside
 from hybridlog_storage.stopping import at_safe_points, safe_point
-from hybridlog_storage.unfinished import beside
 
 
 def test_a_background_job_is_stopped_by_sigint_and_nohup_still_holds() -> None:

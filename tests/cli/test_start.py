@@ -228,7 +228,12 @@ def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     loaded = modules_of(*question, *wanted)
     assert not {name.split(".")[0] for name in loaded} & UNNEEDED
     ours = {name for name in loaded if name.split(".")[0] in {"hybridlog", "hybridlog_storage"}}
-    unneeded = ("hybridlog.columns", "hybridlog.frames", "hybridlog.indexing", "hybridlog.recorder")
+    unneeded = (
+        "hybridlog.columns",
+        "hybridlog.frames",
+        "hybridlog.index.indexing",
+        "hybridlog.record.recorder",
+    )
     assert not {name for name in ours if name.startswith(unneeded)}
     assert "numpy.ma" not in loaded
     # Each module costs about a millisecond.
@@ -241,7 +246,7 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
     # A table answers.
     unneeded = {"pandas", "pydantic", "rich", "pymongo", "rosbags"}
     assert {name.split(".")[0] for name in loaded} & unneeded == set()
-    assert not loaded & {"numpy.ma", "hybridlog.recorder", "hybridlog.index_writer"}
+    assert not loaded & {"numpy.ma", "hybridlog.record.recorder", "hybridlog.index.index_writer"}
 
 
 @pytest.mark.parametrize(

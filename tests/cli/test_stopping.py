@@ -16,7 +16,7 @@ from urllib.parse import quote
 import pytest
 
 from hybridlog.cli.signals import SIGNALS
-from hybridlog_storage.mongod import find_mongod
+from hybridlog_storage.mongo.mongod import find_mongod
 from tests.independent import read_bag
 
 from .running import (

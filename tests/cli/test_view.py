@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 
 from .running import environment
 

@@ -20,7 +20,7 @@ import sys
 class Blocked:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] == "pymongo" or name in {
-            "hybridlog_storage.mongod", "hybridlog_storage.mongod_keeper"
+            "hybridlog_storage.mongo.mongod", "hybridlog_storage.mongo.mongod_keeper"
         }:
             print("imported", name, file=sys.stderr, flush=True)
             raise ImportError(name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import hybridlog as hl
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.odd_messages import write_odd
 
 MS = 10**6

@@ -25,9 +25,9 @@ from hybridlog.drawing.density_cache import DensityCache
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.open_segment import Flushed
-from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.open_segment import Flushed
+from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 MS = 10**6
 BASE = 1_748_937_600 * 10**9

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from hybridlog.arrays import IMAGES
+from hybridlog.arrays.message_arrays import IMAGES
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.drawing.pixels import pixels, png, thumbnail
 from hybridlog_storage.errors import MissingDependencyError, PayloadError

@@ -18,7 +18,7 @@ from hybridlog.drawing.figure import figure
 from hybridlog.drawing.lines import MOST, Line, lines
 from hybridlog.drawing.page import increasing
 from hybridlog.drawing.series import Series
-from hybridlog.losses import Cause
+from hybridlog.record.losses import Cause
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError
 from tests.cli.within import Answer, answer

@@ -16,7 +16,7 @@ from hybridlog.live import LiveRecording
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.odd_messages import MS, START
 
 SAID = Channel("/said", "json", Schema("foxglove.Log", "jsonschema", b"{}"))

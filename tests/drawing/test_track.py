@@ -20,7 +20,7 @@ from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of
 from hybridlog.query.topics import TopicMatcher
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
 from tests.ros_values import ROS1
 from tests.test_arrays import decoded

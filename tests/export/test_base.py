@@ -24,15 +24,15 @@ from hybridlog.export import (
     open_table_writer,
 )
 from hybridlog.export.base import Sink
-from hybridlog_storage import unfinished
-from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
-from hybridlog_storage.unfinished import (
+from hybridlog_storage.disk import unfinished
+from hybridlog_storage.disk.unfinished import (
     beside,
     is_published,
     scratch_directory,
     undo_unfinished,
     undone,
 )
+from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from tests.export.batches import many, ros1_channels
 
 TABLE = pa.table({"x": [1.0, 2.0], "name": ["a", "b"], "v": [[1, 2], []]})

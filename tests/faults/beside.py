@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import hybridlog as hl
-from hybridlog.losses import losses_of
+from hybridlog.record.losses import losses_of
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import HybridlogError
 from tests.faults.cases import Bench, Scenario

@@ -11,7 +11,7 @@ from pathlib import Path
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 HEADER = (
     "std_msgs/Header header\nint32 n\n"

@@ -26,7 +26,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 
 LIMIT_S = 60.0
 ROOT = Path(__file__).parents[2]
@@ -314,7 +314,7 @@ def _name(fd: int) -> str:
 
 def step_database(seam: Seam) -> None:
     """Make each change of the database a step."""
-    from hybridlog_storage.database import Database
+    from hybridlog_storage.mongo.database import Database
 
     def stepped(method: str, kind: str, half: Callable[..., object] | None = None) -> None:
         original = getattr(Database, method)
@@ -475,7 +475,7 @@ def _serve() -> NoReturn:
     import hybridlog.maintenance.index
     import hybridlog.maintenance.removal
     import hybridlog.maintenance.repair
-    import hybridlog.recorder
+    import hybridlog.record.recorder
     import hybridlog.sources.mcap
     import hybridlog.store
     import hybridlog.tables.reader

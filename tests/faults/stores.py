@@ -18,19 +18,19 @@ import bson
 from pymongo import MongoClient
 
 import hybridlog as hl
-from hybridlog.losses import losses_of
 from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
+from hybridlog.record.losses import losses_of
 from hybridlog.tables.folders import recordings_of
 from hybridlog.tables.layout import PARTS
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.catalog import _crc as crc_of
-from hybridlog_storage.collection_names import CATALOG_PREFIX
-from hybridlog_storage.database import Database
-from hybridlog_storage.directory import StoreDirectory
-from hybridlog_storage.index_state import RECORDINGS, STORE, IndexState
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.topic_places import SHARED, TOPICS, TopicPlaces
+from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.mongo.topic_places import SHARED, TOPICS, TopicPlaces
 from tests.faults.logs import Content
 
 WHERE = 20

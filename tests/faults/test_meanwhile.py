@@ -10,10 +10,10 @@ import pytest
 
 from hybridlog.maintenance.index import ids_present
 from hybridlog_storage.catalog import channel_totals
-from hybridlog_storage.chunk_table import TableBuilder
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import IndexChangedError, TopicError
-from hybridlog_storage.index_state import IndexState
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.chunk_table import TableBuilder
 from tests.faults.cases import Bench
 from tests.faults.scenarios import scenario
 from tests.faults.stores import Case, look
@@ -133,7 +133,7 @@ def test_a_count_is_refused_while_documents_go(case: Case) -> None:
 def test_what_goes_while_it_is_counted_is_noticed(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hybridlog_storage.database import Database
+    from hybridlog_storage.mongo.database import Database
 
     with case.open() as store, case.open() as other:
         store.connect()

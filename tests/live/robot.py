@@ -15,7 +15,7 @@ import hybridlog as hl
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveRecording
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.live.speaker import Speaker, text, text_channel
 
 

@@ -15,9 +15,9 @@ from hybridlog.live import memory_reservation as module
 from hybridlog.live.memory_reservation import MemoryReservation
 from hybridlog_storage import buffers as pool_module
 from hybridlog_storage.buffers import SLAB, Buffers
-from hybridlog_storage.copying import COPIED_AT_ONCE
+from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.live.test_recording import channel, text
 from tests.test_faults import wait_for
 

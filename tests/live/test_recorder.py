@@ -30,11 +30,10 @@ from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveOptions, LiveRecording
 from hybridlog.live.snapshots import SnapshotOptions
-from hybridlog.losses import Cause
-from hybridlog.marks import MARKS
 from hybridlog.query.topics import matcher
-from hybridlog_storage import append_file
-from hybridlog_storage.collection_names import collection_of
+from hybridlog.record.losses import Cause
+from hybridlog.record.marks import MARKS
+from hybridlog_storage.disk import append_file
 from hybridlog_storage.errors import (
     DiskFullError,
     PayloadError,
@@ -43,7 +42,8 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
 from tests.test_faults import wait_for
 
@@ -217,7 +217,7 @@ def test_a_full_disk_ends_it_and_what_comes_is_counted(
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(append_file.os, "pwritev", full)
-        patch.setattr("hybridlog_storage.durability.os.writev", full)
+        patch.setattr("hybridlog_storage.disk.durability.os.writev", full)
         for number in range(200):
             robot.speaker.say(channel, scan(number, 3_000_000))
             if robot.recorder.wait(0.01):
@@ -523,7 +523,7 @@ def test_visitors(store: hl.Store) -> None:
 KILLED = """
 import os, signal, sys, time
 import hybridlog as hl
-from hybridlog.losses import Cause
+from hybridlog.record.losses import Cause
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from tests.live.speaker import Speaker, text, text_channel
 with hl.open(sys.argv[1], create=True, require_database=True) as store:

@@ -21,23 +21,24 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog import index_writer
 from hybridlog.demo.write import write_bag
-from hybridlog.indexing import ChunkIndexer
+from hybridlog.index import index_writer
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog.tables.reader import Tables
 from hybridlog.tables.writer import TableWriter
-from hybridlog_storage import append_file, segment_writer
-from hybridlog_storage.chunk import PackedChunk, StoredChunk
-from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.copying import COPIED_AT_ONCE
-from hybridlog_storage.database import Database
+from hybridlog_storage.disk import append_file
+from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
-from hybridlog_storage.index_state import NOTHING, IndexState
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
-from hybridlog_storage.segment_file import SegmentFile
-from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_state import NOTHING, IndexState
+from hybridlog_storage.segments import segment_writer
+from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.segments.segment_file import SegmentFile
+from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from tests.live.sources.heard import must_return
 from tests.test_faults import kill_mongod, wait_for
 
@@ -406,7 +407,7 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
 
     with monkeypatch.context() as patch:
         patch.setattr(append_file.os, "pwritev", full)
-        patch.setattr("hybridlog_storage.durability.os.writev", full)
+        patch.setattr("hybridlog_storage.disk.durability.os.writev", full)
 
         def until_refused() -> None:
             while True:

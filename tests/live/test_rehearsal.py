@@ -18,7 +18,7 @@ import hybridlog as hl
 from hybridlog.live import rehearsal
 from hybridlog.live.rehearsal import snapshot_spans
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger
-from hybridlog.losses import Ledger
+from hybridlog.record.losses import Ledger
 from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel
 from tests.cli.within import answer as run

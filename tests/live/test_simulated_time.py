@@ -15,8 +15,8 @@ from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.simulated_time import clock_time
 from hybridlog.live.snapshots import SnapshotOptions
-from hybridlog.losses import Cause
 from hybridlog.query.topics import matcher
+from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.speaker import Speaker, text, text_channel

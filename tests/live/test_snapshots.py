@@ -16,10 +16,10 @@ from hybridlog.live.control_server import request
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.ring import BufferedMessage, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Trigger, _happened, _Watch
-from hybridlog.losses import Cause
-from hybridlog.marks import MARKS
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.record.losses import Cause
+from hybridlog.record.marks import MARKS
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.speaker import TEXT, Speaker, scan, scan_channel, text, text_channel

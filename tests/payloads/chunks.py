@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hybridlog.payloads.columns import Piece, Rebuilder, TopicColumns, rows_of
-from hybridlog_storage.chunk import StoredChunk
-from hybridlog_storage.chunk_builder import ChunkBuilder
 from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 
 BASE = 1_700_000_000_000_000_000
 

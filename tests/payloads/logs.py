@@ -14,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 COUNT = 120
 SETTINGS = SegmentSettings(chunk_size=32 << 10, segment_size=60 << 10)

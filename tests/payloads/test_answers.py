@@ -16,7 +16,7 @@ from hybridlog.payloads import writer
 from hybridlog.query.engines.base import Need
 from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import PayloadError
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.payloads.logs import BASE, COUNT, SCAN, STEP, scan, write_log
 
 

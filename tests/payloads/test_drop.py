@@ -17,9 +17,9 @@ from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog_storage import journal
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, SegmentError
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from tests.payloads.logs import (
     BASE,
     COUNT,

@@ -18,7 +18,8 @@ import hybridlog as hl
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.verify import verify
 from hybridlog.payloads import files as payload_files
-from hybridlog_storage import files, journal
+from hybridlog_storage import journal
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError
 from tests.payloads.logs import SETTINGS, messages, recording_of, robot, write_log
 from tests.power import PowerCut

@@ -17,7 +17,7 @@ from hybridlog.query.engines.base import Need
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.schema.column import offsets
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.payloads.logs import BASE, COUNT, SCAN, STEP, scan, write_log
 
 FLOATS = st.one_of(st.floats(width=32), st.sampled_from([math.inf, -math.inf, math.nan, 0.0, 1.0]))

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.rows_differ import objects_differ
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 CASES = Path(__file__).parents[1] / "cases"
 BASE = 1_700_000_000 * 10**9

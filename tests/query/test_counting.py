@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.query.intervals import Intervals
-from hybridlog_storage.database import Database
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.index_documents import key_bound
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_documents import key_bound
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.query.test_intervals import (
     BASE,
     SECOND,

@@ -32,9 +32,9 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.query import Query
-from hybridlog_storage import topic_places
 from hybridlog_storage.errors import DatabaseError, TimeError
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo import topic_places
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import EMBEDDED, NONE
 
 SECOND = 10**9

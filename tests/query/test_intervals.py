@@ -26,7 +26,7 @@ from hybridlog.query.rows_differ import rows_differ
 from hybridlog.schema.arrow_columns import array_of
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
 from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
 
 SECOND = 10**9

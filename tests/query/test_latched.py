@@ -14,16 +14,16 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog import latched_front
 from hybridlog.cli.write_answer import write_answer
 from hybridlog.export.slices import Front
-from hybridlog.latched_front import LatchedFront
-from hybridlog.latching import KEEP_ALL, depth_of
+from hybridlog.query import latched_front
+from hybridlog.query.latched_front import LatchedFront
+from hybridlog.query.latching import KEEP_ALL, depth_of
 from hybridlog.query.query import Query
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.messages import Batch, Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND

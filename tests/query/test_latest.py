@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.query.query import Query
 from hybridlog.query.recent_chunks import RecentChunks
-from hybridlog.recorder import RecordOptions
-from hybridlog_storage.chunk import StoredChunk
+from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.messages import Batch
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
 
 AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"

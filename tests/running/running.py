@@ -11,8 +11,8 @@ from pathlib import Path
 
 import hybridlog as hl
 from hybridlog.live import LiveOptions, LiveRecording
-from hybridlog.losses import Cause
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog.record.losses import Cause
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.running.methods import LABEL, TAGS
 from tests.running.sequence import CHANNELS, SECOND, START, Known, Sent, messages
 

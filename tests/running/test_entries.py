@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.losses import Cause
-from hybridlog.running import RunningRecording
+from hybridlog.record.losses import Cause
+from hybridlog.record.running import RunningRecording
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.running.running import NO_MONGODB
 
 CHANNELS = [Channel("/a", "json", None), Channel("/b", "json", None)]

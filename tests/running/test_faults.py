@@ -11,9 +11,15 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.errors import HybridlogError
-from hybridlog_storage.mcap_content import RECORD_HEAD
-from hybridlog_storage.open_segment import OpenSegment
-from hybridlog_storage.segment_format import ARRIVAL_OPCODE, MAGIC, PROOF, arrival_record, proof_of
+from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
+from hybridlog_storage.segments.open_segment import OpenSegment
+from hybridlog_storage.segments.segment_format import (
+    ARRIVAL_OPCODE,
+    MAGIC,
+    PROOF,
+    arrival_record,
+    proof_of,
+)
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import Running, begun
 from tests.running.sequence import Known

@@ -13,7 +13,7 @@ from hybridlog import session as session_module
 from hybridlog.live import LiveOptions
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from tests.running.running import NO_MONGODB
 
 SAID = Channel("/said", "json", None)

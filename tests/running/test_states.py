@@ -13,9 +13,9 @@ import pytest
 from mcap.records import Metadata
 
 import hybridlog as hl
-from hybridlog_storage.attachments import Attachment
-from hybridlog_storage.compression import FilePart
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.segments.attachments import Attachment
+from hybridlog_storage.segments.compression import FilePart
 from tests.cli.running import complete, wait_for
 from tests.cli.within import answer
 from tests.imports import ROOT

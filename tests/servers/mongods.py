@@ -14,7 +14,7 @@ from typing import Any
 from pymongo import MongoClient
 from pymongo.errors import PyMongoError
 
-from hybridlog_storage.mongod import find_mongod
+from hybridlog_storage.mongo.mongod import find_mongod
 
 _LIMIT_S = 60.0
 

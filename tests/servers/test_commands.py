@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.choice import Choice
 from hybridlog.query import index_reader
+from hybridlog.query.choice import Choice
 from hybridlog.query.counters import Counters
 from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner

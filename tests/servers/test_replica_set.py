@@ -12,9 +12,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query import index_reader
-from hybridlog_storage.database import Database
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.faults import logs
 from tests.servers.commands import commands
 from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set

@@ -21,9 +21,9 @@ import zstandard
 
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.sources.detect import open_source
-from hybridlog.yaml_values import YamlError, parse_yaml
-from hybridlog_storage.compression import Compressor, decompress
+from hybridlog.sources.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import SegmentError, UsageError
+from hybridlog_storage.segments.compression import Compressor, decompress
 from tests.sources import test_rosbag1 as bags
 from tests.sources.test_rosbag2 import make
 

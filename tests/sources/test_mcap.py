@@ -21,9 +21,9 @@ from mcap.writer import CompressionType, Writer
 import hybridlog as hl
 from hybridlog.sources.base import BATCH_BYTES, BATCH_MESSAGES, Damage
 from hybridlog.sources.mcap import McapSource
-from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.errors import SourceError
-from hybridlog_storage.mcap_scan import MAGIC, ScannedChunk, scan
+from hybridlog_storage.mcap.mcap_scan import MAGIC, ScannedChunk, scan
+from hybridlog_storage.segments.attachments import Attachment
 from tests.data import DATA, needs_data
 
 if TYPE_CHECKING:
@@ -465,7 +465,7 @@ def test_definitions_that_change_inside_a_chunk_hold_from_there(
 ) -> None:
     from mcap.records import Chunk
 
-    from hybridlog_storage.compression import Compressor
+    from hybridlog_storage.segments.compression import Compressor
 
     builder = RecordBuilder()
     channel = Channel(1, "/x", "cdr", {}, 1)

@@ -21,7 +21,7 @@ from hybridlog.sources.base import BATCH_BYTES, BATCH_MESSAGES, Damage, Source
 from hybridlog.sources.detect import open_source
 from hybridlog.sources.rosbag2_metadata import parse_metadata
 from hybridlog.sources.rosbag2_sqlite import SqliteSource
-from hybridlog.yaml_values import YamlError
+from hybridlog.sources.yaml_values import YamlError
 from hybridlog_storage.errors import SourceError
 from tests.data import DATA, needs_data
 

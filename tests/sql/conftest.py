@@ -12,8 +12,8 @@ import pytest
 import hybridlog as hl
 from hybridlog.tables import writer
 from hybridlog_storage.messages import Schema
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.tables.logs import BASE, SECOND, payload, varied, write_log
 
 CHUNKS = SegmentSettings(chunk_size=32 << 10)

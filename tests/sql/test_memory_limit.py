@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hybridlog.sql.memory_limit import OWN_MEMORY, limited_memory, private_bytes
-from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.cli.running import COMMAND, environment
 
 LIMIT = 64 << 20

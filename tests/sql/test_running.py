@@ -15,9 +15,9 @@ from hybridlog.live import LiveRecording
 from hybridlog.tables import writer
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.open_segment import OpenSegment
-from hybridlog_storage.segment_reader import SegmentReader, places_of
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.open_segment import OpenSegment
+from hybridlog_storage.segments.segment_reader import SegmentReader, places_of
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.sql.conftest import SCAN, scan
 from tests.tables.logs import BASE, STATE, payload
 

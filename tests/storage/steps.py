@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 
 
 class Steps(files.System):

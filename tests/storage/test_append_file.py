@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog_storage import append_file, durability, files
-from hybridlog_storage.append_file import BLOCK, AppendFile
 from hybridlog_storage.buffers import buffers
+from hybridlog_storage.disk import append_file, durability, files
+from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Buffer
 from tests.storage.steps import Steps, through

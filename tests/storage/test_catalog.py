@@ -36,9 +36,9 @@ from hybridlog_storage.catalog import (
     schema_hash,
     stamps_of,
 )
-from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable
 from hybridlog_storage.errors import CatalogError, DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segments.chunk_table import CHUNK, OTHER, PART, ChunkTable
 from tests.imports import ROOT
 from tests.storage.chunk_entries import chunk_entries
 

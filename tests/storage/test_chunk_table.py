@@ -12,10 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.chunk_table import CHUNK, OTHER, PART, ChunkTable, TableBuilder, parts_of
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Batch
-from hybridlog_storage.segment_format import checked_frame, index_order
+from hybridlog_storage.segments.chunk_table import (
+    CHUNK,
+    OTHER,
+    PART,
+    ChunkTable,
+    TableBuilder,
+    parts_of,
+)
+from hybridlog_storage.segments.segment_format import checked_frame, index_order
 
 
 def batch(channel: list[int], log_time: list[int]) -> Batch:

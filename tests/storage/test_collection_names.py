@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog_storage.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
 
 # Few letters, so that names meet if they can.
 NASTY = st.text(alphabet="/_a~.$ \0A0é", max_size=12)

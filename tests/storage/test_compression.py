@@ -12,8 +12,8 @@ import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog_storage.compression import Compressor, decompress, decompress_pieces
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.segments.compression import Compressor, decompress, decompress_pieces
 
 TEXT = b"".join(b"%d: the robot is at %d\n" % (i, i * 7919) for i in range(40_000))
 NOISE = os.urandom(1 << 20)

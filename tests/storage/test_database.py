@@ -23,8 +23,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymongo import MongoClient, monitoring
 
-from hybridlog_storage import database as module
-from hybridlog_storage.database import (
+from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
+from hybridlog_storage.mongo import database as module
+from hybridlog_storage.mongo.database import (
     CollectionStats,
     Database,
     _batches,
@@ -32,8 +33,7 @@ from hybridlog_storage.database import (
     _mapped,
     without_secrets,
 )
-from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
-from hybridlog_storage.mongod import EmbeddedMongod, find_mongod
+from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
 
 NUMBERS = count()
 

@@ -17,8 +17,9 @@ from typing import Any
 
 import pytest
 
-from hybridlog_storage import files, journal
-from hybridlog_storage.directory import LOCK, REMOVED, Holder, StoreDirectory
+from hybridlog_storage import journal
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.directory import LOCK, REMOVED, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError
 from hybridlog_storage.journal import Journal
 from tests.other_user import User, needs_root, open_place
@@ -205,7 +206,7 @@ def test_a_label_that_is_free(store: StoreDirectory) -> None:
 HOLD = """
 import sys
 from pathlib import Path
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 store, *sys.argv = sys.argv[1:]
 with StoreDirectory(Path(store)).writing("r", records=sys.argv.pop() == "records"):
     print("held", flush=True)
@@ -372,7 +373,7 @@ def test_a_store_that_cannot_be_written(store: StoreDirectory) -> None:
 AS_A_READER = """
 import sys
 from pathlib import Path
-from hybridlog_storage.directory import StoreDirectory
+from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import StoreError
 store = StoreDirectory(Path(sys.argv[1]))
 for step in (store.check_writable, lambda: store.new_recording("r")):

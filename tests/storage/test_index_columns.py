@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.index_columns import key_columns
+from hybridlog_storage.mongo.index_columns import key_columns
 
 whole = st.integers(0, 2**63 - 1)
 

@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hybridlog_storage.chunk import StoredChunk
-from hybridlog_storage.index_documents import (
+from hybridlog_storage.messages import Batch
+from hybridlog_storage.mongo.index_documents import (
     DocumentAssembler,
     Origin,
     Placed,
     key_bound,
     recording_key,
 )
-from hybridlog_storage.messages import Batch
+from hybridlog_storage.segments.chunk import StoredChunk
 
 TIMES = st.integers(0, 2**63 - 1)
 ORIGIN = Origin("fedcba9876543210", "/a topic/ä", has_publish_time=True)

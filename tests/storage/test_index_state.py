@@ -10,13 +10,20 @@ from typing import Any
 import pytest
 
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry, channel_entry
-from hybridlog_storage.collection_names import CATALOG_PREFIX
-from hybridlog_storage.database import Database
-from hybridlog_storage.index_documents import key_bound
-from hybridlog_storage.index_state import NOTHING, RECORDINGS, STORE, Indexed, IndexState, Through
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.topic_places import TopicPlace
+from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_documents import key_bound
+from hybridlog_storage.mongo.index_state import (
+    NOTHING,
+    RECORDINGS,
+    STORE,
+    Indexed,
+    IndexState,
+    Through,
+)
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.mongo.topic_places import TopicPlace
 
 ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
 DIGESTS = {"0": "sha256:a", "1": "sha256:b", "10": "sha256:c"}

@@ -18,7 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog_storage import files, journal
+from hybridlog_storage import journal
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.journal import (
     ADOPTED,

@@ -30,10 +30,9 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap_content import read_record
-from hybridlog_storage.mcap_scan import (
+from hybridlog_storage.mcap.mcap_content import read_record
+from hybridlog_storage.mcap.mcap_scan import (
     MAGIC,
     ChunkContent,
     End,
@@ -45,6 +44,7 @@ from hybridlog_storage.mcap_scan import (
     read_summary,
     scan,
 )
+from hybridlog_storage.segments.attachments import Attachment
 from tests.data import DATA, needs_data
 
 if TYPE_CHECKING:

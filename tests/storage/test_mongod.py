@@ -19,7 +19,6 @@ import psutil
 import pytest
 from pymongo import MongoClient
 
-from hybridlog_storage import mongod as module
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -28,14 +27,15 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.mongod import EmbeddedMongod, find_mongod
+from hybridlog_storage.mongo import mongod as module
+from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
 
 LINGER_S = 0.2
 
 USER = """
 import sys, time
 from pathlib import Path
-from hybridlog_storage.mongod import EmbeddedMongod
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
 user = EmbeddedMongod(Path(sys.argv[1]), linger_s=0.2)
 print(user.start(), flush=True)
 sys.stdin.readline()
@@ -775,7 +775,8 @@ def test_linger_time_of_the_environment(monkeypatch: pytest.MonkeyPatch, directo
 
 def test_nothing_heavy_is_imported() -> None:
     code = (
-        "import sys, hybridlog_storage.mongod as m, hybridlog_storage.database; m.find_mongod();"
+        "import sys, hybridlog_storage.mongo.mongod as m, hybridlog_storage.mongo.database;"
+        "m.find_mongod();"
         "print([n for n in ('pymongo', 'bson', 'fiftyone') if n in sys.modules])"
     )
     done = subprocess.run(

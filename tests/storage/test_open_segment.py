@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from mcap.records import Metadata
 
-from hybridlog_storage.attachments import Attachment
-from hybridlog_storage.compression import FilePart
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.open_segment import OpenSegment
-from hybridlog_storage.recovery import recover_segment
-from hybridlog_storage.segment_format import (
+from hybridlog_storage.segments.attachments import Attachment
+from hybridlog_storage.segments.compression import FilePart
+from hybridlog_storage.segments.open_segment import OpenSegment
+from hybridlog_storage.segments.recovery import recover_segment
+from hybridlog_storage.segments.segment_format import (
     END_METADATA,
     LOSSES_METADATA,
     PROOF,
     json_metadata,
 )
-from hybridlog_storage.segment_reader import SegmentReader, SegmentSummary, places_of
-from hybridlog_storage.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary, places_of
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests.storage.test_segments import CHANNELS, LOSS, RECORDING, Row, batch_of, content_of
 
 PLACE = ("offset", "length", "trailer", "crc", "trailer_crc", "first", "last", "parts")
@@ -77,7 +77,7 @@ def written(
 ) -> Iterator[Written]:
     with pytest.MonkeyPatch.context() as patch:
         if "chunks" in request.param:
-            patch.setattr("hybridlog_storage.segment_file._SMALL_DEFINITIONS", 1)
+            patch.setattr("hybridlog_storage.segments.segment_file._SMALL_DEFINITIONS", 1)
         yield Written(tmp_path_factory.mktemp("open") / "r")
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog_storage.recovery import recover_segment
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.recovery import recover_segment
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.storage.test_segments import many, write
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog_storage.runs import run_lengths, run_starts
+from hybridlog_storage.ordering import run_lengths, run_starts
 
 
 @given(st.lists(st.integers(0, 2), min_size=1, max_size=40))

@@ -24,19 +24,19 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import ChunkIndex, Metadata
 from mcap.stream_reader import StreamReader
 
-from hybridlog_storage import segment_writer
-from hybridlog_storage.append_file import BLOCK, AppendFile
-from hybridlog_storage.attachments import Attachment
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.chunk import PackedChunk, StoredChunk
-from hybridlog_storage.compression import Compressor, FilePart
-from hybridlog_storage.copying import COPIED_AT_ONCE
+from hybridlog_storage.disk.append_file import BLOCK, AppendFile
+from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
-from hybridlog_storage.recovery import recover_segment
-from hybridlog_storage.segment_check import SegmentCheck
-from hybridlog_storage.segment_file import Sealed, SealedChannel, SegmentFile
-from hybridlog_storage.segment_format import (
+from hybridlog_storage.segments import segment_writer
+from hybridlog_storage.segments.attachments import Attachment
+from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.segments.compression import Compressor, FilePart
+from hybridlog_storage.segments.recovery import recover_segment
+from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_file import Sealed, SealedChannel, SegmentFile
+from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     END_METADATA,
     LOSSES_METADATA,
@@ -50,8 +50,8 @@ from hybridlog_storage.segment_format import (
     proof_of,
     record_bytes,
 )
-from hybridlog_storage.segment_reader import ChunkPlace, SegmentReader
-from hybridlog_storage.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, postpone
 from tests.storage.steps import Steps, through
 
@@ -735,7 +735,7 @@ def test_a_flipped_bit_is_found_and_named(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_said_to_be_full() -> None:
-    from hybridlog_storage.durability import explain, write_all
+    from hybridlog_storage.disk.durability import explain, write_all
 
     with Path("/dev/full").open("wb", buffering=0) as file, pytest.raises(OSError) as caught:
         write_all(file.fileno(), [b"x"])
@@ -928,7 +928,7 @@ def test_long_segments_are_synced_as_they_grow(
 ) -> None:
     """Where writes go through the page cache; so sealing takes no time."""
     monkeypatch.setattr(segment_writer, "_SYNC_STRIDE", 1000)
-    monkeypatch.setattr("hybridlog_storage.append_file.DIRECT", 0)
+    monkeypatch.setattr("hybridlog_storage.disk.append_file.DIRECT", 0)
     steps = Steps()
     with through(steps):
         writer = small_writer(tmp_path / "rec", steps, "seal")
@@ -953,7 +953,7 @@ def test_old_chunks_are_flushed_and_young_ones_are_not(
 ) -> None:
     chunks: list[StoredChunk] = []
     now = 100.0
-    monkeypatch.setattr("hybridlog_storage.chunk_builder.time.monotonic", lambda: now)
+    monkeypatch.setattr("hybridlog_storage.segments.chunk_builder.time.monotonic", lambda: now)
     writer = RecordingWriter(tmp_path, RECORDING, lambda c, _: chunks.append(c))
     writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)
     now = 101.0
@@ -1096,7 +1096,7 @@ def test_rosbags_passes_over_the_chunk_table(
     """It reads logs of ROS 2 only, and asks the header for that."""
     from rosbags.rosbag2.storage_mcap import McapReader
 
-    monkeypatch.setattr("hybridlog_storage.segment_file.PROFILE", "ros2")
+    monkeypatch.setattr("hybridlog_storage.segments.segment_file.PROFILE", "ros2")
     rows = many(60, 1, 200)
     (path,), chunks = write(tmp_path / "a", [rows], SegmentSettings(chunk_size=4096))
     reader = McapReader(path)
@@ -1147,9 +1147,9 @@ def test_a_segment_of_another_format_is_refused(
     message: str,
     with_table: bool,
 ) -> None:
-    monkeypatch.setattr("hybridlog_storage.segment_file.FORMAT_VERSION", version)
+    monkeypatch.setattr("hybridlog_storage.segments.segment_file.FORMAT_VERSION", version)
     if not with_table:
-        monkeypatch.setattr("hybridlog_storage.segment_file.CHUNK_TABLE_OPCODE", 0xF0)
+        monkeypatch.setattr("hybridlog_storage.segments.segment_file.CHUNK_TABLE_OPCODE", 0xF0)
     (path,), _ = write(tmp_path / "a", [many(30)])
     with SegmentReader(path, 0) as reader, pytest.raises(SegmentError, match=message):
         reader.summary()

@@ -10,14 +10,14 @@ import bson
 import numpy as np
 import pytest
 
-from hybridlog_storage import topic_places
-from hybridlog_storage.collection_names import collection_of
-from hybridlog_storage.database import Database
-from hybridlog_storage.index_columns import KEY, key_columns
-from hybridlog_storage.index_documents import key_bound, recording_key, with_prefix
-from hybridlog_storage.index_state import IndexState
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.topic_places import SHARED, TOPICS, TopicPlace, TopicPlaces
+from hybridlog_storage.mongo import topic_places
+from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_columns import KEY, key_columns
+from hybridlog_storage.mongo.index_documents import key_bound, recording_key, with_prefix
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.mongo.topic_places import SHARED, TOPICS, TopicPlace, TopicPlaces
 
 ONE, OTHER = "1" * 16, "2" * 16
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.mongod import EmbeddedMongod
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.tables.logs import BASE, varied, write_log
 
 SMALL_CHUNKS = SegmentSettings(chunk_size=4096)

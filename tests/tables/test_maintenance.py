@@ -17,9 +17,9 @@ from hybridlog.tables.folders import TableFolders
 from hybridlog.tables.layout import PARTS, TABLES
 from hybridlog.tables.parquet_file import ParquetFileReader
 from hybridlog.tables.reader import Tables
-from hybridlog_storage import files
-from hybridlog_storage.index_state import IndexState
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.disk import files
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.faults import logs
 from tests.tables.logs import BASE, channel, varied, write_log
 from tests.tables.test_writer import compare, topics_of

@@ -17,7 +17,7 @@ from hybridlog.query.predicate import to_mask as deciding
 from hybridlog.tables import folders, parquet_file, reader
 from hybridlog.tables import writer as writing
 from hybridlog.tables.parquet_file import ParquetFileReader
-from hybridlog_storage import files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Schema
 from tests.tables.logs import BASE, SECOND, STATE, varied, write_log

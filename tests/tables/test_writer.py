@@ -21,11 +21,11 @@ from hybridlog.tables.folders import TableFolders
 from hybridlog.tables.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
 from hybridlog.tables.reader import TableRows, Tables
 from hybridlog.tables.writer import TableWriter
-from hybridlog_storage import files
 from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Schema
-from hybridlog_storage.segment_reader import SegmentReader
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import (

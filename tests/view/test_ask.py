@@ -24,7 +24,7 @@ from hybridlog.cli import fetch
 from hybridlog.view.app import make_app
 from hybridlog.view.routes import ask, export
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 from .conftest import PORT, TOKEN
 

@@ -20,7 +20,7 @@ from hybridlog.view import context
 from hybridlog.view.app import make_app
 from hybridlog.view.routes import ask
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
 

@@ -19,7 +19,7 @@ from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.answers.next_time import next_time
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.every_image import (
     BROKEN,
     COMPRESSED,

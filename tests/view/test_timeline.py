@@ -18,7 +18,7 @@ from hybridlog.live import LiveRecording
 from hybridlog.view.context import Context
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.view.conftest import Asking, served
 
 if TYPE_CHECKING:

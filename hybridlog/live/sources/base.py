@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Protocol, Self
 
-from hybridlog.losses import Cause
+from hybridlog.record.losses import Cause
 
 if TYPE_CHECKING:
     from types import TracebackType

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog_storage.copying import joined
+from hybridlog_storage.disk.copying import joined
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

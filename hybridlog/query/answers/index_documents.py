@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 import bson
 import numpy as np
 
-from hybridlog.indexing import ChunkIndexer
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.query.chunk_scan import ChunkScan
 from hybridlog.query.index_reader import without_documents
 from hybridlog.query.planner import Planner
-from hybridlog_storage.chunk import StoredChunk
 from hybridlog_storage.errors import ConnectionLostError, DatabaseError
-from hybridlog_storage.index_columns import KeyColumns
-from hybridlog_storage.index_documents import KEY_BYTES
+from hybridlog_storage.mongo.index_columns import KeyColumns
+from hybridlog_storage.mongo.index_documents import KEY_BYTES
+from hybridlog_storage.segments.chunk import StoredChunk
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask

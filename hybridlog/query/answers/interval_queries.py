@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 
-from hybridlog.losses import extent_of
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.times import END, earlier, placed

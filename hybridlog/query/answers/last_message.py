@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.chunk import StoredChunk
     from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 
 def message_at(

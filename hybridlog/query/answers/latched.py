@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.latching import depth_of, publisher_of
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.counters import Counters
+from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 

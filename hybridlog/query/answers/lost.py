@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.losses import CRASH, Cause, losses_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.wording import counted
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.times import BEGIN, END, span_of

@@ -11,7 +11,6 @@ from itertools import groupby, islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.losses import Cause, in_words, line_of
 from hybridlog.query.answers.lost import JOURNAL_LOST, losses_in, unindexed, unwritten
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
@@ -20,6 +19,7 @@ from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time, is_relative
 from hybridlog.query.topics import namesakes
+from hybridlog.record.losses import Cause, in_words, line_of
 from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import TimeError
 

@@ -53,7 +53,7 @@ class PayloadScan:
 
     def outcomes(self, part: Part) -> Iterator[Outcomes]:
         """Read the messages in order and decide on each."""
-        from hybridlog.indexing import rows_by_channel
+        from hybridlog.index.indexing import rows_by_channel
 
         plan = self.plan([part], filtered=False)
         decide = _filter_of(part)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridlog.losses import lost_spans
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import (
     Need,
@@ -21,6 +20,7 @@ from hybridlog.query.engines.base import (
 )
 from hybridlog.query.message_filter import meta_array
 from hybridlog.query.predicate.tree import is_meta
+from hybridlog.record.losses import lost_spans
 from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog_storage.errors import StoreError
 

@@ -12,8 +12,8 @@ from urllib.parse import urlencode
 
 from starlette.responses import FileResponse
 
-from hybridlog.choice import Choice
 from hybridlog.export.slices import write_mcap
+from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time
 from hybridlog.schema.completion import with_nested

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.choice import Choice
 from hybridlog.drawing.coverage import lost_parts
-from hybridlog.losses import losses_of
+from hybridlog.query.choice import Choice
+from hybridlog.record.losses import losses_of
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 from starlette.responses import Response
 
 from hybridlog.drawing.silence import gaps
-from hybridlog.marks import MARKS
+from hybridlog.record.marks import MARKS
 from hybridlog.view.context import Context, extent, route, start_of
 from hybridlog_storage.errors import UsageError
 

@@ -14,7 +14,7 @@ import reprlib
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
-from hybridlog.yaml_values import YamlError, parse_yaml
+from hybridlog.sources.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Messages, images and points as numpy arrays."""

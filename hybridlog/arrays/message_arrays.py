@@ -1,0 +1,235 @@
+"""Images, scans and point clouds as numpy arrays, without a copy where possible."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import warnings
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.arrays.array_views import MAX_EMPTY, byte_array, check_rows, view_of
+from hybridlog.arrays.point_arrays import POINT_MAKERS
+from hybridlog_storage.errors import MissingDependencyError, PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+_IMAGES: Final[Mapping[str, tuple[str, int]]] = {
+    "mono8": ("u1", 1),
+    "mono16": ("u2", 1),
+    **{
+        f"{order}{bits}": (f"u{bits // 8}", len(order))
+        for order in ("rgb", "bgr", "rgba", "bgra")
+        for bits in (8, 16)
+    },
+    **{
+        f"bayer_{order}{bits}": (f"u{bits // 8}", 1)
+        for order in ("rggb", "bggr", "gbrg", "grbg")
+        for bits in (8, 16)
+    },
+    **dict.fromkeys(("yuv422", "yuv422_yuy2", "uyvy", "yuyv"), ("u1", 2)),
+}
+# Planes of one byte per sample: rows of the whole picture for each row of the image.
+_PLANAR: Final[Mapping[str, tuple[int, int]]] = {"nv21": (3, 2), "nv12": (3, 2), "nv24": (3, 1)}
+_CV_ENCODING = re.compile(r"(8|16|32|64)(U|S|F)C(\d{1,3})?")
+_CV_TYPES = {"8U", "8S", "16U", "16S", "32S", "32F", "64F", "16F"}
+_CV_CHANNELS = 512
+
+_COMPRESSED = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_DEPTH_HEADER = struct.Struct("<iff")
+
+
+def to_numpy(type_name: str, message: object) -> NDArray[Any]:
+    """A message as an array.
+
+    * `Image`, also Foxglove's `RawImage`: shape (height, width) or (height, width, channels)
+      in the encoding's own channel order; big-endian samples have a big-endian dtype. YUV
+      4:2:2 has two channels, not separated; NV12, NV21 and NV24 are returned as raw planes, shape
+      (rows of all planes, width).
+    * `CompressedImage`, also Foxglove's: shape (height, width) or (height, width, 3 or 4),
+      red first.
+      `compressedDepth` gives the depth image: uint16 millimetres or float32 metres
+      (NaN for missing measurements).
+    * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present)
+      and `angle` (radians), float32. Ranges without an intensity have NaN.
+      `MultiEchoLaserScan` has a row for each echo, beam after beam, and `echo`, its number.
+    * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the
+      cloud's own fields, which may overlap; `PointCloud`: shape (n,), `x`, `y`, `z` and the
+      channels, NaN where a channel ends early.
+    * `foxglove.LaserScan` and `foxglove.PointCloud`, also of `foxglove_msgs`: the same.
+
+    An empty image, picture or cloud is an empty array. A step of 0 means rows without
+    padding. Images and `PointCloud2` clouds are views of the message's data, without a copy.
+
+    Args:
+        type_name: `sensor_msgs/Image` or `sensor_msgs/msg/Image`.
+        message: The decoded message, its fields as attributes or, from JSON, as a dict.
+
+    Raises:
+        PayloadError: the type is none of these, or the sizes, the encoding or the
+            fields do not fit the data.
+        MissingDependencyError: Pillow is required and not installed.
+    """
+    maker = _MAKERS.get(plain_type(type_name))
+    if maker is None:
+        raise PayloadError(
+            f"{type_name} has no array form; {', '.join(_MAKERS)} have. "
+            "Its fields are in decode(), its columns in to_pandas()."
+        )
+    try:
+        return maker(attributes(message))
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise PayloadError(f"this {type_name} has unusual fields: {error}") from error
+
+
+def plain_type(name: str) -> str:
+    """The name of a type without `msg`, and of a Foxglove type as Foxglove has it."""
+    return name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove.")
+
+
+def attributes(message: Any) -> Any:
+    """The message with its fields as attributes, if it is a dict as JSON gives it."""
+    if isinstance(message, dict):
+        return SimpleNamespace(**{str(name): attributes(item) for name, item in message.items()})
+    if isinstance(message, list) and any(isinstance(item, dict) for item in message[:1]):
+        return [attributes(item) for item in message]
+    return message
+
+
+def _image(message: Any) -> NDArray[Any]:
+    encoding = str(message.encoding).strip()
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = byte_array(message.data)
+    if not encoding and not height * width and not len(data):
+        return np.empty((min(height, MAX_EMPTY), min(width, MAX_EMPTY)), np.uint8)
+    channels, sample = 1, np.dtype(np.uint8)
+    planes = _PLANAR.get(encoding.lower())
+    if planes is not None:
+        whole, part = planes
+        if height % part:
+            raise PayloadError(f"a {encoding} image cannot have {height} rows")
+        height = height * whole // part
+    else:
+        sample, channels = _sample(encoding)
+    if getattr(message, "is_bigendian", False):  # Foxglove's are little-endian
+        sample = sample.newbyteorder(">")
+    row = width * channels * sample.itemsize
+    step = step or row
+    check_rows("an image", (height, width), row, step, len(data))
+    pixel = channels * sample.itemsize
+    if channels == 1:
+        return view_of(data, (height, width), sample, (step, pixel))
+    return view_of(data, (height, width, channels), sample, (step, pixel, sample.itemsize))
+
+
+def _sample(encoding: str) -> tuple[np.dtype[Any], int]:
+    """Type of a sample, and number of samples per pixel."""
+    known = _IMAGES.get(encoding.lower())
+    if known is not None:
+        return np.dtype(known[0]), known[1]
+    match = _CV_ENCODING.fullmatch(encoding.upper())
+    if match is not None and match[1] + match[2] in _CV_TYPES:
+        channels = int(match[3] or 1)
+        if 1 <= channels <= _CV_CHANNELS:
+            kind = {"U": "u", "S": "i", "F": "f"}[match[2]]
+            return np.dtype(f"{kind}{int(match[1]) // 8}"), channels
+    raise PayloadError(f"an image has the unknown encoding {encoding[:40]!r}")
+
+
+def _compressed_image(message: Any) -> NDArray[Any]:
+    form = str(message.format)
+    data = byte_array(message.data).tobytes()
+    if not data:
+        return np.empty((0, 0), np.uint8)
+    if "compressedDepth" in form:
+        return _depth(form, data)
+    return _picture(data)
+
+
+def depth_picture(form: str, data: bytes) -> bytes | None:
+    """The PNG in a `compressedDepth` image if its values are the depth, uint16 millimetres.
+
+    Raises:
+        PayloadError: no PNG is in it.
+    """
+    if not data:
+        return data
+    if len(data) < _DEPTH_HEADER.size or "rvl" in form.lower():
+        raise PayloadError(f"a depth image in the form {form[:60]!r} cannot be read: only PNG can")
+    return None if form.upper().startswith("32FC1") else data[_DEPTH_HEADER.size :]
+
+
+def _depth(form: str, data: bytes) -> NDArray[Any]:
+    """A depth image after its header: quantised inverse depth, or plain depth."""
+    plain = depth_picture(form, data)
+    picture = _picture(data[_DEPTH_HEADER.size :])
+    if picture.ndim != 2:
+        raise PayloadError("a depth image has more than one channel")
+    if plain is not None:
+        return picture
+    _, scale, shift = _DEPTH_HEADER.unpack_from(data)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.float32(scale) / (picture.astype(np.float32) - np.float32(shift))
+    depth[picture == 0] = np.nan
+    return depth
+
+
+def _picture(data: bytes) -> NDArray[Any]:
+    try:
+        from PIL import Image, UnidentifiedImageError
+    except ImportError as error:
+        raise MissingDependencyError(
+            "compressed images need Pillow: pip install 'hybridlog[images]'"
+        ) from error
+
+    # Pillow would silently cut these to eight bits.
+    if data.startswith(_PNG) and data[24:25] == b"\x10" and data[25:26] != b"\x00":
+        raise PayloadError("a PNG with 16 bits and several channels cannot be read")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=_COMPRESSED) as image:
+                # 16-bit and 32-bit float grey images have modes of their own.
+                plain = image.mode in {"L", "RGB", "RGBA", "F", "I"} or image.mode[:4] == "I;16"
+                mode = "RGBA" if "A" in image.mode or "transparency" in image.info else "RGB"
+                mode = "L" if image.mode == "1" else mode
+                array: NDArray[Any] = np.asarray(image if plain else image.convert(mode))
+    except UnidentifiedImageError as error:
+        raise PayloadError(
+            f"a compressed image is none of {', '.join(_COMPRESSED)}, or its head is damaged"
+        ) from error
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        EOFError,
+        struct.error,
+        Warning,
+        Image.DecompressionBombError,
+    ) as error:
+        raise PayloadError(f"a compressed image cannot be read: {error}") from error
+    if array.dtype == np.int32 and array.size and 0 <= array.min() <= array.max() <= 0xFFFF:
+        array = array.astype(np.uint16)  # older versions read 16-bit grey as 32
+    return array
+
+
+COMPRESSED_IMAGES: Final = frozenset(
+    ("sensor_msgs/CompressedImage", "foxglove.CompressedImage", "foxglove_msgs/CompressedImage")
+)
+"""Types of messages with a picture in a file format, without `/msg/`."""
+_RAW_IMAGES = ("sensor_msgs/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
+IMAGES: Final = COMPRESSED_IMAGES.union(_RAW_IMAGES)
+"""Types of messages with a picture, without `/msg/`."""
+_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
+    **dict.fromkeys(_RAW_IMAGES, _image),
+    **dict.fromkeys(sorted(COMPRESSED_IMAGES), _compressed_image),
+    **POINT_MAKERS,
+}

@@ -1,0 +1,234 @@
+"""Scans and point clouds as numpy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.arrays.array_views import byte_array, check_rows, view_of
+from hybridlog_storage.errors import PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+POINT_TYPES: Final[Mapping[int, str]] = dict(
+    enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1)
+)
+"""Types of the fields of a PointCloud2 by their number, as numpy spells them."""
+_FOXGLOVE_TYPES: Final[Mapping[int, str]] = dict(
+    enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), 1)
+)
+MAX_FIELDS: Final = 256
+"""Greatest number of fields of a point."""
+
+
+def _laser_scan(message: Any) -> NDArray[Any]:
+    angles = _angles(len(message.ranges), message.angle_min, message.angle_increment)
+    return _scan(angles, message.ranges, message.intensities)
+
+
+def scans_of(
+    start: NDArray[np.float32],
+    step: NDArray[np.float32],
+    ranges: NDArray[np.float32],
+    intensities: NDArray[np.float32] | None,
+) -> NDArray[Any]:
+    """Scans of one length, each as `Message.to_numpy` makes it.
+
+    Args:
+        start: (n,), the first angle of each, rad.
+        step: (n,), the angle from one range to the next, rad.
+        ranges: (n, m), m.
+        intensities: (n, m); None if the scans have none.
+
+    Returns:
+        Shape (n, m).
+    """
+    names = ["range", "angle"] if intensities is None else ["range", "intensity", "angle"]
+    scans = np.empty(ranges.shape, [(name, np.float32) for name in names])
+    place = np.arange(ranges.shape[1], dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scans["angle"] = (
+            start.astype(np.float64)[:, None] + place * step.astype(np.float64)[:, None]
+        )
+    scans["range"] = ranges
+    if intensities is not None:
+        scans["intensity"] = intensities
+    return scans
+
+
+def _foxglove_scan(message: Any) -> NDArray[Any]:
+    count = len(message.ranges)
+    step = (float(message.end_angle) - float(message.start_angle)) / max(count - 1, 1)
+    return _scan(_angles(count, message.start_angle, step), message.ranges, message.intensities)
+
+
+def _multi_echo_scan(message: Any) -> NDArray[Any]:
+    ranges = [np.asarray(beam.echoes, np.float32) for beam in message.ranges]
+    counts = [len(beam) for beam in ranges]
+    angles = _angles(len(ranges), message.angle_min, message.angle_increment).repeat(counts)
+    echoes = np.arange(len(angles)) - (np.cumsum(counts, dtype=np.intp) - counts).repeat(counts)
+    intensities = []
+    for number, count in enumerate(counts):
+        given = message.intensities[number].echoes if number < len(message.intensities) else ()
+        intensities.append(_fill(given, count))
+    none = np.empty(0, np.float32)
+    measured = np.concatenate([none, *intensities])
+    return _scan(
+        angles,
+        np.concatenate([none, *ranges]),
+        none if np.isnan(measured).all() else measured,
+        echoes,
+    )
+
+
+def _angles(count: int, start: float, step: float) -> NDArray[np.float64]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(start) + np.arange(count, dtype=np.float64) * float(step)
+
+
+def _scan(
+    angles: NDArray[np.float64],
+    ranges: Any,
+    intensities: Any,
+    echoes: NDArray[np.intp] | None = None,
+) -> NDArray[Any]:
+    """One row for each range.
+
+    Args:
+        angles: Of each range, rad.
+        ranges: m.
+        intensities: As many, fewer, or none.
+        echoes: The number of each range among the echoes of its beam.
+    """
+    columns: dict[str, Any] = {"range": ranges}
+    if len(intensities):
+        columns["intensity"] = _fill(intensities, len(angles))
+    columns["angle"] = angles
+    if echoes is not None:
+        columns["echo"] = echoes
+    scan = np.empty(len(angles), [(name, np.float32) for name in columns])
+    with np.errstate(over="ignore", invalid="ignore"):
+        for name, values in columns.items():
+            scan[name] = np.asarray(values, np.float32)
+    return scan
+
+
+def _fill(values: Any, size: int) -> NDArray[np.float32]:
+    """As many values as there are points: NaN for those that lack, without surplus ones."""
+    filled = np.full(size, np.nan, np.float32)
+    filled[: len(values)] = values[:size]
+    return filled
+
+
+def _point_cloud2(message: Any) -> NDArray[Any]:
+    height, width = int(message.height), int(message.width)
+    step = int(message.point_step)
+    data = byte_array(message.data)
+    if height * width and not step:
+        raise PayloadError("a point cloud has points of 0 bytes")
+    order = ">" if message.is_bigendian else "<"
+    described = [(f.name, f.datatype, f.offset, f.count) for f in message.fields[: MAX_FIELDS + 1]]
+    dtype = _point_dtype(described, POINT_TYPES, step, order)
+    row_step = int(message.row_step) if height > 1 else width * step
+    row_step = row_step or width * step  # some drivers leave it out
+    check_rows("a point cloud", (height, width), width * step, row_step, len(data))
+    if height == 1:
+        return view_of(data, (width,), dtype, (step,))
+    return view_of(data, (height, width), dtype, (row_step, step))
+
+
+def _foxglove_cloud(message: Any) -> NDArray[Any]:
+    data, step = byte_array(message.data), int(message.point_stride)
+    described = [(f.name, f.type, f.offset, 1) for f in message.fields[: MAX_FIELDS + 1]]
+    dtype = _point_dtype(described, _FOXGLOVE_TYPES, step, "<")
+    points, rest = divmod(len(data), step) if step else (0, len(data))
+    if rest:
+        raise PayloadError(
+            f"a point cloud has {len(data)} bytes, which is no whole number of points of "
+            f"{step} bytes"
+        )
+    return view_of(data, (points,), dtype, (step,))
+
+
+def _point_dtype(
+    fields: Sequence[tuple[Any, Any, Any, Any]], types: Mapping[int, str], step: int, order: str
+) -> np.dtype[Any]:
+    """The structure of one point.
+
+    Args:
+        fields: Name, type, offset and count of each.
+        types: Types by their number.
+        step: Bytes of a point.
+        order: Byte order, as numpy spells it.
+
+    Raises:
+        PayloadError: a field has an unknown type, or lies outside the point.
+    """
+    if len(fields) > MAX_FIELDS:
+        raise PayloadError(f"a point cloud has more than {MAX_FIELDS} fields")
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    for given in fields:
+        name = _unique(str(given[0]), names)
+        code, offset, count = int(given[1]), int(given[2]), int(given[3]) or 1
+        if code not in types:
+            raise PayloadError(f"field {name!r} of a point cloud has the unknown type {code}")
+        item = np.dtype(order + types[code])
+        end = offset + count * item.itemsize
+        if offset < 0 or end <= offset:
+            raise PayloadError(
+                f"field {name!r} of a point cloud has {count} elements from byte {offset}"
+            )
+        if end > step:
+            raise PayloadError(
+                f"field {name!r} of a point cloud ends at byte {end} of points of {step} bytes"
+            )
+        names.append(name)
+        formats.append(item if count == 1 else (item, (count,)))
+        offsets.append(offset)
+    try:
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    except (ValueError, OverflowError) as error:
+        raise PayloadError(f"points of {step} bytes cannot be read: {error}") from error
+
+
+def _unique(name: str, taken: list[str]) -> str:
+    """A field name that numpy accepts: not empty and not used already."""
+    name = name or f"field_{len(taken)}"
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _point_cloud(message: Any) -> NDArray[Any]:
+    points = message.points
+    if len(message.channels) > MAX_FIELDS:
+        raise PayloadError(f"a point cloud has more than {MAX_FIELDS} channels")
+    names = ["x", "y", "z"]
+    columns = []
+    for channel in message.channels:
+        names.append(_unique(str(channel.name), names))
+        columns.append(_fill(channel.values, len(points)))
+    cloud = np.empty(len(points), [(name, np.float32) for name in names])
+    for axis in ("x", "y", "z"):
+        cloud[axis] = np.fromiter((getattr(p, axis) for p in points), np.float32, len(points))
+    for name, values in zip(names[3:], columns, strict=True):
+        cloud[name] = values
+    return cloud
+
+
+POINT_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
+    "sensor_msgs/LaserScan": _laser_scan,
+    "sensor_msgs/MultiEchoLaserScan": _multi_echo_scan,
+    "sensor_msgs/PointCloud2": _point_cloud2,
+    "sensor_msgs/PointCloud": _point_cloud,
+    "foxglove.LaserScan": _foxglove_scan,
+    "foxglove.PointCloud": _foxglove_cloud,
+}
+"""Makers of arrays by the type of a message, of ROS without `msg`."""

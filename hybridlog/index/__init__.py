@@ -1,0 +1,1 @@
+"""The index in MongoDB: connecting, making and writing its documents."""

@@ -1,0 +1,103 @@
+"""Indexes on fields, with which MongoDB finds documents without a scan.
+
+They change the duration of a query and never its answer, so the segments do not have
+them: MongoDB stores them, and `index rebuild` leaves them in place. In a collection that topics
+share, an index holds the documents of one topic (a partial index).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.topic_places import TopicPlaces
+
+if TYPE_CHECKING:
+    from hybridlog_storage.mongo.database import Database
+
+OWN_FIELDS = ("_meta.t", "_meta.pub", "_meta.inserted_at", "_meta.rec")
+"""Fields that every index document has, in any topic."""
+
+_MOST_FIELDS = 8
+
+
+class FieldIndex(NamedTuple):
+    """An index on some fields of a topic.
+
+    Attributes:
+        topic: Full name.
+        fields: Fields in the order of the index.
+    """
+
+    topic: str
+    fields: tuple[str, ...]
+
+
+def add(database: Database, topics: Iterable[str], fields: Sequence[str]) -> None:
+    """Create an index on each topic, unless it exists.
+
+    Raises:
+        UsageError: no field, or too many.
+        DatabaseError: MongoDB cannot create it: two of the fields are arrays.
+    """
+    _check(fields)
+    names = list(topics)
+    for place in TopicPlaces(database).assigned(names).values():
+        database.create_index(place.collection, _keys(fields), only=place.of_topic)
+    _list(database, names, fields, is_there=True)
+
+
+def remove(database: Database, topics: Iterable[str], fields: Sequence[str]) -> int:
+    """Drop the index on these fields from each topic; returns the number of indexes dropped."""
+    _check(fields)
+    names = list(topics)
+    _list(database, names, fields, is_there=False)
+    return sum(
+        database.drop_index(place.collection, _keys(fields), only=place.of_topic)
+        for place in TopicPlaces(database).of(names).values()
+    )
+
+
+def listed(database: Database) -> list[FieldIndex]:
+    """All indexes that were added, without a look at the collections."""
+    return [FieldIndex(*one) for one in IndexState(database).field_indexes()]
+
+
+def _list(
+    database: Database, topics: Iterable[str], fields: Sequence[str], *, is_there: bool
+) -> None:
+    keys = tuple(field for field, _ in _keys(fields))
+    state = IndexState(database)
+    known = dict.fromkeys(state.field_indexes())
+    for topic in topics:
+        if is_there:
+            known[topic, keys] = None
+        else:
+            known.pop((topic, keys), None)
+    state.put_field_indexes(known)
+
+
+def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
+    """The indexes of some topics, in the order of the topics, by fields."""
+    places = TopicPlaces(database).of(list(topics)).values()
+    indexes = {name: database.indexes(name) for name in {place.collection for place in places}}
+    return [
+        FieldIndex(place.topic, tuple(field for field, _ in index.keys))
+        for place in places
+        for index in indexes[place.collection]
+        if index.only == place.of_topic
+    ]
+
+
+def _check(fields: Sequence[str]) -> None:
+    if not fields:
+        raise UsageError("Name at least one field; `hybridlog schema TOPIC` lists them.")
+    if len(fields) > _MOST_FIELDS or len(set(fields)) != len(fields):
+        raise UsageError(f"An index takes up to {_MOST_FIELDS} fields, without duplicates.")
+
+
+def _keys(fields: Sequence[str]) -> list[tuple[str, int]]:
+    # Documents have no brackets: an index on an element is one on the array.
+    return [(field.replace("[]", ""), 1) for field in fields]

@@ -1,0 +1,458 @@
+"""Makes tables, statistics and index documents of a recording, behind its recorder.
+
+`IndexWriter` reads the chunks that were flushed back from their segments, so memory does not
+grow with what waits. `DocumentSender` sends documents in the order of the file, so that one
+position says what the index has.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.index.indexing import ChunkIndexer
+from hybridlog_storage.catalog import decoded_rows
+from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
+from hybridlog_storage.mongo.index_documents import with_prefix
+from hybridlog_storage.mongo.index_state import NOTHING, IndexState, Through
+from hybridlog_storage.mongo.topic_places import TopicPlaces
+from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
+from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.threads import Threads
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hybridlog.index.indexing import Documents
+    from hybridlog.tables.writer import TableWriter
+    from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry, RecordingEntry
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_file import Sealed
+
+INTERVAL_S = 5.0
+"""Longest time between two passes over what was flushed, seconds."""
+_INTERVAL_BYTES = 64 << 20  # content that was flushed since the last pass, at most
+_SEND_BYTES = 8 << 20  # documents that are sent together, at most
+_GROUP_BYTES = 1 << 20  # content of small chunks that are decoded together
+_PAUSE_S = 0.002
+_RETRY_S = 2.0  # between attempts after the database has failed
+
+
+@dataclass(frozen=True, slots=True)
+class IndexTarget:
+    """The database for the index documents of a new recording.
+
+    Attributes:
+        database: The index; None if it is unavailable now, or the recording gets none.
+        failure: Why it is unavailable now; None if it is not, or the recording gets none.
+        renew: Another connection to the index, after one has failed; starts the embedded
+            MongoDB again if that has ended. Raises `DatabaseError`.
+    """
+
+    database: Database | None = None
+    failure: DatabaseError | None = None
+    renew: Callable[[], Database] | None = None
+
+    @property
+    def is_wanted(self) -> bool:
+        """True if the recording gets documents, now or later."""
+        return self.database is not None or self.failure is not None
+
+
+class DocumentSender:
+    """Sends the documents of a recording's chunks to the index, in the order of the file.
+
+    Args:
+        entry: The recording.
+        database: The index.
+        through: What the index has.
+
+    Attributes:
+        through: What the index has.
+        added: The same with what is being sent, or waits for more.
+    """
+
+    def __init__(self, entry: RecordingEntry, database: Database, through: Through) -> None:
+        self.through = self.added = through
+        self._key = entry.key
+        self._database = database
+        self._places = TopicPlaces(database)
+        self._documents: dict[str, list[NDArray[np.uint8]]] = {}
+        self._size = 0
+        self._thread = Threads(1, "hybridlog-send")
+        self._sending: Future[None] | None = None
+
+    def prepare(self, topics: Collection[str]) -> None:
+        """Assign places to topics before their first documents."""
+        self._places.assigned(topics)
+
+    def add(self, documents: Sequence[Documents], entries: Sequence[ChunkEntry]) -> None:
+        """Add the documents of chunks that follow those added before.
+
+        Raises:
+            DatabaseError: An earlier sending has failed.
+        """
+        for part in documents:
+            self._documents.setdefault(part.topic, []).extend(part.tables)
+            self._size += part.size
+        last, messages = entries[-1], sum(entry.messages for entry in entries)
+        messages += self.added.messages
+        self.added = Through(last.segment, last.number, last.offset, messages)
+        if self._size >= _SEND_BYTES:
+            self.send()
+
+    def send(self, *, wait: bool = False) -> None:
+        """Send what was added, while more is made.
+
+        Args:
+            wait: True to wait until the index has it.
+
+        Raises:
+            DatabaseError: This sending has failed, or an earlier one.
+        """
+        if self._sending is not None:
+            self._sending.result()
+        if self.added != self.through:
+            documents, self._documents, self._size = self._documents, {}, 0
+            self._sending = self._thread.submit(self._send, documents, self.added)
+            if wait:
+                self._sending.result()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _send(self, documents: Mapping[str, list[NDArray[np.uint8]]], through: Through) -> None:
+        for collection, tables in self._by_collection(documents).items():
+            counts, widths = zip(*(table.shape for table in tables), strict=True)
+            data = b"".join(table.data for table in tables)
+            lengths = np.repeat(widths, counts).astype(np.int64)
+            self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
+        IndexState(self._database).put_through(self._key, through)
+        self.through = through
+
+    def _by_collection(
+        self, documents: Mapping[str, list[NDArray[np.uint8]]]
+    ) -> dict[str, list[NDArray[np.uint8]]]:
+        """The documents of topics by collection, with their keys there."""
+        found: dict[str, list[NDArray[np.uint8]]] = {}
+        for topic, place in self._places.assigned(documents.keys()).items():
+            own = [with_prefix(table, place.prefix) for table in documents[topic]]
+            found.setdefault(place.collection, []).extend(own)
+        return {collection: tables for collection, tables in found.items() if tables}
+
+
+class IndexWriter:
+    """Follows a recording that is being written.
+
+    One thread reads the chunks that were flushed: every few seconds, after many bytes, when a
+    segment is sealed and at the end. A failing database stops the index, never the recording:
+    the index goes on where it was as soon as the database answers again, at the latest when a
+    question needs it.
+
+    Args:
+        recording: The recording's directory.
+        entry: The recording.
+        target: Where documents go.
+        catalog: Gets the decoding results of each segment.
+        tables: Gets each chunk once, in the order of the file.
+        behind: Returns whether the recorder has more than it can write; this then waits.
+        spare: Processors for what can wait. One is held while documents or tables are made.
+        interval_s: Longest time between two passes, seconds.
+
+    Attributes:
+        failure: The error that stopped the index; None while it works.
+        database: The present connection to the index; None without one.
+        damage: Chunks that could not be read back: reason by segment and number.
+    """
+
+    def __init__(
+        self,
+        recording: Path,
+        entry: RecordingEntry,
+        target: IndexTarget,
+        catalog: Catalog,
+        *,
+        tables: TableWriter,
+        behind: Callable[[], bool] = lambda: False,
+        spare: AbstractContextManager[Any] | None = None,
+        interval_s: float = INTERVAL_S,
+    ) -> None:
+        self.failure = target.failure
+        self.database = target.database
+        self.damage: dict[tuple[int, int], str] = {}
+        self._recording = recording
+        self._entry = entry
+        self._target = target
+        self._catalog = catalog
+        self._tables = tables
+        self._behind = behind
+        self._spare = spare or nullcontext()
+        self._interval_s = interval_s
+        self._indexer = ChunkIndexer(entry.id, has_documents=target.is_wanted)
+        self._channels: Mapping[int, Channel] = {}
+        self._places: dict[int, list[ChunkPlace]] = {}  # chunks of segments that are not read yet
+        self._sealed: dict[int, str] = {}  # their digests
+        self._flushed = 0  # messages
+        self._unread = 0  # bytes since the last pass
+        self._next = 0, 0  # segment and number of the first chunk that is not decoded
+        self._stats: dict[int, Mapping[int, ChannelStats]] = {}  # of this segment, by chunk
+        self._reader: SegmentReader | None = None
+        self._sender: DocumentSender | None = None
+        if target.database is not None:
+            self._sender = DocumentSender(entry, target.database, NOTHING)
+        self._indexed = 0
+        self._retry_at = 0.0
+        self._renewed: list[Database] = []
+        self._crash: BaseException | None = None
+        self._has_ended = self._is_abandoned = False
+        # No event: a thread that is interrupted in `set` may leave it locked forever.
+        self._calls: SimpleQueue[str] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
+        self._thread.start()
+
+    @property
+    def indexed(self) -> int:
+        """Number of messages that the index has."""
+        return self._indexed if self._sender is None else self._sender.through.messages
+
+    @property
+    def missed(self) -> int:
+        """Number of messages that it lacks after a failure of the database."""
+        return self._flushed - self.indexed if self.failure is not None else 0
+
+    def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
+        """Note a chunk that is in its segment."""
+        if self._crash is not None:
+            raise self._crash
+        self._channels = channels
+        self._places.setdefault(chunk.segment, []).append(_place_of(chunk))
+        self._flushed += len(chunk.batch)
+        self._unread += len(chunk.batch.buffer)
+        if self._unread >= _INTERVAL_BYTES:
+            self._unread = 0
+            self._calls.put("")
+
+    def seal(self, sealed: Sealed) -> None:
+        """Note that a segment has all its chunks."""
+        self._places.setdefault(sealed.segment, [])
+        self._sealed[sealed.segment] = sealed.digest
+        self._calls.put("")
+
+    def prepare(self, channel: Channel, *, with_place: bool) -> None:
+        """Prepare a channel before its first message.
+
+        Args:
+            channel: The channel.
+            with_place: Whether to assign a place in MongoDB to its topic.
+        """
+        self._indexer.prepare(channel)
+        if with_place:
+            self._calls.put(channel.topic)
+
+    def close(self) -> None:
+        """Read all chunks; raise errors other than those of the database."""
+        self._has_ended = True
+        self._end()
+        if self._crash is not None:
+            raise self._crash
+
+    def abandon(self) -> None:
+        """Stop without reading waiting chunks."""
+        self._has_ended = self._is_abandoned = True
+        self._end()
+
+    def release(self) -> None:
+        """Close the connections made by this object; `database` may be one of them."""
+        for database in self._renewed:
+            database.close()
+        self._renewed.clear()
+
+    def _end(self) -> None:
+        self._calls.put("")
+        self._thread.join()
+
+    # The methods below run on the thread of the index.
+
+    def _run(self) -> None:
+        try:
+            due = 0.0
+            while True:
+                topic = ""
+                with suppress(Empty):
+                    topic = self._calls.get(timeout=max(due - time.monotonic(), 0))
+                has_ended = self._has_ended  # after the call, or its end would be waited for
+                if topic and not has_ended:
+                    self._prepare(topic)
+                    continue
+                if not self._is_abandoned:
+                    self._advance(has_ended=has_ended)
+                if has_ended:
+                    return
+                due = time.monotonic() + self._interval_s
+        except BaseException as error:
+            self._crash = error
+        finally:
+            self._stop_sending()
+            self._close_reader()
+
+    def _prepare(self, topic: str) -> None:
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.prepare([topic])
+
+    def _advance(self, *, has_ended: bool) -> None:
+        """Read what was flushed since the last pass."""
+        if self.failure is not None and (has_ended or time.monotonic() >= self._retry_at):
+            self._reconnect()
+        segment, first = self._next
+        if self._sender is not None:
+            added = self._sender.added
+            segment, first = min(self._next, (added.segment, added.chunk + 1))
+        while segment in self._places or segment < self._next[0]:
+            digest = self._sealed.get(segment)  # first: what it has is known then
+            reader = self._open(segment)
+            reader.grow()
+            places = self._places.get(segment)
+            if places is None:
+                places = reader.summary().chunks
+            for group in self._read(reader, places[first:]):
+                self._take(group)
+                if self._is_abandoned:
+                    return
+            if digest is None:
+                break
+            if segment == self._next[0]:
+                self._end_segment(segment, digest)
+            segment, first = segment + 1, 0
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.send(wait=has_ended)
+
+    def _read(
+        self, reader: SegmentReader, places: Sequence[ChunkPlace]
+    ) -> Iterator[list[StoredChunk]]:
+        """The chunks at some places; small ones in groups."""
+        group: list[StoredChunk] = []
+        size = 0
+        for place in places:
+            while self._behind():
+                time.sleep(_PAUSE_S)
+            try:
+                chunk = reader.read_chunk(place)
+            except SegmentError as error:
+                self.damage[reader.number, place.number] = str(error)
+                continue
+            size += len(chunk.batch.buffer)
+            if group and size > _GROUP_BYTES:
+                yield group
+                group, size = [], len(chunk.batch.buffer)
+            group.append(chunk)
+        if group:
+            yield group
+
+    def _take(self, chunks: Sequence[StoredChunk]) -> None:
+        """Make rows and documents of chunks of one segment."""
+        new = [chunk for chunk in chunks if (chunk.segment, chunk.number) >= self._next]
+        for chunk in new:
+            with self._spare:
+                self._tables.add(chunk, self._channels)
+        with self._spare:
+            documents, entries = self._indexer.documents_of(chunks, self._channels)
+        for entry in entries[len(chunks) - len(new) :]:
+            self._stats[entry.number] = entry.stats
+            self._next = entry.segment, entry.number + 1
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.add(documents, entries)
+
+    def _end_segment(self, segment: int, digest: str) -> None:
+        """Store the decoding results of a segment, if all of it could be read."""
+        places = self._places.pop(segment)
+        if len(self._stats) == len(places):
+            rows = decoded_rows([self._stats[number] for number in range(len(places))])
+            with suppress(HybridlogError):  # it is derived, and the disk may be full
+                self._catalog.put_stamps(self._entry.id, [(segment, digest, rows)])
+        self._stats = {}
+        self._next = segment + 1, 0
+
+    def _open(self, segment: int) -> SegmentReader:
+        """The reader of a segment, which may still grow."""
+        if self._reader is not None and self._reader.number == segment:
+            return self._reader
+        self._close_reader()
+        path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
+        try:
+            self._reader = SegmentReader(path, segment, direct=True)
+        except SegmentError:  # it may be sealed and renamed at this moment
+            sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
+            self._reader = SegmentReader(sealed, segment, direct=True)
+        return self._reader
+
+    def _close_reader(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    @contextmanager
+    def _noting_failure(self) -> Iterator[None]:
+        """Stop the index at a failure of the database."""
+        try:
+            yield
+        except DatabaseError as error:
+            self._fail(error)
+
+    def _fail(self, error: DatabaseError) -> None:
+        self._stop_sending()
+        self.failure = error
+        self._retry_at = time.monotonic() + _RETRY_S
+
+    def _stop_sending(self) -> None:
+        if self._sender is not None:
+            self._sender.close()
+            self._indexed, self._sender = self._sender.through.messages, None
+
+    def _reconnect(self) -> None:
+        """Go on after a failure of the database, from what a new connection has."""
+        if self._target.renew is None:
+            return
+        try:
+            database = self._target.renew()
+            self._renewed.append(database)
+            state = IndexState(database)
+            indexed = state.one(self._entry.key)
+            if indexed is None:  # it was unavailable when the recording began
+                state.put(self._entry, "open", turn=1)
+            # A killed server has lost what was not in its journal yet.
+            through = NOTHING if indexed is None else indexed.through
+        except DatabaseError as error:
+            self._fail(error)
+            return
+        self.database, self.failure = database, None
+        self._sender = DocumentSender(self._entry, database, through)
+
+
+def _place_of(chunk: StoredChunk) -> ChunkPlace:
+    return ChunkPlace(
+        offset=chunk.offset,
+        length=chunk.length,
+        trailer=chunk.trailer,
+        first=int(chunk.batch.log_time.min()),
+        last=int(chunk.batch.log_time.max()),
+        channels=(),
+        number=chunk.number,
+        crc=chunk.crc,
+        trailer_crc=chunk.trailer_crc,
+    )

@@ -1,0 +1,257 @@
+"""Chooses recordings among the summaries of a store.
+
+Only `where` asks about messages: the index or the tables of the recordings that satisfy the
+other conditions.
+"""
+
+from __future__ import annotations
+
+import difflib
+import time
+from collections.abc import Collection, Iterable, Sequence
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Question
+from hybridlog.query.times import TIME_LIMIT, format_time, is_relative, parse_range
+from hybridlog.query.topics import matcher, resolve, split_topic
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.choice import Choice
+    from hybridlog.query.times import TimeLike
+    from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
+
+_GLOB = frozenset("*?[")
+
+
+class Chosen(NamedTuple):
+    """The recordings that satisfy a choice.
+
+    Attributes:
+        summaries: The recordings in short, oldest first.
+        problem: The reason why there is none, with a cure; empty if there are any.
+    """
+
+    summaries: list[RecordingSummary]
+    problem: str
+
+
+class _NothingLeftError(Exception):
+    """No recording satisfies the conditions so far; its text is the hint."""
+
+
+def choose(session: Session, choice: Choice) -> Chosen:
+    """The recordings of a store that satisfy a choice.
+
+    Raises:
+        TopicError: A name without wildcards means no recording, or several; a topic pattern
+            is malformed.
+        TimeError: `during` is no range of times.
+        UsageError: A `where` lacks its topic.
+        WhereError: A predicate cannot be parsed, or does not fit the fields.
+    """
+    choosing = _Choosing(session)
+    try:
+        if not len(choosing.places) and not choice.is_everything:
+            raise _NothingLeftError("The store is empty: `hybridlog record FILE` fills it.")
+        if choice.name:
+            choosing.by_name(choice.name)
+        choosing.look()
+        for key, value in choice.tag:
+            choosing.by_tag(key, value)
+        for topic in choice.has:
+            choosing.by_topic(topic)
+        for name in choice.type:
+            choosing.by_type(name)
+        if choice.during is not None:
+            choosing.by_time(*choice.during)
+        for condition in choice.where:
+            choosing.by_content(condition)
+    except _NothingLeftError as nothing:
+        asked = ", ".join(choosing.conditions)
+        what = f"There is no recording {asked}. " if asked else ""
+        return Chosen([], f"{what}{nothing}")
+    return Chosen(choosing.summaries, "")
+
+
+def is_exact(session: Session, name: str) -> bool:
+    """True if a name is the whole label, id or name of one recording, or has no wildcards."""
+    return not _GLOB & set(name) or len(session.snapshot().called(name)) == 1
+
+
+def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
+    """Positions of recordings by names and globs.
+
+    Raises:
+        TopicError: A name without wildcards means no recording, or several.
+    """
+    snapshot = session.snapshot()
+    found: dict[int, None] = {}
+    for name in names:
+        if _GLOB & set(name) and not snapshot.called(name):
+            fitting = snapshot.matching(name) or snapshot.named(name)
+            found.update(dict.fromkeys(fitting))
+        else:
+            found.update(dict.fromkeys(session.named([name])))
+    return found
+
+
+class _Choosing:
+    """Narrows down the recordings of a store, one condition after the other."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._snapshot = session.snapshot()
+        self.places = np.arange(len(self._snapshot), dtype=np.intp)
+        self.conditions: list[str] = []
+
+    @property
+    def summaries(self) -> list[RecordingSummary]:
+        """Those that are left. Positions are of the snapshot at hand: a later one sorts anew."""
+        return [self._snapshot.summaries[place] for place in self.places.tolist()]
+
+    def look(self) -> None:
+        """See what those that go on have flushed."""
+        ids = [self._snapshot.summaries[place].id for place in self.places.tolist()]
+        self._snapshot = self._session.look(ids)
+        self.places = np.sort(np.array([self._snapshot.by_id[one] for one in ids], np.intp))
+
+    def _keep(self, places: Collection[int] | NDArray[np.intp], condition: str) -> bool:
+        """Keep those at some positions; true if any is left."""
+        self.conditions.append(condition)
+        kept = np.fromiter(places, np.intp, len(places))
+        self.places = np.intersect1d(self.places, kept)
+        return bool(len(self.places))
+
+    def by_name(self, names: Sequence[str]) -> None:
+        condition = f"named {' or '.join(map(repr, names))}"
+        if not self._keep(placed(self._session, names), condition):
+            labels = (summary.label for summary in self._snapshot.summaries)
+            raise _NothingLeftError(f"There are: {listed(labels)}.")
+
+    def by_tag(self, key: str, value: str | None) -> None:
+        tags = self._snapshot.tags
+        values = tags.get(key, {})
+        if value is None:
+            places = [place for found in values.values() for place in found]
+        else:
+            places = values.get(value, [])
+        shown = key if value is None else f"{key}={value}"
+        if self._keep(places, f"with the tag {shown}"):
+            return
+        if not tags:
+            hint = "No recording has a tag; `hybridlog tag RECORDING KEY=VALUE` sets one."
+        elif values and not places:
+            hint = f"The store has {listed(f'{key}={one}' for one in sorted(values))}."
+        else:
+            hint = f"The tags of the store are: {listed(sorted(tags))}."
+        raise _NothingLeftError(hint)
+
+    def by_topic(self, pattern: str) -> None:
+        topics, hint = self._topics(pattern)
+        if not self._keep(self._snapshot.having(topics), f"with the topic {pattern!r}"):
+            raise _NothingLeftError(hint)
+
+    def _topics(self, pattern: str) -> tuple[list[str], str]:
+        """The topics of the recordings that fit a pattern, and what to say if none does."""
+        fits = matcher([pattern])
+        known = self._snapshot.topics_at(self.places)
+        found = [topic for topic in known if fits(topic)]
+        if found:
+            return found, ""
+        try:
+            return resolve([pattern], known), ""  # an unambiguous name in another case
+        except TopicError as error:
+            text = str(error)
+            end = "" if text.endswith("?") else "."
+            return [], f"{text[:1].upper()}{text[1:].rstrip('.')}{end}"
+
+    def by_type(self, name: str) -> None:
+        names = self._session.type_names()
+        schemas = {digest for digest, known in names.items() if _is_type(known, name)}
+        found = self._snapshot.with_schemas(schemas)
+        if self._keep(found, f"with messages of the type {name!r}"):
+            return
+        known = sorted(set(names.values()))
+        near = difflib.get_close_matches(name, known, cutoff=0.6)
+        raise _NothingLeftError(
+            f"Did you mean {listed(near)}?" if near else f"The store has: {listed(known)}."
+        )
+
+    def by_time(self, begin: TimeLike | None, end: TimeLike | None) -> None:
+        for moment in (begin, end):
+            if is_relative(moment) and not _is_side(moment):
+                raise TimeError(
+                    f"A time for choosing recordings is absolute, not {moment!r}: write a date "
+                    "such as 2025-06-03, seconds since the epoch, `now`, `start` or `end`."
+                )
+        low, high = parse_range(
+            None if _is_side(begin) else begin,
+            None if _is_side(end) else end,
+            start=0,
+            end=TIME_LIMIT - 1,
+        )
+        before = self.places
+        places = self._snapshot.during(before, low, high, time.time_ns())
+        sides = [] if _is_side(begin) else [f"from {format_time(low)} on"]
+        if not _is_side(end):
+            sides.append(f"before {format_time(high)}")
+        condition = " ".join(["with messages", *sides])
+        if not self._keep(places, condition):
+            spans = [self._snapshot.summaries[place].span for place in before.tolist()]
+            known = [span for span in spans if span is not None]
+            hint = "`hybridlog ls` shows the times of all."
+            if known:
+                first = format_time(min(span[0] for span in known))
+                last = format_time(max(span[1] for span in known))
+                hint = f"The others lie between {first} and {last}."
+            raise _NothingLeftError(hint)
+
+    def by_content(self, condition: str) -> None:
+        pattern, predicate = split_topic(condition)
+        if not pattern:
+            raise UsageError(
+                f"Write TOPIC: PREDICATE, such as 'scan: ranges.min < 0.5', not {condition!r}."
+            )
+        topics, hint = self._topics(pattern)
+        there = np.intersect1d(self._snapshot.having(topics), self.places)
+        found: set[int] = set()
+        if len(there):
+            ids = tuple(self._snapshot.summaries[place].id for place in there.tolist())
+            question = Question(tuple(topics), ids)
+            if predicate:
+                asked = self._session.predicate(predicate, tuple(topics), ids)
+                question = Question(tuple(topics), ids, predicate=asked)
+            found = {self._snapshot.by_id[one] for one in self._having_any(question)}
+        if not self._keep(found, f"with a message for which {condition!r} holds"):
+            raise _NothingLeftError(hint or f"{len(there)} with {listed(topics)} were asked.")
+
+    def _having_any(self, question: Question) -> set[str]:
+        """Ids of the recordings with at least one message of the answer."""
+        return Planner(self._session, question, Counters()).recordings_with_any()
+
+
+def _is_side(moment: TimeLike | None) -> bool:
+    """True if a time leaves its side open."""
+    return moment is None or (isinstance(moment, str) and moment.strip() in {"start", "end"})
+
+
+def _is_type(name: str, pattern: str) -> bool:
+    """True if a type is meant: `sensor_msgs/msg/Imu` by itself, `sensor_msgs/Imu` or `Imu`."""
+    spelled = {name, _short(name), name.replace(".", "/").rpartition("/")[2]}
+    wanted = {pattern, _short(pattern)}
+    return any(fnmatchcase(one, want) or one == want for one in spelled for want in wanted)
+
+
+def _short(name: str) -> str:
+    """A ROS 2 type as ROS 1 spells it."""
+    return name.replace("/msg/", "/")

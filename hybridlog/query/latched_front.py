@@ -1,0 +1,162 @@
+"""The latched messages in front of a slice of a log that is being recorded."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Sequence
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from hybridlog.query.latching import KEEP_ALL, depth_of, publisher_of
+from hybridlog_storage.messages import Batch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Channel
+
+MAX_HELD: Final = 256 << 20
+"""Payload bytes that are held; the last message of each publisher is held in any case."""
+
+_BATCH = 2 << 20  # payload bytes
+
+
+class _Held(NamedTuple):
+    """A message; the order is that of log time and arrival."""
+
+    log_time: int
+    number: int
+    channel: int
+    publish_time: int
+    sequence: int
+    payload: bytes
+
+
+class LatchedFront:
+    """Holds the last messages of each publisher from before a slice until the log has ended.
+
+    A log may be out of order, so only its end shows which messages are the last ones. Their
+    log time becomes that of the slice's beginning. Messages of their channels with that very
+    log time are held, too: of equal log times, the one that arrived last is current.
+
+    Args:
+        begin: Log time of the beginning, ns.
+        original_times: The messages keep their log time.
+
+    Attributes:
+        messages: Number of latched messages from before the slice.
+        left_out: Number of those that were in force and could not be held.
+    """
+
+    def __init__(self, begin: int, *, original_times: bool) -> None:
+        self._begin = begin
+        self._original_times = original_times
+        self._depths: list[int] = []
+        self._publishers: list[Hashable] = []
+        self._has_publish_time: list[bool] = []
+        self._last: dict[Hashable, list[_Held]] = defaultdict(list)
+        self._at_begin: list[_Held] = []
+        self._size = 0
+        self._number = 0
+        self.messages = 0
+        self.left_out = 0
+
+    def split(
+        self, batch: Batch, inside: NDArray[np.bool_], channels: Sequence[Channel]
+    ) -> tuple[Batch, NDArray[np.bool_]]:
+        """Take the messages to hold from a batch.
+
+        Args:
+            batch: The next messages of the log, of the wanted topics.
+            inside: bool[n], True for messages of the slice.
+            channels: The log's channels.
+
+        Returns:
+            The batch and bool[n], True for messages to write at once. Among them are messages
+            from before the slice of publishers that keep all of theirs.
+        """
+        for channel in channels[len(self._depths) :]:
+            self._depths.append(depth_of(channel))
+            self._publishers.append(publisher_of(channel))
+            self._has_publish_time.append(channel.has_publish_time)
+        depth = np.array(self._depths, np.int64)[batch.channel]
+        before = batch.log_time < self._begin
+        always = before & (depth == KEEP_ALL)
+        hold = before & (depth > 0) & ~always
+        if not self._original_times:
+            hold |= (batch.log_time == self._begin) & (depth > 0) & (depth < KEEP_ALL) & inside
+        for row in np.flatnonzero(hold).tolist():
+            hold[row] = self._hold(batch, row)
+        if always.any():
+            self.messages += int(always.sum())
+            batch = self._moved(batch)
+        return batch, (inside | always) & ~hold
+
+    def _hold(self, batch: Batch, row: int) -> bool:
+        """Hold a message; False for one that is to be written at once."""
+        self._number += 1
+        channel = int(batch.channel[row])
+        held = _Held(
+            int(batch.log_time[row]),
+            self._number,
+            channel,
+            int(batch.publish_time[row]),
+            int(batch.sequence[row]),
+            bytes(batch.payload(row)),
+        )
+        if held.log_time == self._begin:
+            if self._size + len(held.payload) > MAX_HELD:
+                return False
+            self._size += len(held.payload)
+            self._at_begin.append(held)
+            return True
+        last = self._last[self._publishers[channel]]
+        heappush(last, held)
+        self._size += len(held.payload)
+        if len(last) > self._depths[channel]:
+            self._size -= len(heappop(last).payload)
+        while self._size > MAX_HELD and len(last) > 1:
+            self._size -= len(heappop(last).payload)
+            self.left_out += 1
+        return True
+
+    def batches(self) -> Iterator[Batch]:
+        """The held messages, in order; `channel` indexes the log's channels."""
+        front = sorted(held for last in self._last.values() for held in last)
+        self.messages += len(front)
+        group: list[_Held] = []
+        size = 0
+        for held in [*front, *self._at_begin]:
+            group.append(held)
+            size += len(held.payload)
+            if size >= _BATCH:
+                yield self._moved(_batch_of(group))
+                group, size = [], 0
+        if group:
+            yield self._moved(_batch_of(group))
+
+    def _moved(self, batch: Batch) -> Batch:
+        """The messages with the log time of the beginning, where they are from before it."""
+        if self._original_times:
+            return batch
+        moved = batch.take(slice(None))
+        moved.log_time = np.maximum(batch.log_time, self._begin)
+        # Without publish times, they repeat the log times.
+        has_own = np.array(self._has_publish_time)[batch.channel]
+        moved.publish_time = np.where(has_own, batch.publish_time, moved.log_time)
+        return moved
+
+
+def _batch_of(group: Sequence[_Held]) -> Batch:
+    length = np.fromiter((len(held.payload) for held in group), np.int64, len(group))
+    return Batch(
+        buffer=b"".join(held.payload for held in group),
+        offset=np.cumsum(length) - length,
+        length=length,
+        channel=np.array([held.channel for held in group], np.int32),
+        log_time=np.array([held.log_time for held in group], np.int64),
+        publish_time=np.array([held.publish_time for held in group], np.int64),
+        sequence=np.array([held.sequence for held in group], np.uint32),
+    )

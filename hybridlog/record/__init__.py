@@ -1,0 +1,1 @@
+"""Writes recordings: the recorder, its capture, losses and marks."""

@@ -1,0 +1,306 @@
+"""A recording in progress: its directory, its segments and its index.
+
+Messages of log files and of running robots both go through a `Capture`. It starts the
+recording, provides its writer, and completes or removes the recording.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import BoundedSemaphore
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.entries import new_id, recording_metadata, sealed_event, text
+from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
+from hybridlog.maintenance.index import finish
+from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
+from hybridlog.tables.writer import TableWriter
+from hybridlog_storage import journal
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
+from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.topic_places import TopicPlaces
+from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import Catalog
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.segments.segment_file import Sealed
+
+
+@dataclass(frozen=True, slots=True)
+class Backpressure:
+    """Settings of a live recording, which cannot wait for compression, disk and index.
+
+    Attributes:
+        hurry: Returns whether writing is behind. Then only chunks that shrink to a fifth are
+            compressed.
+        behind: Returns whether writing is so far behind that indexing pauses.
+        index_interval_s: Longest time between two passes of the index, seconds.
+        next_chunk_size: Returns the size in bytes of the next chunk.
+        spare: Semaphore of the processors for packing that can wait, and for making documents
+            and tables.
+        on_written: Called on another thread when less content waits for the disk. `append`
+            then never waits; its caller watches `writer.waiting`.
+    """
+
+    hurry: Callable[[], bool]
+    behind: Callable[[], bool]
+    index_interval_s: float
+    next_chunk_size: Callable[[], int]
+    spare: BoundedSemaphore
+    on_written: Callable[[], None]
+
+
+class Capture:
+    """Records the messages of one new recording.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        target: Where its index documents go.
+        name: Name of the recording.
+        tags: Tags of the recording.
+        source: Origin of its messages, for the catalog.
+        settings: Rotation, chunks and compression of segments.
+        pressure: Settings for a caller that cannot wait for compression, disk and index.
+        no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
+            no topic.
+        check: Called with the catalog before anything is written, while no other process can
+            start a recording; raises to refuse.
+
+    Attributes:
+        entry: The recording's catalog entry.
+        writer: Writer of its segments.
+        index: Writer of its index.
+    """
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        target: IndexTarget,
+        *,
+        name: str,
+        tags: Mapping[str, str],
+        source: Mapping[str, Any],
+        settings: SegmentSettings,
+        pressure: Backpressure | None = None,
+        no_index: Callable[[str], bool] | None = None,
+        check: Callable[[Catalog], None] | None = None,
+    ) -> None:
+        self.catalog = catalog
+        self._directory = directory
+        self._no_index = no_index or (lambda _: False)
+        self._sync = settings.sync != "never"
+        self._end: Mapping[str, Any] | None = None
+        self._turn = 1
+        self._held = ExitStack()
+        with self._held, directory.alone():
+            # Of two processes that record the same content now, one is refused.
+            if check is not None:
+                check(self.catalog)
+            self.entry = self._begin(name, tags, source, target.database)
+            self._held = self._held.pop_all()
+        self._target = target
+        recording = directory.recording(self.entry.label)
+        self._tables = TableWriter(directory.path, self.entry.id)
+        self.index = IndexWriter(
+            recording,
+            self.entry,
+            target,
+            catalog,
+            tables=self._tables,
+            behind=pressure.behind if pressure else lambda: False,
+            spare=pressure.spare if pressure else None,
+            interval_s=pressure.index_interval_s if pressure else INTERVAL_S,
+        )
+        self._held.callback(self.index.release)
+        self.writer = RecordingWriter(
+            recording,
+            recording_metadata(self.entry),
+            self.index.submit,
+            settings,
+            no_index=self._no_index,
+            on_sealing=self._announce,
+            hurry=pressure.hurry if pressure else None,
+            next_chunk_size=pressure.next_chunk_size if pressure else None,
+            spare=pressure.spare if pressure else None,
+            on_written=pressure.on_written if pressure else None,
+        )
+
+    @property
+    def indexed(self) -> int:
+        """Number of messages in the index, after the end."""
+        return max(0, self.index.indexed - (self.entry.messages - self.entry.documents))
+
+    @property
+    def lag(self) -> int:
+        """Messages that are to be in the index, and are not yet."""
+        lag = self.writer.totals.messages - self.index.indexed
+        return max(lag, 0) if self._target.is_wanted else 0
+
+    def expect(self, channel: Channel) -> None:
+        """Prepare a channel before its first message."""
+        self.index.prepare(channel, with_place=not self._no_index(channel.topic))
+
+    def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
+        """Complete the recording; `entry` is then complete, too.
+
+        Args:
+            end: The end of the recording: `status` and `losses`.
+
+        Returns:
+            Why the index is not complete, None when it is.
+        """
+        # From here on only the last segment is sealed, which announces the end.
+        self.writer.flush()
+        self._end = end
+        self.writer.close(json_metadata(END_METADATA, end))
+        return self._finish()
+
+    def give_up(
+        self, end: Mapping[str, Any], lost: Sequence[Mapping[str, Any]]
+    ) -> DatabaseError | None:
+        """Complete the recording on a full disk.
+
+        Args:
+            end: As for `close`.
+            lost: Rows of the loss ledger.
+
+        Returns:
+            Why the index is not complete, None when it is.
+
+        Raises:
+            DiskFullError: No room for that either. Without any message, the recording is gone.
+        """
+        self._end = end  # the segment holds the last losses
+        try:
+            self.writer.give_up(
+                [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
+            )
+        except DiskFullError:
+            if not self.writer.written.total():
+                self.forget()
+            raise
+        return self._finish()
+
+    def _announce(self, sealed: Sealed) -> None:
+        """Write a segment into the journal before it gets its final name."""
+        lines = [sealed_event(sealed)]
+        if self._end is not None:
+            lines.append(journal.event(journal.ENDED, end=dict(self._end)))
+        self._journal.append(*lines)
+        messages = sum(channel.messages for channel in sealed.channels)
+        self._tables.seal(sealed.segment, sealed.digest, messages)
+        self.index.seal(sealed)
+
+    def _finish(self) -> DatabaseError | None:
+        self.index.close()
+        failure = self.index.failure
+        label = self.entry.label
+        if self.index.damage:
+            self.catalog.put_damage(self.entry.id, self.index.damage)
+        try:
+            if failure is None:
+                database = self.index.database
+                self.entry = finish(self._directory, self.catalog, database, label, turn=self._turn)
+        except DatabaseError as error:
+            failure = error
+        if failure is not None:
+            self.entry = put_entry(self._directory, self.catalog, label)
+        self._tables.close(self.entry)
+        self._held.close()
+        return failure
+
+    def leave(self) -> None:
+        """Stop at once; flushed messages stay, and the next opening of the store seals them."""
+        self.writer.abort()
+        self.index.abandon()
+        self._tables.discard()
+        self._held.close()
+
+    def forget(self) -> None:
+        """Remove the whole recording; the next opening finishes a removal that fails."""
+        label, entry = self.entry.label, self.entry
+        with suppress(HybridlogError):  # the directory's hidden name announces it, too
+            announce_removal(self._directory, label)
+        self.writer.abort()
+        self.index.abandon()
+        self._tables.discard()
+        with suppress(HybridlogError):
+            remove_files(self._directory, label)
+        with suppress(HybridlogError):
+            self.catalog.remove(entry.id)
+        # If MongoDB is unavailable, the next connection finds an entry without files.
+        database = self.index.database
+        with suppress(HybridlogError):
+            if database is not None:
+                state = IndexState(database)
+                topics = {channel.topic for channel in self.writer.channels.values()}
+                state.clear(entry.key, TopicPlaces(database).of(topics).values())
+                state.remove(entry.key)
+        self._held.close()
+
+    def _begin(
+        self,
+        name: str,
+        tags: Mapping[str, str],
+        source: Mapping[str, Any],
+        database: Database | None,
+    ) -> RecordingEntry:
+        """Create and lock the recording's directory, its journal and its index entry."""
+        name = text(name)
+        label = self._directory.new_recording(name)
+        try:
+            path = self._directory.recording(label)
+            lock = self._directory.writing(label, wait_s=LOCK_WAIT_S, records=True)
+            self._held.enter_context(lock)
+            entry = RecordingEntry(
+                id=new_id(),
+                label=label,
+                name=name,
+                tags={text(key): text(value) for key, value in tags.items()},
+                source=dict(source),
+                created=time.time_ns(),
+                status="open",
+            )
+            self._journal = Journal(path, sync=self._sync)
+            self._journal.append(
+                journal.event(
+                    journal.BEGUN,
+                    id=entry.id,
+                    store=self._directory.settings.store_id,
+                    name=entry.name,
+                    tags=entry.tags,
+                    source=entry.source,
+                    created=entry.created,
+                    origin=origin(),
+                )
+            )
+            put_entry(self._directory, self.catalog, label, is_open=True)
+            if database is not None:
+                IndexState(database).put(entry, "open", turn=self._turn)
+        except BaseException:
+            self._directory.sweep(self._directory.hide(label))
+            raise
+        return entry
+
+
+def origin() -> dict[str, Any]:
+    """The origin of a recording: host, boot, recorder, clock."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        boot = ""
+    return {"host": platform.node(), "boot": boot, "recorder": "hybridlog", "clock": "realtime"}

@@ -1,0 +1,361 @@
+"""Recording a log into the store: source to segments to index.
+
+The recorder gets its parts as arguments. A complete recording has everything that could
+be read, and a loss ledger of everything that could not. A failed recording leaves nothing
+behind.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.entries import text
+from hybridlog.query.latched_front import LatchedFront
+from hybridlog.record.capture import Capture
+from hybridlog.schema.completion import TRIED_MESSAGES, completed
+from hybridlog.wording import listed
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.errors import (
+    AlreadyRecordedError,
+    DatabaseError,
+    SourceError,
+    TopicError,
+)
+from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.ordering import distinct
+from hybridlog_storage.segments.attachments import Attachment
+from hybridlog_storage.segments.segment_format import OUR_NAMES
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.stopping import at_safe_points, safe_point
+from hybridlog_storage.times import placed
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.index.index_writer import IndexTarget
+    from hybridlog.query.topics import TopicMatcher
+    from hybridlog.sources.base import Damage, Source
+    from hybridlog.sources.fingerprint import Fingerprint
+    from hybridlog_storage.catalog import Catalog
+    from hybridlog_storage.disk.directory import StoreDirectory
+
+_MOST_PARTS = 1000  # of a log, whose fingerprints the recording has
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOptions:
+    """Options of a recording.
+
+    Attributes:
+        name: Name of the recording; by default that of the file.
+        tags: Tags of the recording.
+        matcher: Selects topics; None for all.
+        between: Log time `[begin, end)`, ns; None for all.
+        latched: With `between`, also the latched messages that are in force when it begins.
+        original_times: They keep their log time, instead of that of the beginning.
+        again: True to record even if the same content is in the store.
+        settings: Rotation, chunks and compression of segments.
+        no_index: Selects topics whose messages get no documents in MongoDB; None for none.
+    """
+
+    name: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
+    matcher: TopicMatcher | None = None
+    between: tuple[int, int] | None = None
+    latched: bool = True
+    original_times: bool = False
+    again: bool = False
+    settings: SegmentSettings = field(default_factory=SegmentSettings)
+    no_index: TopicMatcher | None = None
+
+
+@dataclass(slots=True)
+class RecordReport:
+    """The result of a recording.
+
+    Attributes:
+        entry: The recording's entry in the catalog.
+        damage: Unreadable parts of the source.
+        indexed: Messages in the index.
+        missed: Stored messages whose index documents are missing.
+        failure: The reason why they are missing.
+        skipped: Messages left out by topic or time.
+        elapsed_s: Wall time, seconds.
+        latched: Latched messages from before the time range.
+        latched_left_out: Those that were in force and did not fit in memory.
+        attachments_left_out: Attachments from behind the time range.
+    """
+
+    entry: RecordingEntry
+    damage: list[Damage]
+    indexed: int
+    missed: int
+    failure: DatabaseError | None
+    skipped: int
+    elapsed_s: float
+    latched: int = 0
+    latched_left_out: int = 0
+    attachments_left_out: int = 0
+
+
+@at_safe_points()
+def record(
+    source: Source,
+    directory: StoreDirectory,
+    catalog: Catalog,
+    target: IndexTarget,
+    *,
+    fingerprint: Fingerprint,
+    options: RecordOptions,
+    progress: Callable[[int, int], None] | None = None,
+) -> RecordReport:
+    """Record a whole source. A signal stops it at safe points only, and then nothing is stored.
+
+    Args:
+        source: The source, open and not yet read.
+        directory: The store.
+        catalog: Its catalog.
+        target: Where its index documents go.
+        fingerprint: Fingerprint of the source's content.
+        options: Options of the recording.
+        progress: Called periodically with bytes read and messages stored.
+
+    Raises:
+        AlreadyRecordedError: the same content is in the store.
+        SourceError: nothing could be read.
+        DiskFullError: no space; nothing is stored.
+    """
+    started = time.monotonic()
+
+    def refuse_known(catalog: Catalog) -> None:
+        if not options.again:
+            _refuse_known(catalog, source, fingerprint)
+
+    capture = Capture(
+        directory,
+        catalog,
+        target,
+        name=options.name or _name_of(source.path),
+        tags=options.tags,
+        source={
+            "path": text(str(source.path)),
+            "kind": source.kind,
+            "profile": source.profile,
+            "bytes": source.size_bytes,
+            **_identity(fingerprint),
+        },
+        settings=options.settings,
+        no_index=options.no_index,
+        check=refuse_known,
+    )
+    try:
+        copy = _Copy(source, capture.writer, options)
+        copy.run(progress)
+        _check_result(source, capture.writer, options)
+        failure = capture.close(_end_of(source))
+    except BaseException:
+        # Remove a partial recording: the source still exists, the command can be repeated.
+        capture.forget()
+        raise
+    return RecordReport(
+        capture.entry,
+        list(source.damage),
+        capture.indexed,
+        capture.index.missed,
+        failure,
+        copy.skipped,
+        time.monotonic() - started,
+        latched=copy.front.messages if copy.front is not None else 0,
+        latched_left_out=copy.front.left_out if copy.front is not None else 0,
+        attachments_left_out=copy.attachments_left_out,
+    )
+
+
+class _Copy:
+    """Copies everything wanted from a source to a writer.
+
+    Attributes:
+        front: The latched messages in front of a slice; None for none.
+        skipped: Messages left out.
+        attachments_left_out: Attachments left out.
+    """
+
+    def __init__(self, source: Source, writer: RecordingWriter, options: RecordOptions) -> None:
+        self.front: LatchedFront | None = None
+        if options.between is not None and options.latched:
+            self.front = LatchedFront(options.between[0], original_times=options.original_times)
+        self.skipped = 0
+        self.attachments_left_out = 0
+        self._source = source
+        self._writer = writer
+        self._between = options.between
+        self._choice = _Choice(options, self.front)
+        self._completed = _Completed(source)
+
+    def run(self, progress: Callable[[int, int], None] | None) -> None:
+        """Copy the source from its beginning to its end."""
+        source, writer = self._source, self._writer
+        read = 0
+        for batch in source.batches():
+            safe_point()
+            self._copy_extras()
+            read += len(batch)
+            kept = self._choice.of(batch, source.channels)
+            writer.append(kept, self._completed.of(kept))
+            if progress is not None:
+                progress(source.bytes_read, writer.totals.messages)
+        for batch in self.front.batches() if self.front is not None else ():
+            writer.append(batch, self._completed.of(batch))
+        self._copy_extras()
+        for channel in self._choice.channels(self._completed.all()):
+            writer.declare(channel)
+        self.skipped = read - writer.totals.messages
+
+    def _copy_extras(self) -> None:
+        """Store attachments and metadata records; a slice holds the attachments up to its end."""
+        for extra in self._source.extras:
+            if isinstance(extra, Attachment):
+                if self._between is not None and extra.log_time >= self._between[1]:
+                    self.attachments_left_out += 1
+                    continue
+            elif extra.name.startswith(OUR_NAMES):
+                continue
+            self._writer.add_extra(extra)
+        self._source.extras.clear()
+
+
+class _Completed:
+    """The channels of a source, completed with standard definitions by their first messages."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._channels: list[Channel] = []
+        self._open: set[int] = set()
+
+    def of(self, batch: Batch) -> list[Channel]:
+        """The channels of a batch, by their numbers in the source."""
+        self._learn()
+        if self._open and len(batch):
+            for number in self._open.intersection(distinct(batch.channel).tolist()):
+                rows = np.flatnonzero(batch.channel == number)
+                some = rows[:: max(1, len(rows) // TRIED_MESSAGES)].tolist()
+                payloads = [batch.payload(row) for row in some]
+                self._channels[number] = completed(self._channels[number], payloads)
+                self._open.discard(number)
+        return self._channels
+
+    def all(self) -> list[Channel]:
+        """All channels of the source; those without messages are completed by proof only."""
+        self._learn()
+        for number in self._open:
+            self._channels[number] = completed(self._channels[number], [])
+        self._open.clear()
+        return self._channels
+
+    def _learn(self) -> None:
+        known = len(self._channels)
+        self._channels += self._source.channels[known:]
+        self._open.update(range(known, len(self._channels)))
+
+
+class _Choice:
+    """Selects the wanted messages."""
+
+    def __init__(self, options: RecordOptions, front: LatchedFront | None) -> None:
+        self._matcher = options.matcher
+        self._between = options.between
+        self._front = front
+        self._wanted: list[bool] = []
+
+    def channels(self, channels: list[Channel]) -> list[Channel]:
+        """The wanted ones of some channels."""
+        if self._matcher is None:
+            return channels
+        return [channel for channel in channels if self._matcher(channel.topic)]
+
+    def of(self, batch: Batch, channels: list[Channel]) -> Batch:
+        """The wanted messages of a batch."""
+        if self._matcher is not None:
+            for channel in channels[len(self._wanted) :]:
+                self._wanted.append(self._matcher(channel.topic))
+            batch = _where(batch, np.array(self._wanted, np.bool_)[batch.channel])
+        if self._between is not None:
+            begin, end = self._between
+            times = placed(batch.log_time)
+            inside = (times >= begin) & (times < end)
+            if self._front is not None:
+                batch, inside = self._front.split(batch, inside, channels)
+            batch = _where(batch, inside)
+        return batch
+
+
+def _where(batch: Batch, mask: NDArray[np.bool_]) -> Batch:
+    return batch if mask.all() else batch.take(mask)
+
+
+def _check_result(source: Source, writer: RecordingWriter, options: RecordOptions) -> None:
+    if not writer.totals.messages and source.damage:
+        first = source.damage[0]
+        raise SourceError(f"{source.path}: no message could be read: {first.reason}")
+    if options.matcher is not None and not writer.totals.messages:
+        topics = listed(sorted({c.topic for c in source.channels}), 20)
+        raise TopicError(
+            f"{source.path}: no message is on the topics asked for; the log has: {topics}"
+        )
+
+
+def _end_of(source: Source) -> dict[str, Any]:
+    losses = [
+        {
+            "cause": "source damaged",
+            "file": text(damage.file.name),
+            "offset": damage.offset,
+            "length": damage.length,
+            "reason": damage.reason,
+            "count": damage.messages_lost,
+            "topic": None,
+            "from": None,
+            "to": None,
+        }
+        for damage in source.damage
+    ]
+    return {"status": "damaged" if losses else "complete", "losses": losses}
+
+
+def _identity(fingerprint: Fingerprint) -> dict[str, object]:
+    """The fingerprint of a log in the description of its recording."""
+    several = 1 < len(fingerprint.parts) <= _MOST_PARTS
+    parts = {"parts": list(fingerprint.parts)} if several else {}
+    return {"fingerprint": fingerprint.whole, **parts}
+
+
+def _refuse_known(catalog: Catalog, source: Source, fingerprint: Fingerprint) -> None:
+    known = catalog.with_fingerprint(fingerprint.whole)
+    if known is None and len(fingerprint.parts) > 1:
+        parts = [catalog.with_fingerprint(part) for part in fingerprint.parts]
+        labels = dict.fromkeys(one.label for one in parts if one is not None)
+        if None not in parts:
+            raise AlreadyRecordedError(
+                f"{source.path} is in the store already, part by part: {listed(labels)}. "
+                "Use --again to record it once more."
+            )
+    if known is not None:
+        state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
+        raise AlreadyRecordedError(
+            f"{source.path} is in the store already, as {known.label!r}"
+            f"{state.get(known.status, '')}. "
+            "Use --again to record it once more."
+        )
+
+
+def _name_of(path: Path) -> str:
+    name = path.resolve().name
+    for suffix in (".active", ".zstd", ".bag", ".mcap", ".db3"):
+        name = name.removesuffix(suffix)
+    return name or "recording"

@@ -1,0 +1,185 @@
+"""A recording that goes on: what is sealed, and what is flushed besides.
+
+Its entry is like that of an ended recording, as of one moment. The catalog has what is sealed;
+the rest is read from the open segments, each byte once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.entries import topic_types
+from hybridlog.index.indexing import ChunkIndexer
+from hybridlog.record.losses import Cause, joined
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.catalog import ChannelEntry, ChannelStats, channel_entry, channel_totals
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.segments.open_segment import OpenSegment
+from hybridlog_storage.segments.segment_file import OPEN_SUFFIX
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.messages import Schema
+    from hybridlog_storage.segments.segment_reader import SegmentReader
+    from hybridlog_storage.summary import TopicType
+
+
+class RunningRecording:
+    """Follows a recording while it is written. Not thread safe.
+
+    Args:
+        directory: The store.
+        label: Label of the recording.
+        sealed: Returns its entry by the catalog, with what is sealed; None if it is gone.
+
+    Attributes:
+        entry: The recording at the last look; None if it is gone.
+        topics: Its topics and their types.
+        schemas: Schemas of segments that are not sealed, by hash.
+    """
+
+    def __init__(
+        self, directory: StoreDirectory, label: str, sealed: Callable[[], RecordingEntry | None]
+    ) -> None:
+        self._directory = directory
+        self._label = label
+        self._read_sealed = sealed
+        self._sealed: RecordingEntry | None = None
+        self._state = "", False  # the look of its directory, and whether it is being written
+        self._segments: dict[int, OpenSegment] = {}
+        self._unreadable: dict[int, str] = {}  # why, by number of the segment
+        self._indexer: ChunkIndexer | None = None
+        self.entry: RecordingEntry | None = None
+        self.topics: set[TopicType] = set()
+        self.schemas: dict[str, Schema] = {}
+
+    def follow(self) -> bool:
+        """See what was flushed, sealed or begun since.
+
+        Returns:
+            True if the entry has changed.
+
+        Raises:
+            StoreError: Its files cannot be read.
+        """
+        look = self._directory.looks([self._label]).get(self._label, "")
+        state = look, self._directory.is_recorded(self._label)
+        is_same = state == self._state
+        if not is_same:
+            self._begin()
+        before = dict(self._unreadable)
+        is_new = False
+        for number, segment in self._segments.items():
+            with self._noting(number):
+                is_new |= segment.follow()
+        if is_same and not is_new and before == self._unreadable:
+            return False
+        self._state = state
+        self.entry = None if self._sealed is None else self._with_flushed(self._sealed)
+        self.topics = set() if self.entry is None else topic_types(self.entry)
+        return True
+
+    def is_cut(self) -> bool:
+        """True if chunks that were read have been taken back, on a full disk."""
+        return any(segment.is_cut() for segment in self._segments.values())
+
+    def reader(self, number: int) -> SegmentReader | None:
+        """The reader of a segment that is not sealed; None for others."""
+        segment = self._segments.get(number)
+        return None if segment is None else segment.reader
+
+    @contextmanager
+    def _noting(self, number: int) -> Iterator[None]:
+        """Note why a segment cannot be read; the other ones answer."""
+        try:
+            yield
+            self._unreadable.pop(number, None)
+        except SegmentError as error:
+            self._unreadable[number] = str(error)
+
+    def _begin(self) -> None:
+        """Read again what is sealed, and open the segments that are not."""
+        # Listed first: what is sealed meanwhile is then in neither, or in both.
+        opened = self._directory.listing(self._label).open
+        self._sealed = self._read_sealed()
+        before, self._segments = self._segments, {}
+        self._unreadable.clear()
+        if self._sealed is None or self._sealed.status not in UNFINISHED:
+            return
+        path = self._directory.recording(self._sealed.label)
+        for number in opened:
+            if str(number) in self._sealed.digests:
+                continue
+            with self._noting(number):
+                self._segments[number] = before.get(number) or OpenSegment(path, number)
+        if self._indexer is None:
+            self._indexer = ChunkIndexer(self._sealed.id)
+
+    def _with_flushed(self, sealed: RecordingEntry) -> RecordingEntry:
+        """The entry with what is flushed besides."""
+        channels = {channel.id: replace(channel) for channel in sealed.channels}
+        found = replace(sealed, end=dict(sealed.end), spans=list(sealed.spans))
+        found.flushed = {number: one.flushed for number, one in self._segments.items()}
+        for number, (table, attachments, metadata) in found.flushed.items():
+            segment = self._segments[number]
+            self._add_channels(channels, segment)
+            silent = {channel.id for channel in channels.values() if not channel.has_publish_time}
+            for channel_id, stats in channel_totals(table, None, silent).items():
+                channels[channel_id].stats = _sum(channels[channel_id].stats, stats)
+            if len(table.parts):
+                span = int(table.parts["first"].min()), int(table.parts["last"].max())
+                found.spans.append((number, *span))
+                found.is_decoded = False
+            found.stored_bytes += segment.end
+            found.segments += 1
+            found.chunks += len(table.chunks)
+            found.attachments += len(attachments)
+            found.metadata_records += len(metadata)
+        found.channels = [channels[number] for number in sorted(channels)]
+        losses = list(_losses(sealed, self._segments, self._unreadable))
+        if losses:
+            found.end["losses"] = losses
+        return found
+
+    def _add_channels(self, channels: dict[int, ChannelEntry], segment: OpenSegment) -> None:
+        assert self._indexer is not None
+        for number, channel in segment.channels.items():
+            if number not in channels:
+                reason = self._indexer.reason(number, channel)
+                channels[number] = found = channel_entry(number, channel, reason)
+                if channel.schema is not None and found.schema is not None:
+                    self.schemas[found.schema] = channel.schema
+
+
+def _sum(one: ChannelStats, other: ChannelStats) -> ChannelStats:
+    total = replace(one)
+    total.add(other)
+    return total
+
+
+def _losses(
+    sealed: RecordingEntry, segments: Mapping[int, OpenSegment], unreadable: Mapping[int, str]
+) -> Iterator[dict[str, Any]]:
+    """The loss ledger: what sealed segments and flushed records say, and what is damaged."""
+    before = sealed.end.get("losses", ())
+    rows = [row for row in before if row["cause"] != Cause.SEGMENT]
+    yield from joined([*rows, *(row for one in segments.values() for row in one.losses)])
+    yield from (row for row in before if row["cause"] == Cause.SEGMENT)
+    for number, segment in segments.items():
+        for damage in filter(None, (*segment.damaged, segment.stopped)):
+            yield _damaged(number, damage.reason, damage.offset, damage.length)
+    for number, reason in unreadable.items():
+        yield _damaged(number, reason)
+
+
+def _damaged(
+    number: int, reason: str, offset: int | None = None, length: int | None = None
+) -> dict[str, Any]:
+    """A row for an unknown number of messages at unknown times."""
+    place = {"file": f"{number:06d}{OPEN_SUFFIX}", "offset": offset, "length": length}
+    nothing = {"count": None, "topic": None, "from": None, "to": None}
+    return {"cause": Cause.SEGMENT.value, **place, "reason": reason, **nothing}

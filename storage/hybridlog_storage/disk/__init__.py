@@ -1,0 +1,1 @@
+"""Files and directories: durability, guards, locks, temporary names."""

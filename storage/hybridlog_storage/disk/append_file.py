@@ -1,0 +1,248 @@
+"""A file that only grows, written past the page cache where the file system allows it.
+
+A recorder does not read its own output again. Copying it into the page cache costs
+processor time, and stalls later writers when the kernel flushes the cache. Direct writes
+avoid both, but must start and end at whole blocks. So the bytes behind the last whole
+block also stay in memory; the next write repeats them, padded with zeros to a whole block.
+A file that was never closed may therefore end in up to a block of zeros. Large content
+that starts at a block, in memory and in the file, is written without a copy; all other
+content is staged.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import stat
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from hybridlog_storage.buffers import buffers
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.durability import left_over, sync_file, write_all
+from hybridlog_storage.messages import Buffer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BLOCK = 4096
+"""Bytes of a block; a multiple of every device's block size."""
+_STAGE = 4 << 20
+DIRECT: int = getattr(os, "O_DIRECT", 0)
+"""Flag of direct reads and writes, 0 if not supported."""
+_OWN = 1 << 18  # bytes from which content is not staged; pool buffers start at a block
+_REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
+
+
+class AppendFile:
+    """A file open for appending.
+
+    Args:
+        fd: The file; it is closed with this object.
+        position: Its length, bytes; 0 for direct writes.
+        direct: Whether it was opened for direct writes.
+    """
+
+    def __init__(self, fd: int, position: int = 0, *, direct: bool = False) -> None:
+        self.position = position
+        """Bytes in the file."""
+        self._fd = fd
+        self._stage = buffers.take(_STAGE) if direct else None
+        self._filled = 0  # bytes in the stage
+        self._begun = 0  # staged bytes before this are being written
+        self._written = 0  # byte of the file up to which whole blocks are written
+
+    @classmethod
+    def create(cls, path: Path) -> Self:
+        """Create a file of a recording.
+
+        Raises:
+            OSError: It exists, or cannot be made.
+        """
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
+        if DIRECT:
+            try:
+                return cls(files.open_file(path, flags | DIRECT), direct=True)
+            except OSError as error:
+                if error.errno not in _REFUSED:
+                    raise
+                with suppress(FileNotFoundError):
+                    files.unlink(path)  # some systems create the file before they refuse
+        return cls(files.open_file(path, flags))
+
+    @classmethod
+    def reopen(cls, path: Path) -> Self:
+        """Open an existing ordinary file.
+
+        Raises:
+            OSError: It cannot be opened for writing, or is not an ordinary file.
+        """
+        fd = files.open_file(path, os.O_RDWR | os.O_NONBLOCK)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise OSError(errno.EINVAL, "it is not an ordinary file", str(path))
+        return cls(fd, os.lseek(fd, 0, os.SEEK_END))
+
+    @property
+    def direct(self) -> bool:
+        """True if appended bytes are on the disk already, except for the file's length."""
+        return self._stage is not None
+
+    def append(self, parts: Sequence[Buffer]) -> None:
+        """Append all parts; they are in the file when this returns.
+
+        Raises:
+            OSError: when the system refuses; the file is then as it was before.
+        """
+        before = self.position
+        try:
+            self._append(parts)
+        except OSError:
+            self._step_back(before)
+            raise
+
+    def _append(self, parts: Sequence[Buffer]) -> None:
+        if self._stage is None:
+            self.position += write_all(self._fd, parts)
+            return
+        pieces: list[NDArray[np.uint8]] = []
+        for part in filter(len, parts):
+            content = np.frombuffer(part, np.uint8)
+            if self.position % BLOCK == 0 and _is_own(content):
+                whole = len(content) - len(content) % BLOCK
+                pieces += [self._stage[self._begun : self._filled], content[:whole]]
+                self._begun = self._filled
+                self.position += whole
+                content = content[whole:]
+            while len(content):
+                piece = content[: _STAGE - self._filled]
+                self._stage[self._filled : self._filled + len(piece)] = piece
+                self._filled += len(piece)
+                self.position += len(piece)
+                content = content[len(piece) :]
+                if self._filled == _STAGE:
+                    self._put(pieces)
+                    pieces = []
+        self._put(pieces)
+
+    def room_before(self, content: Buffer, position: int) -> int:
+        """Bytes of padding that let large content be written without a copy.
+
+        Args:
+            content: The content to append.
+            position: Byte of the file where it would begin.
+
+        Returns:
+            0 where padding does not help.
+        """
+        if self._stage is None or not _is_own(np.frombuffer(content, np.uint8)):
+            return 0
+        return -position % BLOCK
+
+    def cut(self, position: int) -> None:
+        """Truncate the file at a position; not for direct writes.
+
+        Raises:
+            OSError: when the system refuses.
+        """
+        assert self._stage is None
+        files.system.truncate(self._fd, position)
+        os.lseek(self._fd, position, os.SEEK_SET)
+        self.position = position
+
+    def rewrite(self, position: int, data: Buffer) -> None:
+        """Overwrite bytes of the file; not for direct writes.
+
+        Raises:
+            OSError: when the system refuses; some of them may have been written by then.
+        """
+        assert self._stage is None
+        assert position + len(data) <= self.position
+        pieces = [memoryview(data)]
+        while pieces:
+            done = files.system.pwritev(self._fd, pieces, position)
+            position += done
+            pieces = left_over(pieces, done)
+
+    def finish(self, *, sync: bool) -> None:
+        """Set the file's exact length and close it.
+
+        Args:
+            sync: Return once everything is on the disk.
+
+        Raises:
+            OSError: when the system refuses.
+        """
+        try:
+            if os.fstat(self._fd).st_size != self.position:
+                files.system.truncate(self._fd, self.position)
+            if sync:
+                self.sync()
+        finally:
+            self.close()
+
+    def sync(self) -> None:
+        """Return once everything appended is on the disk."""
+        sync_file(self._fd)
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _step_back(self, position: int) -> None:
+        """Undo a failed write; the bytes before it are whole, and can be appended to.
+
+        Later writes go through the page cache; they are few.
+        """
+        self._stage = None
+        self.position = position
+        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
+        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+        os.lseek(self._fd, position, os.SEEK_SET)
+        with suppress(OSError):  # later writes overwrite it, and `finish` cuts the rest
+            files.system.truncate(self._fd, position)
+
+    def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
+        """Write pieces and the staged bytes; stage the bytes behind the last block."""
+        assert self._stage is not None
+        whole = self._filled - self._filled % BLOCK
+        rest = self._filled - whole
+        end = whole + BLOCK if rest else whole
+        self._stage[self._filled : end] = 0
+        pieces.append(self._stage[self._begun : end])
+        self._write([piece.data for piece in pieces if len(piece)], self._written)
+        self._written = self.position - rest
+        self._stage[:rest] = self._stage[whole : self._filled].copy()
+        self._filled, self._begun = rest, 0
+
+    def _write(self, pieces: list[memoryview], position: int) -> None:
+        while pieces:
+            try:
+                done = files.system.pwritev(self._fd, pieces, position)
+            except OSError as error:
+                if error.errno not in _REFUSED:
+                    raise
+                # Some file systems take the flag and refuse the write. Blocks stay whole,
+                # so nothing else changes.
+                self._give_up_direct(error)
+                continue
+            position += done
+            pieces = left_over(pieces, done)
+
+    def _give_up_direct(self, error: OSError) -> None:
+        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
+        if not flags & DIRECT:
+            raise error
+        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
+
+
+def _is_own(content: NDArray[np.uint8]) -> bool:
+    """True if content is aligned for a direct write without a copy."""
+    return len(content) >= _OWN and content.ctypes.data % BLOCK == 0

@@ -1,0 +1,131 @@
+"""Durable writes, and the meaning of a failed write.
+
+Model: a file system may reorder writes of different files, and may lose everything
+since the last fsync when power fails; when only a process dies, what was written
+stays. A rename within one directory is atomic; it is durable once the directory is
+synced. So a file becomes visible under its final name only complete, and a reader
+never meets a half-made one.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, StoreError, exhausted
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Buffer
+
+
+def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
+    """Map an operating system error on a file of the store to a hybridlog error."""
+    if error.errno in NO_SPACE:
+        return DiskFullError(
+            f"No space left while {doing} {path}. Free some space and run the command again."
+        )
+    short = exhausted(error.errno, f"{doing} {path}")
+    if short is not None:
+        return short
+    if error.errno in {errno.EROFS, errno.EACCES, errno.EPERM}:
+        return StoreError(
+            f"Not allowed to write while {doing} {path}: {error.strerror}. "
+            "Check the owner and the mount of the store, or choose another with --store."
+        )
+    return StoreError(f"Error while {doing} {path}: {error.strerror or error}.")
+
+
+def write_all(fd: int, parts: Sequence[Buffer]) -> int:
+    """Write all parts at the file's position; return the number of bytes.
+
+    Raises:
+        OSError: when the system refuses; a part may have been written by then.
+    """
+    views = [memoryview(part).cast("B") for part in parts if len(part)]
+    total = sum(len(view) for view in views)
+    while views:
+        views = left_over(views, files.system.writev(fd, views[:512]))
+    return total
+
+
+def left_over(views: Sequence[memoryview], done: int) -> list[memoryview]:
+    """The views without their first bytes."""
+    for index, view in enumerate(views):
+        if done < len(view):
+            return [view[done:], *views[index + 1 :]]
+        done -= len(view)
+    return []
+
+
+def sync_file(fd: int) -> None:
+    """Return once everything written to the file is on the disk."""
+    files.system.sync(fd)
+
+
+def publish(temporary: Path, final: Path, *, depth: int) -> None:
+    """Durably give a synced file its final name.
+
+    Args:
+        temporary: The file; in the folder of `final`.
+        final: Its new name; a file of that name is replaced.
+        depth: As for `files.open_file`; 1 for a file outside of stores.
+
+    Raises:
+        OSError: It cannot be renamed, or the folder cannot be synced.
+    """
+    files.rename(temporary, final, depth=depth)
+    files.sync_folder(final.parent, depth=depth - 1)
+
+
+@contextmanager
+def new_file(final: Path, *, depth: int) -> Iterator[int]:
+    """Descriptor of a temporary file that becomes `final` if the block succeeds.
+
+    Otherwise the temporary file is removed. The umask decides who may read the file.
+
+    Args:
+        final: Its name after the block.
+        depth: As for `files.open_file`.
+
+    Raises:
+        HybridlogError: It cannot be created or written.
+    """
+    temporary = final.with_name(f".{final.name}.{secrets.token_hex(8)}")
+    try:
+        fd = files.open_file(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, depth=depth)
+    except OSError as error:
+        raise explain(error, final, "creating") from error
+    published = False
+    try:
+        yield fd
+        sync_file(fd)
+        publish(temporary, final, depth=depth)
+        published = True
+    except OSError as error:
+        raise explain(error, final, "writing") from error
+    finally:
+        os.close(fd)
+        if not published:
+            with suppress(OSError):
+                files.unlink(temporary, depth=depth)
+
+
+def write_new(final: Path, content: bytes, *, depth: int) -> None:
+    """Write a small file atomically.
+
+    Args:
+        final: The file.
+        content: Its whole content.
+        depth: As for `files.open_file`.
+
+    Raises:
+        HybridlogError: It cannot be written.
+    """
+    with new_file(final, depth=depth) as fd:
+        write_all(fd, [content])

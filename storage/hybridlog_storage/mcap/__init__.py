@@ -1,0 +1,1 @@
+"""Reads MCAP files of any origin, damaged ones too."""

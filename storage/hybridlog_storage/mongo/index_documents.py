@@ -1,0 +1,236 @@
+"""Assembles index documents as bytes around the fields of messages.
+
+A document is `_id`, the message's fields, and `_meta` (see `docs/format.md`). The fields
+are given as BSON elements. Thousands of documents are assembled at once: a template row is
+tiled, and each value that differs is a column.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
+
+import numpy as np
+
+from hybridlog_storage.disk.copying import joined
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segments.chunk import StoredChunk
+
+KEY_BYTES: Final = 24
+PREFIX_BYTES: Final = 8
+"""Bytes before the key of a document in a collection that topics share."""
+_HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES
+_KEY_AT: Final = _HEAD_WIDTH - KEY_BYTES
+_MAX_TIME: Final = (1 << 63) - 1
+
+
+def key_bound(log_time: int) -> bytes:
+    """The smallest key (`_id`) of any message at or after a log time in nanoseconds."""
+    return struct.pack(">QQQ", min(max(log_time, 0), _MAX_TIME + 1), 0, 0)
+
+
+def last_key(prefix: bytes) -> bytes:
+    """A key after all of those with a prefix."""
+    return prefix + b"\xff" * KEY_BYTES
+
+
+def recording_key(document: bytes) -> str:
+    """Key of the recording of an index document, 16 hexadecimal digits."""
+    at = _KEY_AT + document[_KEY_AT - 5] - KEY_BYTES
+    return document[at + 8 : at + 16].hex()
+
+
+def with_prefix(documents: NDArray[np.uint8], prefix: bytes) -> NDArray[np.uint8]:
+    """Documents with a prefix before their keys.
+
+    Args:
+        documents: uint8[k, width]: a whole document a row, its key without a prefix.
+        prefix: The prefix; nothing changes without one.
+
+    Returns:
+        uint8[k, width + len(prefix)].
+    """
+    if not prefix:
+        return documents
+    count, width = documents.shape
+    out = np.empty((count, width + len(prefix)), np.uint8)
+    at = _KEY_AT + len(prefix)
+    out[:, :at] = np.frombuffer(_head(width, prefix), np.uint8)
+    out[:, at:] = documents[:, _KEY_AT:]
+    return out
+
+
+def _head(width: int, prefix: bytes = b"") -> bytes:
+    """The beginning of a document with a key, up to the key, and its prefix.
+
+    Args:
+        width: Bytes of the document without the prefix.
+        prefix: Its prefix.
+    """
+    key = struct.pack("<iB", KEY_BYTES + len(prefix), 0)
+    return struct.pack("<i", width + len(prefix)) + b"\x05_id\x00" + key + prefix
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Values shared by all documents of one channel of one recording.
+
+    Attributes:
+        key: The first 64 bits of the recording's id, 16 hexadecimal digits.
+        topic: The topic, as the source spells it.
+        has_publish_time: Whether `_meta.pub` is written.
+    """
+
+    key: str
+    topic: str
+    has_publish_time: bool
+
+
+class Placed(NamedTuple):
+    """The messages of some chunks, and their positions.
+
+    Attributes:
+        batch: n messages, grouped by chunk; its offsets refer to its buffer.
+        seq: int64[n], arrival numbers.
+        number: intp[n], index of the chunk of each message.
+        segment: int32[n], segment of that chunk.
+        chunk: int64[n], number of the chunk in the segment.
+        offset: int64[n], position of the payload in the chunk's content.
+    """
+
+    batch: Batch
+    seq: NDArray[np.int64]
+    number: NDArray[np.intp]
+    segment: NDArray[np.int32]
+    chunk: NDArray[np.int64]
+    offset: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, chunks: Sequence[StoredChunk]) -> Self:
+        """All messages of one or more chunks; the contents of several are copied together."""
+        batches = [chunk.batch for chunk in chunks]
+        number = np.arange(len(chunks)).repeat([len(batch) for batch in batches])
+        return cls(
+            joined(batches),
+            np.concatenate([chunk.seq for chunk in chunks]),
+            number,
+            np.array([chunk.segment for chunk in chunks], np.int32)[number],
+            np.array([chunk.number for chunk in chunks], np.int64)[number],
+            np.concatenate([batch.offset for batch in batches]),
+        )
+
+
+class DocumentAssembler:
+    """Assembles the index documents of one channel."""
+
+    def __init__(self, origin: Origin) -> None:
+        self._origin = origin
+        self._tails: dict[str | None, _Tail] = {}
+
+    def assemble(
+        self,
+        placed: Placed,
+        rows: NDArray[np.intp],
+        body: NDArray[np.uint8],
+        error: str | None = None,
+    ) -> NDArray[np.uint8]:
+        """Assemble the documents of some messages.
+
+        Args:
+            placed: Messages of some chunks.
+            rows: intp[k], the rows to use.
+            body: uint8[k, w], BSON elements of each message's fields.
+            error: The reason for missing fields, for `_meta.error`.
+
+        Returns:
+            uint8[k, width]: one whole BSON document a row.
+        """
+        tail = self._tails.get(error)
+        if tail is None:
+            if len(self._tails) > 256:
+                self._tails.clear()
+            tail = self._tails[error] = _Tail(self._origin, error)
+        count, fields = body.shape
+        width = _HEAD_WIDTH + fields + len(tail.template)
+        out = np.empty((count, width), np.uint8)
+        out[:, :_KEY_AT] = np.frombuffer(_head(width), np.uint8)
+        batch = placed.batch
+        log_time = batch.log_time[rows]
+        seq = placed.seq[rows]
+        _column(out, _KEY_AT, ">i8")[:] = log_time
+        _column(out, _KEY_AT + 8, ">u8")[:] = int(self._origin.key, 16)
+        _column(out, _KEY_AT + 16, ">i8")[:] = seq
+        out[:, _HEAD_WIDTH : _HEAD_WIDTH + fields] = body
+        start = _HEAD_WIDTH + fields
+        out[:, start:] = tail.template
+        at = tail.at
+        _column(out, start + at["inserted_at"], "<i8")[:] = log_time // 1_000_000
+        _column(out, start + at["t"], "<i8")[:] = log_time
+        if "pub" in at:
+            _column(out, start + at["pub"], "<i8")[:] = batch.publish_time[rows]
+        _column(out, start + at["seq"], "<i8")[:] = seq
+        _column(out, start + at["seg"], "<i4")[:] = placed.segment[rows]
+        _column(out, start + at["chunk"], "<i8")[:] = placed.chunk[rows]
+        _column(out, start + at["off"], "<i8")[:] = placed.offset[rows]
+        _column(out, start + at["len"], "<i8")[:] = batch.length[rows]
+        return out
+
+
+class _Tail:
+    """The `_meta` element and the document's end, and the positions of their values."""
+
+    def __init__(self, origin: Origin, error: str | None) -> None:
+        self.at: dict[str, int] = {}
+        body = bytearray()
+
+        def number(name: str, kind: int, size: int) -> None:
+            body.extend(bytes([kind]) + name.encode() + b"\x00")
+            self.at[name] = len(body)
+            body.extend(bytes(size))
+
+        def text(name: str, value: str) -> None:
+            data = value.encode("utf-8", "replace")
+            body.extend(b"\x02" + name.encode() + b"\x00")
+            body.extend(struct.pack("<i", len(data) + 1) + data + b"\x00")
+
+        def document(name: str) -> int:
+            body.extend(b"\x03" + name.encode() + b"\x00")
+            start = len(body)
+            body.extend(bytes(4))
+            return start
+
+        def end(start: int) -> None:
+            body.append(0)
+            struct.pack_into("<i", body, start, len(body) - start)
+
+        meta = document("_meta")
+        number("inserted_at", 0x09, 8)
+        number("t", 0x12, 8)
+        if origin.has_publish_time:
+            number("pub", 0x12, 8)
+        text("rec", origin.key)
+        text("topic", origin.topic)
+        number("seq", 0x12, 8)
+        ref = document("ref")
+        number("seg", 0x10, 4)
+        number("chunk", 0x12, 8)
+        number("off", 0x12, 8)
+        number("len", 0x12, 8)
+        end(ref)
+        if error is not None:
+            text("error", error[:1000])
+        end(meta)
+        body.append(0)
+        self.template = np.frombuffer(bytes(body), np.uint8)
+
+
+def _column(out: NDArray[np.uint8], offset: int, dtype: str) -> NDArray[np.int64]:
+    """A column view of one value at a fixed position in each row."""
+    return np.ndarray((len(out),), dtype, buffer=out, offset=offset, strides=(out.shape[1],))

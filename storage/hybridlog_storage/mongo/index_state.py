@@ -1,0 +1,329 @@
+"""Stores in MongoDB the indexing progress of each recording.
+
+`hybridlog.recordings` mirrors the catalog for other programs. It also states for each
+recording whether its index is complete, and from which segments it was made. The index is
+used only if both match, and in a replica set only if a majority of its members has them:
+then the documents, written before, cannot be lost. While a recording is being indexed, its
+mirror says through which chunk. That is written after the documents, so a killed server has
+not lost documents up to there.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import Any, Final, Literal, NamedTuple
+
+from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
+from hybridlog_storage.mongo.database import Database, ReadConcern
+from hybridlog_storage.mongo.topic_places import SHARED, TopicPlace, text_of
+
+RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
+STORE: Final = f"{CATALOG_PREFIX}store"
+"""Collection that names the store that owns a database."""
+_AT_ONCE: Final = 500  # entries decoded at once; each takes some kilobytes as a dictionary
+
+State = Literal["open", "clearing", "indexing", "complete", "removing"]
+"""State of a recording's index: being recorded, documents being removed for a rebuild, being
+indexed, complete, being removed for good."""
+_DESTROYS: Final = frozenset({"clearing", "removing"})
+_TURN: Final = {"_id": "turn"}
+_FIELDS: Final = {"_id": "fields"}
+_UNCERTAIN_CHANNEL: Final = [
+    {"is_indexed": {"$ne": True}},
+    {"reason": {"$ne": None}},
+    {"stats.unreadable": {"$ne": 0}},
+]
+_TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
+_CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
+_MOST_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
+_OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
+_SHOWN: Final = (
+    "label",
+    "name",
+    "tags",
+    "status",
+    "notes",
+    "marks",
+    "payloads",
+    "stored_bytes",
+)
+"""Values of an entry that may change while its segments stay."""
+
+
+class Through(NamedTuple):
+    """A chunk up to which, in the order of the file, an index has all documents.
+
+    Attributes:
+        segment: Number of its segment.
+        chunk: Number in the segment; -1 for none.
+        offset: Byte of the chunk record.
+        messages: Number of messages up to there.
+    """
+
+    segment: int
+    chunk: int
+    offset: int
+    messages: int
+
+
+NOTHING: Final = Through(0, -1, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Indexed:
+    """The state of a recording's index.
+
+    Attributes:
+        id: The recording.
+        state: Progress of the index.
+        segments: Digest of each completely indexed segment, by its number as text.
+        turn: Counts how often its documents were removed or rebuilt.
+        topics: Topics of its documents, as far as known.
+        span: First and last log time of its documents, ns, as far as known; None without any.
+        shown: Name, tags, notes and marks in the mirror.
+        damage: Chunks that could not be read for indexing: reason by segment and number.
+        through: Of an incomplete index, the last chunk that it has.
+    """
+
+    id: str
+    state: State
+    segments: Mapping[str, str]
+    turn: int
+    topics: tuple[str, ...] = ()
+    span: tuple[int, int] | None = None
+    shown: Mapping[str, Any] = field(default_factory=dict)
+    damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    through: Through = NOTHING
+
+    def mirrors(self, entry: RecordingEntry) -> bool:
+        """True if the mirror of a recording with the same segments is current."""
+        document = _mirrored(entry)
+        return all(self.shown.get(name) == document[name] for name in _SHOWN)
+
+    def is_whole(self, entry: RecordingEntry) -> bool:
+        """True if the index of a recording is complete and current."""
+        return self.state == "complete" and dict(self.segments) == entry.digests
+
+
+class Progressed(NamedTuple):
+    """Progress of a recording: its turn, and digests of the indexed segments."""
+
+    turn: int
+    segments: Mapping[str, str]
+
+
+class IndexState:
+    """The recordings indexed in a database."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def one(self, key: str) -> Indexed | None:
+        """The index state of a recording by its key; None if it is unknown."""
+        return self.of([key]).get(key)
+
+    def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
+        """The index states of these recordings, or of all, by key."""
+        asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
+        found: dict[str, Indexed] = {}
+        wanted = {"id": 1, "index": 1, **dict.fromkeys((*_OF_CHANNELS, *_SHOWN), 1)}
+        for document in self._db.find(
+            RECORDINGS, asked, wanted, batch_size=_AT_ONCE, read="majority"
+        ):
+            index = document.get("index") or {}
+            channels = document.get("channels") or ()
+            topics = {str(channel.get("topic", "")) for channel in channels}
+            firsts, lasts = (
+                [t for c in channels if (t := (c.get("stats") or {}).get(name)) is not None]
+                for name in ("first", "last")
+            )
+            found[document["_id"]] = Indexed(
+                str(document.get("id", "")),
+                index.get("state", "indexing"),
+                dict(index.get("segments") or {}),
+                int(index.get("turn", 0)),
+                tuple(sorted(topics)),
+                (min(firsts), max(lasts)) if firsts and lasts else None,
+                {name: document.get(name) for name in _SHOWN},
+                {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
+                Through(**index["through"]) if "through" in index else NOTHING,
+            )
+        return found
+
+    def count(self) -> int:
+        """Number of recordings in the mirror; may be wrong after the server was killed."""
+        return self._db.stats(RECORDINGS).documents
+
+    def turn(self, read: ReadConcern = "local") -> int:
+        """The number of removals of documents of any recording so far."""
+        found = self._db.find_one(STORE, _TURN, read=read, max_time_ms=_TURN_MS)
+        return int(found["turn"]) if found is not None else 0
+
+    def uncertain(self, topic: str) -> set[str]:
+        """Keys of the recordings whose documents may not tell about a topic.
+
+        Their index is not complete, or messages of the topic have no documents, or documents
+        without fields.
+        """
+        channel = {"$elemMatch": {"topic": text_of(topic), "$or": _UNCERTAIN_CHANNEL}}
+        damaged = {"index.damage": {"$exists": True}}
+        asked = {"$or": [{"index.state": {"$ne": "complete"}}, damaged, {"channels": channel}]}
+        return {str(one["_id"]) for one in self._db.find(RECORDINGS, asked, {"_id": 1})}
+
+    def field_indexes(self) -> list[tuple[str, tuple[str, ...]]]:
+        """Topic and fields of each index on fields, as `put_field_indexes` was told."""
+        found = self._db.find_one(STORE, _FIELDS)
+        listed = [] if found is None else found.get("indexes", ())
+        return [(str(one["topic"]), tuple(map(str, one["fields"]))) for one in listed]
+
+    def put_field_indexes(self, indexes: Iterable[tuple[str, Sequence[str]]]) -> None:
+        """List the indexes on fields, so that questions know them without a look at each."""
+        listed = [{"topic": topic, "fields": list(fields)} for topic, fields in indexes]
+        self._db.replace(STORE, _FIELDS, {**_FIELDS, "indexes": listed})
+
+    def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
+        """Progress of recordings by key, without unknown ones."""
+        asked, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
+        said = {
+            found["_id"]: found.get("index") or {}
+            for found in self._db.find(RECORDINGS, asked, wanted, read="majority")
+        }
+        return {
+            key: Progressed(int(index.get("turn", 0)), dict(index.get("segments") or {}))
+            for key, index in said.items()
+        }
+
+    def put(
+        self,
+        entry: RecordingEntry,
+        state: State,
+        *,
+        turn: int,
+        segments: Mapping[str, str] | None = None,
+        damage: Mapping[tuple[int, int], str] | None = None,
+    ) -> None:
+        """Mirror a recording and store the progress of its index.
+
+        Args:
+            entry: The recording.
+            state: Progress of the index.
+            turn: Greater than before if documents are about to be removed.
+            segments: Digest of each indexed segment, by its number as text.
+            damage: Chunks that could not be read: reason by segment and number.
+        """
+        unreadable = [
+            {"seg": segment, "chunk": chunk, "reason": reason}
+            for (segment, chunk), reason in sorted((damage or {}).items())
+        ]
+        document = {
+            **_mirrored(entry),
+            "_id": entry.key,
+            "index": {
+                "state": state,
+                "turn": turn,
+                "segments": dict(segments or {}),
+                **({"damage": unreadable} if unreadable else {}),
+            },
+        }
+        self._db.replace(RECORDINGS, {"_id": entry.key}, document)
+        if state in _DESTROYS:
+            # Concurrent questions compare this number before and after.
+            self._db.update(STORE, _TURN, {"$inc": {"turn": 1}}, upsert=True)
+
+    def show(self, entry: RecordingEntry) -> None:
+        """Mirror a recording; leave the state of its index unchanged."""
+        self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": _mirrored(entry)})
+
+    def is_mirrored(self, entry: RecordingEntry) -> bool:
+        """True if the mirror of a recording equals its catalog entry."""
+        found = self._db.find_one(RECORDINGS, {"_id": entry.key})
+        if found is None:
+            return False
+        document = {name: found[name] for name in found if name not in {"_id", "index"}}
+        wanted = replace(entry, label=_label(entry), channels=[])
+        try:
+            same = document.pop("channels") == _mirrored(entry)["channels"]
+            return same and RecordingEntry.from_document({**document, "channels": []}) == wanted
+        except (AttributeError, KeyError, TypeError, ValueError):
+            return False
+
+    def put_through(self, key: str, through: Through) -> None:
+        """Store that the index of a recording has all documents up to a chunk."""
+        self._db.update(RECORDINGS, {"_id": key}, {"$set": {"index.through": through._asdict()}})
+
+    def clear(
+        self,
+        key: object,
+        places: Iterable[TopicPlace] | None = None,
+        span: tuple[int, int] | None = None,
+        but: Collection[int] = (),
+    ) -> None:
+        """Remove the index documents of a recording.
+
+        Args:
+            key: Key of the recording, or another value of `_meta.rec` in foreign documents.
+            places: Places of topics that may have documents; None for all documents, which
+                takes a scan.
+            span: First and last log time of its documents at these places, ns; None for any.
+            but: Segments whose documents stay.
+        """
+        asked: dict[str, object] = {"_meta.rec": key}
+        if but:
+            asked["_meta.ref.seg"] = {"$nin": sorted(but)}
+        if places is None:
+            for collection in self.document_collections():
+                self._db.delete(collection, asked)
+            return
+        bounds = (None, None) if span is None else (span[0], span[1] + 1)
+        shared: list[dict[str, object]] = []
+        for place in places:
+            chosen = {**asked, **place.documents(*bounds)}
+            if place.is_shared:
+                shared.append(chosen)
+            else:
+                self._db.delete(place.collection, chosen)
+        self._db.delete_each(SHARED, shared)
+
+    def remove(self, key: str) -> None:
+        """Remove a recording from the mirror, as the last step of its removal."""
+        self._db.delete(RECORDINGS, {"_id": key})
+
+    def document_collections(self) -> list[str]:
+        """Names of the collections that hold index documents."""
+        names = self._db.list_collections()
+        return [c for c in names if c == SHARED or not c.startswith(CATALOG_PREFIX)]
+
+    def mark(self) -> Mapping[str, Any] | None:
+        """The store that owns the database, and its place; None without an owner."""
+        return self._db.find_one(STORE, {"_id": "store"})
+
+    def claim(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Register the store that owns the database; return its mark.
+
+        The index gets a new id, so that nothing is believed of it that was known before.
+        """
+        mark = {"_id": "store", **values, "index": secrets.token_hex(8)}
+        self._db.replace(STORE, {"_id": "store"}, mark)
+        return mark
+
+
+def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
+    """An entry as MongoDB accepts it: a directory's name may not be UTF-8."""
+    document = {**entry.to_document(), "label": _label(entry)}
+    text = (
+        len(part)
+        for channel in entry.channels
+        for part in (channel.topic, channel.reason or "", *chain(*channel.metadata.items()))
+    )
+    if len(entry.channels) * _CHANNEL_BYTES + sum(text) > _MOST_CHANNEL_BYTES:
+        document["channels"] = [{"topic": channel.topic} for channel in entry.channels]
+    return document
+
+
+def _label(entry: RecordingEntry) -> str:
+    return os.fsencode(entry.label).decode("utf-8", "backslashreplace")

@@ -1,0 +1,72 @@
+"""Order, runs and distinct values of arrays, fast for the few messages of a small chunk."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    T = TypeVar("T", bound=np.generic)
+
+
+def order_of(*keys: NDArray[Any]) -> NDArray[np.intp] | None:
+    """The order of rows; None if they are in order.
+
+    Args:
+        keys: The keys of each row, the most significant first.
+    """
+    is_tie = np.ones(max(len(keys[0]) - 1, 0), np.bool_)
+    for key in keys:
+        if (is_tie & (key[1:] < key[:-1])).any():
+            return np.lexsort(keys[::-1])
+        is_tie &= key[1:] == key[:-1]
+        if not is_tie.any():
+            break
+    return None
+
+
+def distinct(values: NDArray[T]) -> NDArray[T]:
+    """The distinct values in ascending order: T[n] to T[k].
+
+    Its first call to `numpy.unique` would load masked arrays, which stops a recording for
+    15 milliseconds during its first messages.
+    """
+    ordered = np.sort(values)
+    return ordered[run_starts(ordered)]
+
+
+def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
+    """Start of each run of equal values, ascending; of an empty array none.
+
+    For few values this takes a fifth of the time of `np.diff`.
+
+    Args:
+        values: [n].
+
+    Returns:
+        intp[k], the first is 0.
+    """
+    changes = (values[1:] != values[:-1]).nonzero()[0]
+    starts = np.zeros(len(changes) + min(len(values), 1), np.intp)
+    np.add(changes, 1, out=starts[1:])
+    return starts
+
+
+def run_lengths(starts: NDArray[np.intp], total: int) -> NDArray[np.intp]:
+    """Length of each run.
+
+    Args:
+        starts: intp[k], start of each run.
+        total: End of the last run.
+
+    Returns:
+        intp[k].
+    """
+    lengths = np.empty(len(starts), np.intp)
+    lengths[-1] = total
+    lengths[:-1] = starts[1:]
+    lengths -= starts
+    return lengths

@@ -1,0 +1,1 @@
+"""Segments: MCAP files in chunks, with the recovery of those that a crash left open."""

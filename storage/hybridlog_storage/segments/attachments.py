@@ -1,0 +1,188 @@
+"""Attachments: files that lie in a log beside its messages.
+
+Their content is never held in memory as a whole: it is passed on piece by piece.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex
+
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
+from hybridlog_storage.segments.compression import FilePart
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Buffer
+
+PIECE = 4 << 20
+"""Bytes of content in memory at a time."""
+MAX_HEAD = 1 << 20
+"""Most bytes of the fields before the content, which hold two texts."""
+
+_TIMES = struct.Struct("<QQ")
+_TEXT = struct.Struct("<I")
+_SIZE = struct.Struct("<Q")
+_CRC = struct.Struct("<I")
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """An attachment record of a file.
+
+    Attributes:
+        log_time: Time at which it was recorded, ns; 0 if unknown.
+        create_time: Time at which it was created, ns; 0 if unknown.
+        name: Its name; need be no valid file name, and need not be unique.
+        media_type: Its media type, such as `text/plain`.
+        data: Its content, in the file.
+    """
+
+    log_time: int
+    create_time: int
+    name: str
+    media_type: str
+    data: FilePart
+
+    def pieces(self) -> Iterator[bytes]:
+        """The content, in pieces of at most `PIECE` bytes.
+
+        Raises:
+            SegmentError: The file is shorter than before.
+        """
+        part = self.data.again()
+        left = len(part)
+        while left:
+            piece = part.read(PIECE)
+            if not piece:
+                raise SegmentError(f"{left} bytes of the attachment {self.name!r} are missing")
+            left -= len(piece)
+            yield piece
+
+    def fields(self) -> bytes:
+        """The fields of its record before the content."""
+        name, media_type = self.name.encode(), self.media_type.encode()
+        return b"".join(
+            (
+                _TIMES.pack(self.log_time, self.create_time),
+                _TEXT.pack(len(name)),
+                name,
+                _TEXT.pack(len(media_type)),
+                media_type,
+                _SIZE.pack(len(self.data)),
+            )
+        )
+
+    def record(self) -> Iterator[bytes]:
+        """Its MCAP record, in pieces.
+
+        Raises:
+            SegmentError: As `pieces`.
+        """
+        fields = self.fields()
+        crc = crc32(fields)
+        size = len(fields) + len(self.data) + _CRC.size
+        yield RECORD_HEAD.pack(Opcode.ATTACHMENT, size) + fields
+        for piece in self.pieces():
+            crc = crc32(piece, crc)
+            yield piece
+        yield _CRC.pack(crc)
+
+    def index(self, offset: int, length: int) -> AttachmentIndex:
+        """The record of the summary that lists it.
+
+        Args:
+            offset: Byte at which its record starts.
+            length: Bytes of its record.
+        """
+        return AttachmentIndex(
+            offset=offset,
+            length=length,
+            create_time=self.create_time,
+            log_time=self.log_time,
+            data_size=len(self.data),
+            name=self.name,
+            media_type=self.media_type,
+        )
+
+
+def parse_attachment(
+    head: Buffer, part: FilePart, *, check_crc: bool = True
+) -> tuple[Attachment, int]:
+    """Parse an attachment record.
+
+    Args:
+        head: The beginning of its content, up to `MAX_HEAD` bytes.
+        part: Its whole content.
+        check_crc: Compare the checksum, if the record has one.
+
+    Returns:
+        The attachment, and the size of its fields, bytes.
+
+    Raises:
+        SegmentError: Its fields exceed it or are not UTF-8, or its checksum differs.
+    """
+    try:
+        log_time, create_time = _TIMES.unpack_from(head)
+        name, at = _text(head, _TIMES.size)
+        media_type, at = _text(head, at)
+        (size,) = _SIZE.unpack_from(head, at)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise SegmentError("an attachment record is damaged") from error
+    at += _SIZE.size
+    if at + size + _CRC.size > len(part):
+        raise SegmentError("an attachment record is damaged (its content runs over its end)")
+    found = Attachment(log_time, create_time, name, media_type, part.section(at, size))
+    (crc,) = _CRC.unpack(part.section(at + size, _CRC.size).read())
+    if crc and check_crc:
+        of_content = crc32(memoryview(head)[:at])
+        for piece in found.pieces():
+            of_content = crc32(piece, of_content)
+        if of_content != crc:
+            raise SegmentError(f"the checksum of the attachment {name!r} differs")
+    return found, at + size + _CRC.size
+
+
+def _text(head: Buffer, at: int) -> tuple[str, int]:
+    """A text behind its length, and where it ends."""
+    (size,) = _TEXT.unpack_from(head, at)
+    at += _TEXT.size
+    if at + size > len(head):
+        raise struct.error("the text runs over the end")
+    return str(memoryview(head)[at : at + size], "utf-8"), at + size
+
+
+class FileHandle:
+    """Reads a file by position, beside its other users and after they have closed it.
+
+    It closes when nothing refers to it any more.
+
+    Args:
+        fd: The open file.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._at = 0
+        self._fd = os.dup(fd)
+
+    def __del__(self) -> None:
+        if hasattr(self, "_fd"):
+            os.close(self._fd)
+
+    def seek(self, offset: int) -> int:
+        """Set the position of the next read."""
+        self._at = offset
+        return offset
+
+    def read(self, size: int) -> bytes:
+        """The next bytes; fewer at the end."""
+        data = os.pread(self._fd, size, self._at)
+        self._at += len(data)
+        return data

@@ -1,0 +1,137 @@
+"""Closed chunks: packed for the file, then stored in a segment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hybridlog_storage.checksum import crc32, crc32_combine
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.segments.chunk_table import parts_of
+from hybridlog_storage.segments.segment_format import (
+    chunk_head,
+    index_order,
+    message_indexes,
+    pack_arrivals,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Batch, Buffer
+    from hybridlog_storage.segments.compression import Compressor
+
+
+@dataclass(frozen=True, slots=True)
+class PackedChunk:
+    """A closed chunk, compressed and indexed, ready for the file.
+
+    Attributes:
+        batch: Its messages over the uncompressed content; `channel` holds channel ids.
+        seq: int64[n], arrival numbers.
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+        uncompressed_size: Bytes of content.
+        compression: MCAP name of the codec.
+        head: The chunk record up to the compressed content.
+        data: The compressed content.
+        head_crc: CRC-32 of the head.
+        crc: CRC-32 of head and data.
+        indexes: Message index record of each channel, by channel id.
+        indexes_crc: CRC-32 of all of them, concatenated.
+        arrivals: The arrival numbers, packed.
+        parts: `PART`[c], statistics of each channel in the chunk.
+    """
+
+    batch: Batch
+    seq: NDArray[np.int64]
+    first: int
+    last: int
+    uncompressed_size: int
+    compression: str
+    head: bytes
+    data: Buffer
+    head_crc: int
+    crc: int
+    indexes: dict[int, bytes]
+    indexes_crc: int
+    arrivals: bytes
+    parts: NDArray[np.void]
+
+
+def pack(
+    compressor: Compressor,
+    batch: Batch,
+    seq: NDArray[np.int64],
+    size: int,
+    *,
+    hurried: bool = False,
+) -> PackedChunk:
+    """Compress a chunk and build its message indexes and checksums. Runs on a worker thread."""
+    compression, data = compressor.compress(batch.buffer, hurried=hurried)
+    order = index_order(batch.channel, batch.log_time)
+    parts, first, last = parts_of(batch, order)
+    content_crc = crc32(batch.buffer)
+    head = chunk_head(
+        first=first,
+        last=last,
+        uncompressed_size=size,
+        crc=content_crc,
+        compression=compression,
+        compressed_size=len(data),
+    )
+    head_crc, content = crc32(head), content_crc
+    if compression:
+        content = crc32(data)
+    crc = crc32_combine(head_crc, content, len(data))
+    starts = batch.offset - MESSAGE_HEAD.itemsize
+    indexes = message_indexes(batch.channel, batch.log_time, starts, order)
+    indexes_crc = 0
+    for index in indexes.values():
+        indexes_crc = crc32(index, indexes_crc)
+    return PackedChunk(
+        batch=batch,
+        seq=seq,
+        first=first,
+        last=last,
+        uncompressed_size=size,
+        compression=compression,
+        head=head,
+        data=data,
+        head_crc=head_crc,
+        crc=crc,
+        indexes=indexes,
+        indexes_crc=indexes_crc,
+        arrivals=pack_arrivals(seq),
+        parts=parts,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredChunk:
+    """A chunk stored in a segment, with its content in memory.
+
+    Attributes:
+        segment: Number of the segment in its recording.
+        number: Number of the chunk in its segment, from 0, in file order.
+        offset: Byte of the chunk record in the file.
+        length: Bytes of the chunk record.
+        trailer: Bytes of the message indexes and arrival numbers that follow it.
+        crc: CRC-32 of the stored chunk record, including its head.
+        trailer_crc: CRC-32 of the trailer.
+        batch: Its messages over the uncompressed content; `channel` holds channel ids.
+        seq: int64[n], arrival numbers.
+        compressed_size: Bytes of compressed content.
+    """
+
+    segment: int
+    number: int
+    offset: int
+    length: int
+    trailer: int
+    crc: int
+    trailer_crc: int
+    batch: Batch
+    seq: NDArray[np.int64]
+    compressed_size: int

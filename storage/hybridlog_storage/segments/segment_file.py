@@ -1,0 +1,622 @@
+"""A segment file: records are appended, and a summary seals it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.append_file import AppendFile
+from hybridlog_storage.errors import StoreError
+from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
+from hybridlog_storage.segments.attachments import Attachment
+from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
+from hybridlog_storage.segments.segment_format import (
+    CHUNK_HEAD,
+    CHUNK_TABLE_OPCODE,
+    FORMAT_VERSION,
+    INDEX_HEAD,
+    LIBRARY,
+    MAGIC,
+    MOVED_OPCODE,
+    PROFILE,
+    PROOF,
+    RECORDING_METADATA,
+    ChunkSummary,
+    Proof,
+    arrival_record,
+    channel_record,
+    chunk_index_record,
+    compression_of,
+    definitions_chunk,
+    head_length,
+    json_metadata,
+    padding_record,
+    proof_of,
+    record_bytes,
+    schema_record,
+    split_trailer,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Buffer, Channel, Schema
+
+OPEN_SUFFIX = ".mcap.open"
+SEALED_SUFFIX = ".mcap"
+_SMALL_DEFINITIONS = 1024  # bytes of definitions that are not compressed
+
+
+@dataclass(frozen=True, slots=True)
+class SealedChannel:
+    """Statistics of one channel in a sealed segment.
+
+    Attributes:
+        id: The channel's id in the recording.
+        topic: Its topic.
+        messages: Number of its messages, at least 1.
+        payload_bytes: Bytes of their payloads.
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+    """
+
+    id: int
+    topic: str
+    messages: int
+    payload_bytes: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sealed:
+    """A complete segment, for the journal of its recording.
+
+    Attributes:
+        segment: Its number.
+        file: Its name once it is sealed.
+        bytes: Its size.
+        digest: `sha256:` and the hex digest of its bytes from the start of the summary on.
+            The summary has checksums of all bytes before, so this proves the whole file.
+        channels: Channels with messages, by channel id.
+    """
+
+    segment: int
+    file: str
+    bytes: int
+    digest: str
+    channels: tuple[SealedChannel, ...]
+
+
+OnSealing = Callable[[Sealed], None]
+"""Called when a segment is complete and on the disk, before it gets its final name."""
+
+
+def digest_of(tail: Buffer) -> str:
+    """Digest of a segment's bytes from the start of its summary to its end."""
+    return f"sha256:{hashlib.sha256(tail).hexdigest()}"
+
+
+def sealed_name(number: int) -> str:
+    """File name of a sealed segment."""
+    return f"{number:06d}{SEALED_SUFFIX}"
+
+
+def sealed_channels(
+    table: ChunkTable, channels: Mapping[int, Channel]
+) -> tuple[SealedChannel, ...]:
+    """Statistics of each channel with messages in a segment."""
+    rows = table.by_channel()
+    names = ("channel", "messages", "payload_bytes", "first", "last")
+    columns = (rows[name].tolist() for name in names)
+    return tuple(
+        SealedChannel(number, channels[number].topic, messages, payload_bytes, first, last)
+        for number, messages, payload_bytes, first, last in zip(*columns, strict=True)
+    )
+
+
+class SegmentFile:
+    """An open segment: appends whole records and collects the summary.
+
+    Args:
+        path: The file; its name ends in `.mcap.open`.
+        number: Number of the segment.
+        file: The open file; a new one, or one whose records will be noted.
+    """
+
+    def __init__(self, path: Path, number: int, file: AppendFile) -> None:
+        self.path = path
+        self.number = number
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, tuple[int, Channel]] = {}
+        self.table = TableBuilder()
+        """The chunk table of the file."""
+        self._file = file
+        self._chunk_indexes = bytearray()  # as records: a long segment has many
+        self._attachment_indexes: list[AttachmentIndex] = []
+        self._metadata_indexes: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}
+        self._listed = 0  # chunks that other readers of MCAP find
+        self._first: int | None = None
+        self._last = 0
+        self._sealed: Sealed | None = None  # once the file is complete
+        self._finished = False  # once it is closed
+
+    @classmethod
+    def create(
+        cls,
+        directory: Path,
+        number: int,
+        recording: Mapping[str, object],
+        next_seq: int = 0,
+        *,
+        sync: bool = False,
+    ) -> SegmentFile:
+        """Start a new segment file.
+
+        Args:
+            directory: The recording's directory.
+            number: Segment number, also the file's name.
+            recording: Catalog entry of the recording, stored in the file.
+            next_seq: One more than the greatest arrival number in the segments before.
+            sync: Return once the file's name is on the disk.
+
+        Raises:
+            StoreError: The file cannot be created.
+            DiskFullError: No room for it; no file remains.
+        """
+        path = directory / f"{number:06d}{OPEN_SUFFIX}"
+        try:
+            file = AppendFile.create(path)
+        except OSError as error:
+            raise durability.explain(error, path, "creating") from error
+        segment = cls(path, number, file)
+        head = [MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))]
+        try:
+            segment._write(head)
+            segment.add_recording(recording, next_seq)
+            if sync:
+                segment._sync_folder()
+        except BaseException:
+            file.close()
+            with suppress(OSError):
+                files.unlink(path)  # or the next attempt would find it
+            raise
+        return segment
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks in the file, which is the number of the next one."""
+        return self.table.chunks
+
+    @property
+    def is_complete(self) -> bool:
+        """True if the summary is written, so nothing can be added."""
+        return self._sealed is not None
+
+    @property
+    def position(self) -> int:
+        """Bytes in the file."""
+        return self._file.position
+
+    @property
+    def direct(self) -> bool:
+        """True if written bytes are on the disk already, except for the file's length."""
+        return self._file.direct
+
+    def define(self, channels: Iterable[tuple[int, int, Channel]], *, write: bool = True) -> None:
+        """Write channels; before each its schema, on its first use in the file.
+
+        Args:
+            channels: Id, id of the schema, and channel.
+            write: False for channels that are in the file already.
+        """
+        records: list[bytes] = []
+        schemas: dict[int, Schema] = {}
+        defined = [*channels]
+        for channel_id, schema_id, channel in defined:
+            if schema_id and channel.schema is not None:
+                if schema_id not in self.schemas and schema_id not in schemas:
+                    records.append(record_bytes(schema_record(schema_id, channel.schema)))
+                schemas[schema_id] = channel.schema
+            records.append(record_bytes(channel_record(channel_id, schema_id, channel)))
+        if write and records:
+            content = b"".join(records)
+            if len(content) < _SMALL_DEFINITIONS:
+                self._write(records)
+            else:
+                self._write([definitions_chunk(content)])
+                self._prove()
+        self.schemas |= schemas
+        self.channels |= {number: (schema, channel) for number, schema, channel in defined}
+
+    def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
+        """Append the metadata of the recording and of the segment."""
+        about = {"segment": self.number, "format": FORMAT_VERSION, "next_seq": next_seq}
+        self.add_metadata(json_metadata(RECORDING_METADATA, {**recording, **about}))
+
+    def add_metadata(self, record: Metadata) -> None:
+        """Append a metadata record."""
+        data = record_bytes(record)
+        offset = self.position
+        size, crc = self.table.unproven
+        proof = arrival_record(Proof(0, size + len(data), crc32(data, crc)))
+        self._append([data, proof])
+        self.table.other(data, alone=True)
+        self.table.proof(proof)
+        self.note_metadata(record.name, offset, len(data))
+
+    def note_metadata(self, name: str, offset: int, length: int) -> None:
+        """Note a metadata record that is in the file already."""
+        self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment, piece by piece."""
+        offset = self.position
+        crc = 0
+        for piece in attachment.record():
+            self._append([piece])
+            crc = crc32(piece, crc)
+        length = self.position - offset
+        self.table.stretch(length, crc)
+        self.note_attachment(attachment, offset, length)
+        self._prove()
+
+    def _prove(self) -> None:
+        """Append checksums of the records since the last chunk."""
+        size, crc = self.table.unproven
+        if size:
+            proof = arrival_record(Proof(0, size, crc))
+            self._append([proof])
+            self.table.proof(proof)
+
+    def note_attachment(self, attachment: Attachment, offset: int, length: int) -> None:
+        """Note an attachment that is in the file already."""
+        self._attachment_indexes.append(attachment.index(offset, length))
+
+    def note_attachment_index(self, index: AttachmentIndex) -> None:
+        """Note an attachment that is in the file already, by its index record."""
+        self._attachment_indexes.append(index)
+
+    def append_chunks(self, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
+        """Append chunks with their message indexes and arrival numbers in one write.
+
+        Args:
+            chunks: At least one.
+            end: Byte of the file at or behind which only the first chunk may begin.
+
+        Returns:
+                The appended chunks, a prefix of `chunks`.
+        """
+        parts: list[Buffer] = []
+        stored: list[StoredChunk] = []
+        paddings: list[bytes] = []
+        at = self.position
+        size, crc = self.table.unproven
+        for chunk in chunks:
+            if stored and at >= end:
+                break
+            padding = self._padding(chunk.data, at, len(chunk.head))
+            offset = at + len(padding)
+            length = len(chunk.head) + len(chunk.data)
+            before = size + len(padding), crc32(padding, crc)
+            size = crc = 0
+            proof = Proof(offset, *before, chunk.head_crc, chunk.crc, chunk.indexes_crc)
+            arrivals = arrival_record(proof, chunk.arrivals)
+            trailer_length = sum(map(len, chunk.indexes.values())) + len(arrivals)
+            parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
+            at = offset + length + trailer_length
+            paddings.append(padding)
+            stored.append(
+                StoredChunk(
+                    segment=self.number,
+                    number=self.chunks + len(stored),
+                    offset=offset,
+                    length=length,
+                    trailer=trailer_length,
+                    crc=chunk.crc,
+                    trailer_crc=crc32(arrivals, chunk.indexes_crc),
+                    batch=chunk.batch,
+                    seq=chunk.seq,
+                    compressed_size=len(chunk.data),
+                )
+            )
+        self._append(parts)
+        for chunk, padding, place in zip(chunks, paddings, stored, strict=False):
+            self.table.other(padding)
+            self.note_chunk(
+                ChunkSummary(
+                    first=chunk.first,
+                    last=chunk.last,
+                    offset=place.offset,
+                    length=place.length,
+                    indexes={channel: len(data) for channel, data in chunk.indexes.items()},
+                    compression=chunk.compression,
+                    compressed_size=place.compressed_size,
+                    uncompressed_size=chunk.uncompressed_size,
+                ),
+                chunk.parts,
+                trailer=place.trailer,
+                crc=place.crc,
+                trailer_crc=place.trailer_crc,
+            )
+        return stored
+
+    def append_stretch(self, pieces: Iterable[Buffer]) -> None:
+        """Append checked bytes of another segment that belong to no chunk."""
+        length = crc = 0
+        for piece in pieces:
+            self._append([piece])
+            length, crc = length + len(piece), crc32(piece, crc)
+        self.table.stretch(length, crc)
+
+    def append_copy(self, record: Buffer, trailer: Buffer, parts: NDArray[np.void]) -> None:
+        """Append a chunk of another segment, or the record of a moved one.
+
+        Args:
+            record: Its record.
+            trailer: Message indexes and arrival numbers, as they stand in the other segment.
+            parts: `PART`[c], statistics of each channel in it.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        indexes, body = split_trailer(trailer)
+        offset = self.position
+        head = crc32(record[: head_length(record)])
+        proof = proof_of(body)._replace(chunk=offset, head=head, record=crc32(record))
+        arrivals = arrival_record(proof, body[PROOF.size :])
+        own = bytes(trailer[: len(trailer) - len(arrivals)]) + arrivals
+        _, _, first, last, size, _ = CHUNK_HEAD.unpack_from(record)
+        self._append([record, own])
+        checksums = {"crc": proof.record, "trailer_crc": crc32(own)}
+        if record[0] == MOVED_OPCODE:
+            self.table.chunk(
+                offset=offset,
+                length=len(record),
+                trailer=len(own),
+                first=first,
+                last=last,
+                parts=parts,
+                **checksums,
+            )
+            return
+        compression, compressed = compression_of(record)
+        sizes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in indexes}
+        chunk = ChunkSummary(first, last, offset, len(record), sizes, compression, compressed, size)
+        self.note_chunk(chunk, parts, trailer=len(own), **checksums)
+
+    def append_trailer(self, trailer: bytes) -> None:
+        """Append indexes and arrival numbers of a chunk that a crash cut off."""
+        self._append([trailer])
+
+    def note_chunk(
+        self,
+        chunk: ChunkSummary,
+        parts: NDArray[np.void],
+        *,
+        trailer: int,
+        crc: int,
+        trailer_crc: int,
+    ) -> None:
+        """Note a chunk that is in the file already.
+
+        Args:
+            chunk: Its entry in the summary.
+            parts: `PART`[c], statistics of each channel in it.
+            trailer: Bytes of message indexes and arrival record behind it.
+            crc: CRC-32 of the chunk record.
+            trailer_crc: CRC-32 of the trailer.
+        """
+        self.table.chunk(
+            offset=chunk.offset,
+            length=chunk.length,
+            trailer=trailer,
+            crc=crc,
+            trailer_crc=trailer_crc,
+            first=chunk.first,
+            last=chunk.last,
+            parts=parts,
+        )
+        self._chunk_indexes += chunk_index_record(chunk)
+        self._listed += 1
+        counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
+        for channel, count in counts:
+            self._counts[channel] = self._counts.get(channel, 0) + count
+        self._first = chunk.first if self._first is None else min(self._first, chunk.first)
+        self._last = max(self._last, chunk.last)
+
+    def rewrite(self, position: int, data: Buffer) -> None:
+        """Overwrite bytes damaged by a crash or the disk."""
+        try:
+            self._file.rewrite(position, data)
+        except OSError as error:
+            raise durability.explain(error, self.path, "recovering") from error
+
+    def cut(self, position: int) -> None:
+        """Truncate the file at a position; the next record is written there."""
+        try:
+            self._file.cut(position)
+        except OSError as error:
+            raise durability.explain(error, self.path, "cutting") from error
+
+    def sync(self) -> None:
+        """Force the written bytes to the disk."""
+        try:
+            self._file.sync()
+        except OSError as error:
+            raise durability.explain(error, self.path, "syncing") from error
+
+    def seal(self, *, sync: bool, on_sealing: OnSealing) -> Path:
+        """Write the summary, close, and give the file its final name.
+
+        After `on_sealing` or the rename has failed, a second call repeats only the missing
+        steps.
+
+        Args:
+            sync: Force the file to the disk before `on_sealing` is called.
+            on_sealing: Called with the complete file, before it gets its final name.
+
+        Returns:
+            The sealed file.
+
+        Raises:
+            StoreError: It cannot be written, or a sealed segment of this number exists.
+            DiskFullError: No room for the summary; the file is unchanged.
+        """
+        final = self.path.with_name(sealed_name(self.number))
+        try:
+            if self.path != final and _is_there(final):
+                raise StoreError(
+                    f"{final} is there already, so {self.path} cannot be sealed. "
+                    "Move one of them out of the store."
+                )
+            sealed = self._sealed or self.complete()
+            if not self._finished:
+                self._file.finish(sync=sync)
+                self._finished = True
+            on_sealing(sealed)
+            if self.path != final:
+                files.rename(self.path, final)
+                self.path = final
+            files.sync_folder(final.parent)
+        except OSError as error:
+            raise durability.explain(error, final, "sealing") from error
+        return final
+
+    def complete(self) -> Sealed:
+        """Write the summary, without renaming the file or forcing it to the disk."""
+        self._prove()
+        # In one write: without room the file is unchanged, and can be sealed again.
+        end = record_bytes(DataEnd(data_section_crc=0))
+        table = self.table.build(end)
+        assert table.end == self.position + len(end)
+        tail = self._summary(table) + MAGIC
+        self._append([end, tail])
+        channels = {number: channel for number, (_, channel) in self.channels.items()}
+        self._sealed = Sealed(
+            self.number,
+            sealed_name(self.number),
+            self.position,
+            digest_of(tail),
+            sealed_channels(table, channels),
+        )
+        return self._sealed
+
+    def finish(self) -> None:
+        """Force a complete file to the disk and close it, without giving it another name.
+
+        Raises:
+            HybridlogError: It cannot be written.
+        """
+        try:
+            self._file.finish(sync=True)
+        except OSError as error:
+            raise durability.explain(error, self.path, "writing") from error
+        self._finished = True
+
+    def abandon(self) -> None:
+        """Close without sealing; the next opening of the store recovers the file."""
+        with suppress(OSError):
+            self._file.finish(sync=False)
+
+    def _padding(self, content: Buffer, at: int, head: int) -> bytes:
+        """Padding before a chunk record so that its content starts at a block."""
+        if not self._file.room_before(content, at + head):
+            return b""
+        least = RECORD_HEAD.size
+        return padding_record(least + self._file.room_before(content, at + least + head))
+
+    def _write(self, records: Sequence[bytes]) -> None:
+        """Append records outside of chunks."""
+        self._append(records)
+        for record in records:
+            self.table.other(record)
+
+    def _append(self, parts: Sequence[Buffer]) -> None:
+        try:
+            self._file.append(parts)
+        except OSError as error:
+            raise durability.explain(error, self.path, "writing") from error
+
+    def _sync_folder(self) -> None:
+        try:
+            files.sync_folder(self.path.parent)
+        except OSError as error:
+            raise durability.explain(error, self.path, "creating") from error
+
+    def _summary(self, table: ChunkTable) -> bytes:
+        start = table.end
+        body = table.to_bytes()
+        groups: list[tuple[int, bytes]] = [
+            (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
+            (
+                Opcode.CHANNEL,
+                _joined(channel_record(i, sid, c) for i, (sid, c) in self.channels.items()),
+            ),
+            (Opcode.STATISTICS, record_bytes(self._statistics())),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.ATTACHMENT_INDEX, _joined(self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, _joined(self._metadata_indexes)),
+            (CHUNK_TABLE_OPCODE, RECORD_HEAD.pack(CHUNK_TABLE_OPCODE, len(body)) + body),
+        ]
+        offsets: list[SummaryOffset] = []
+        at = start
+        for opcode, records in groups:
+            if records:
+                offsets.append(
+                    SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(records))
+                )
+            at += len(records)
+        summary = b"".join((*(records for _, records in groups), _joined(offsets)))
+        footer = Footer(summary_start=start, summary_offset_start=at, summary_crc=0)
+        # The footer's checksum covers the summary and the footer up to the checksum itself.
+        covered = record_bytes(footer)[:-4]
+        footer.summary_crc = crc32(covered, crc32(summary))
+        return summary + record_bytes(footer)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self._counts.items())),
+            chunk_count=self._listed,
+            message_count=sum(self._counts.values()),
+            message_end_time=self._last,
+            message_start_time=self._first or 0,
+            metadata_count=len(self._metadata_indexes),
+            schema_count=len(self.schemas),
+        )
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        files.status(path)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _joined(records: Iterable[McapRecord]) -> bytes:
+    return b"".join(map(record_bytes, records))

@@ -1,0 +1,497 @@
+"""The bytes of a segment: MCAP records and the private ones of hybridlog.
+
+Pure functions from values to bytes and back. Rare records are built with the classes of
+the `mcap` package. The records written for each chunk are packed here, so that a payload
+is copied once on its way to the disk.
+
+Names in channel metadata and of metadata records that start with `hybridlog.` are reserved.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+from collections.abc import Mapping
+from itertools import accumulate
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import McapRecord, Metadata
+from mcap.records import Schema as SchemaRecord
+
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk.copying import windows
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap.mcap_content import (
+    CHUNK_INDEX_HEAD,
+    INDEX_PLACE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+)
+from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
+from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.segments.compression import decompress
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+PROFILE: Final = "hybridlog"
+LIBRARY: Final = "hybridlog"
+FORMAT_VERSION: Final = 3
+
+OUR_NAMES: Final = "hybridlog."
+"""Beginning of the names of the store's own metadata records and channel metadata."""
+RECORDING_METADATA: Final = "hybridlog.recording"
+END_METADATA: Final = "hybridlog.end"
+LOSSES_METADATA: Final = "hybridlog.losses"
+NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
+NO_INDEX: Final = "hybridlog.no_index"
+
+ARRIVAL_OPCODE: Final = 0x90
+"""Record of the application range of opcodes: checksums of what stands before it, and the
+arrival numbers of a chunk's messages when it follows one."""
+PADDING_OPCODE: Final = 0x91
+"""Record of zeros, so that the content of the chunk behind it starts at a block."""
+
+CHUNK_TABLE_OPCODE: Final = 0x92
+"""Record of the summary: the chunk table, see `chunk_table`."""
+
+MOVED_OPCODE: Final = 0x93
+"""Record in place of a chunk whose content lies in columns of payloads."""
+COMPACTED_METADATA: Final = "hybridlog.compacted"
+"""Metadata record of a segment with moved chunks."""
+DATA_END_SIZE: Final = 13
+"""Bytes of the record of the end of the data."""
+CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
+MOVED_SIZE: Final = CHUNK_HEAD.size
+"""Bytes of the record of a moved chunk; every chunk record has more."""
+INDEX_HEAD: Final = struct.Struct("<BQHI")
+PROOF: Final = struct.Struct("<QQIIIII")
+"""Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
+
+_INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_MAX_ARRIVALS = 1 << 27
+_per_thread = threading.local()
+
+
+def record_bytes(record: McapRecord) -> bytes:
+    """One record of the `mcap` package as bytes."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()  # type: ignore[no-any-return, no-untyped-call]
+
+
+def schema_record(schema_id: int, schema: Schema) -> SchemaRecord:
+    """The MCAP record of a schema."""
+    return SchemaRecord(
+        id=schema_id, name=schema.name, encoding=schema.encoding, data=bytes(schema.data)
+    )
+
+
+def channel_record(channel_id: int, schema_id: int, channel: Channel) -> ChannelRecord:
+    """The MCAP record of a channel; private metadata keys hold what MCAP has no field for."""
+    metadata = dict(channel.metadata)
+    flags = {NO_PUBLISH_TIME: not channel.has_publish_time, NO_INDEX: not channel.is_indexed}
+    for name, is_set in flags.items():
+        metadata.pop(name, None)
+        if is_set:
+            metadata[name] = "1"
+    return ChannelRecord(
+        id=channel_id,
+        topic=channel.topic,
+        message_encoding=channel.message_encoding,
+        schema_id=schema_id,
+        metadata=metadata,
+    )
+
+
+def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Channel:
+    """The channel described by a record of a segment.
+
+    Raises:
+        SegmentError: Its schema is not defined.
+    """
+    schema: Schema | None = None
+    if record.schema_id:
+        found = schemas.get(record.schema_id)
+        if found is None:
+            raise SegmentError(f"channel {record.id} refers to schema {record.schema_id}: unknown")
+        schema = Schema(found.name, found.encoding, bytes(found.data))
+    metadata = dict(record.metadata)
+    return Channel(
+        record.topic,
+        record.message_encoding,
+        schema,
+        metadata,
+        has_publish_time=metadata.pop(NO_PUBLISH_TIME, None) is None,
+        is_indexed=metadata.pop(NO_INDEX, None) is None,
+    )
+
+
+def json_metadata(name: str, value: object) -> Metadata:
+    """A metadata record with one JSON value."""
+    text = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
+    return Metadata(name=name, metadata={"json": text})
+
+
+def json_of(record: Metadata) -> dict[str, object]:
+    """The value of a metadata record from `json_metadata`.
+
+    Raises:
+        SegmentError: it is not one.
+    """
+    try:
+        value = json.loads(record.metadata["json"])
+    except (KeyError, ValueError) as error:
+        raise SegmentError(f"metadata record {record.name!r} cannot be read: {error}") from error
+    if not isinstance(value, dict):
+        raise SegmentError(f"metadata record {record.name!r} is not a JSON object")
+    return value
+
+
+def chunk_head(
+    *,
+    first: int,
+    last: int,
+    uncompressed_size: int,
+    crc: int,
+    compression: str,
+    compressed_size: int,
+) -> bytes:
+    """The head of a chunk record: all bytes before the compressed data."""
+    name = compression.encode()
+    body = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + compressed_size
+    return b"".join(
+        (
+            CHUNK_HEAD.pack(Opcode.CHUNK, body, first, last, uncompressed_size, crc),
+            struct.pack("<I", len(name)),
+            name,
+            struct.pack("<Q", compressed_size),
+        )
+    )
+
+
+class ChunkSummary(NamedTuple):
+    """The entry of a chunk in the summary; its message indexes directly follow the chunk.
+
+    Attributes:
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+        offset: Byte of the file where it starts.
+        length: Bytes of the chunk record.
+        indexes: Bytes of each channel's message index record, in their order in the file.
+        compression: MCAP name of the codec.
+        compressed_size: Bytes of compressed content.
+        uncompressed_size: Bytes of content.
+    """
+
+    first: int
+    last: int
+    offset: int
+    length: int
+    indexes: Mapping[int, int]
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+
+
+def chunk_index_record(chunk: ChunkSummary) -> bytes:
+    """The chunk index record of this entry."""
+    name = chunk.compression.encode()
+    places = index_offsets(chunk.indexes, chunk.offset + chunk.length)
+    table = b"".join(map(INDEX_PLACE.pack, places.keys(), places.values()))
+    tail = struct.pack(
+        f"<QI{len(name)}sQQ",
+        sum(chunk.indexes.values()),
+        len(name),
+        name,
+        chunk.compressed_size,
+        chunk.uncompressed_size,
+    )
+    head = CHUNK_INDEX_HEAD.pack(chunk.first, chunk.last, chunk.offset, chunk.length, len(table))
+    body = head + table + tail
+    return RECORD_HEAD.pack(Opcode.CHUNK_INDEX, len(body)) + body
+
+
+def compression_of(record: Buffer) -> tuple[str, int]:
+    """Compression of a checked chunk record, and bytes of its compressed content."""
+    at = CHUNK_HEAD.size
+    (length,) = struct.unpack_from("<I", record, at)
+    name = bytes(record[at + 4 : at + 4 + length]).decode("ascii", "replace")
+    (compressed,) = struct.unpack_from("<Q", record, at + 4 + length)
+    return name, int(compressed)
+
+
+def head_length(record: Buffer) -> int:
+    """Bytes of a chunk record before its content; all of the record of a moved chunk.
+
+    Args:
+        record: The record, or its beginning.
+    """
+    if record[0] == MOVED_OPCODE:
+        return MOVED_SIZE
+    (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
+    return int(CHUNK_HEAD.size + 4 + name + 8)
+
+
+def moved_record(chunk: Buffer) -> bytes:
+    """The record in place of a chunk record whose content lies elsewhere.
+
+    Args:
+        chunk: The chunk record, or such a record already.
+    """
+    _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
+    return CHUNK_HEAD.pack(MOVED_OPCODE, MOVED_SIZE - RECORD_HEAD.size, first, last, size, crc)
+
+
+def padding_record(size: int) -> bytes:
+    """A padding record of `size` bytes, including its head."""
+    length = size - RECORD_HEAD.size
+    return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
+
+
+def index_order(channel: NDArray[np.int32], log_time: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Rows of a chunk by channel and, within one, by log time.
+
+    Returns:
+        intp[n]; messages of one channel and time stay in the order of the chunk.
+    """
+    return np.lexsort((log_time, channel))
+
+
+def message_indexes(
+    channel: NDArray[np.int32],
+    log_time: NDArray[np.int64],
+    record_offset: NDArray[np.int64],
+    order: NDArray[np.intp],
+) -> dict[int, bytes]:
+    """Message index record of each channel in a chunk, by channel id.
+
+    Args:
+        channel: int32[n], channel ids.
+        log_time: int64[n], ns.
+        record_offset: int64[n], byte of the content where each message record starts.
+        order: intp[n], from `index_order`.
+    """
+    channels = channel[order]
+    entries = np.empty(len(order), _INDEX_ENTRY)
+    entries["log_time"] = log_time[order]
+    entries["offset"] = record_offset[order]
+    starts = run_starts(channels).tolist()
+    records: dict[int, bytes] = {}
+    for start, end in zip(starts, [*starts[1:], len(channels)], strict=True):
+        data = entries[start:end].tobytes()
+        head = INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(data), int(channels[start]), len(data))
+        records[int(channels[start])] = head + data
+    return records
+
+
+def index_offsets(sizes: Mapping[int, int], start: int) -> dict[int, int]:
+    """Start of the message index of each channel, by channel id.
+
+    Args:
+        sizes: Bytes of each, in file order.
+        start: Byte where the first begins.
+    """
+    return dict(zip(sizes, accumulate(sizes.values(), initial=start), strict=False))
+
+
+def entries_of(index: bytes) -> int:
+    """Number of messages in a message index record."""
+    return (len(index) - INDEX_HEAD.size) // _INDEX_ENTRY.itemsize
+
+
+def definitions_chunk(content: bytes) -> bytes:
+    """A chunk record with definitions alone: compressed they have a fifth of the bytes."""
+    packed = checked_frame(content)
+    head = chunk_head(
+        first=0,
+        last=0,
+        uncompressed_size=len(content),
+        crc=crc32(content),
+        compression="zstd",
+        compressed_size=len(packed),
+    )
+    return head + packed
+
+
+def checked_frame(data: Buffer) -> bytes:
+    """Data as one zstd frame with a checksum of its content."""
+    compressor = getattr(_per_thread, "compressor", None)
+    if compressor is None:
+        compressor = zstandard.ZstdCompressor(level=1, write_checksum=True)
+        _per_thread.compressor = compressor
+    packed: bytes = compressor.compress(data)
+    return packed
+
+
+def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
+    """Pack the arrival numbers of a chunk's messages, in chunk order, with a checksum."""
+    steps = seq.astype("<i8")
+    steps[1:] -= seq[:-1]
+    return checked_frame(steps.tobytes())
+
+
+class Proof(NamedTuple):
+    """Checksums of a part of a segment, in the arrival record behind it.
+
+    They prove what an open segment has so far; the chunk table repeats them for a sealed one.
+
+    Attributes:
+        chunk: Byte of the file where the chunk record starts; 0 if the record follows no chunk.
+        length: Bytes before the chunk that it covers; without a chunk, before the record.
+        before: CRC-32 of these bytes.
+        head: CRC-32 of the head of the chunk record; 0 without a chunk, as are the others.
+        record: CRC-32 of the chunk record.
+        indexes: CRC-32 of the message indexes.
+    """
+
+    chunk: int
+    length: int
+    before: int
+    head: int = 0
+    record: int = 0
+    indexes: int = 0
+
+
+def arrival_record(proof: Proof, packed: Buffer = b"") -> bytes:
+    """The record with checksums and, behind a chunk, with its packed arrival numbers."""
+    fields = PROOF.pack(*proof, 0)[:-4]
+    own = crc32(packed, crc32(fields))
+    head = RECORD_HEAD.pack(ARRIVAL_OPCODE, PROOF.size + len(packed))
+    return b"".join((head, fields, own.to_bytes(4, "little"), packed))
+
+
+def proof_of(body: Buffer) -> Proof:
+    """Parse the checksums in the body of an arrival record.
+
+    Raises:
+        SegmentError: The record is damaged.
+    """
+    if len(body) < PROOF.size:
+        raise SegmentError("the arrival record is damaged")
+    *fields, own = PROOF.unpack_from(body)
+    view = memoryview(body)
+    if crc32(view[PROOF.size :], crc32(view[: PROOF.size - 4])) != own:
+        raise SegmentError("the arrival record is damaged")
+    return Proof(*fields)
+
+
+def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
+    """Parse the body of an arrival record into chunk offset and arrival numbers.
+
+    Raises:
+        SegmentError: The record is damaged or does not hold `count` numbers.
+    """
+    if len(body) < PROOF.size or count > _MAX_ARRIVALS:
+        raise SegmentError("the record of arrival numbers is damaged")
+    try:
+        raw = decompress("zstd", memoryview(body)[PROOF.size :], count * 8)
+    except SegmentError as error:
+        raise SegmentError(f"the record of arrival numbers is damaged: {error}") from error
+    (chunk_offset,) = struct.unpack_from("<Q", body)
+    return chunk_offset, np.cumsum(np.frombuffer(raw, "<i8"), dtype=np.int64)
+
+
+def message_starts(trailer: Buffer) -> NDArray[np.int64]:
+    """Start of each message record in a chunk, ascending, from its message indexes.
+
+    Args:
+        trailer: The message index records, and the record of arrival numbers.
+
+    Returns:
+        int64[n]; as right as the trailer is.
+
+    Raises:
+        SegmentError: The trailer holds something else.
+    """
+    indexes, _ = split_trailer(trailer)
+    found = [entries["offset"].astype(np.int64) for _, entries in indexes]
+    # Each channel's starts are sorted already; merging sorted runs is ten times as fast.
+    return np.sort(np.concatenate(found), kind="stable") if found else np.empty(0, np.int64)
+
+
+def message_times(trailer: Buffer) -> dict[int, NDArray[np.int64]]:
+    """Log times of the messages of a chunk by channel, from its message indexes.
+
+    Args:
+        trailer: The message index records, and the record of arrival numbers.
+
+    Returns:
+        int64[n], ns, ascending; as right as the trailer is.
+
+    Raises:
+        SegmentError: The trailer holds something else.
+    """
+    indexes, _ = split_trailer(trailer)
+    return {channel: entries["log_time"].astype(np.int64) for channel, entries in indexes}
+
+
+def split_trailer(trailer: Buffer) -> tuple[list[tuple[int, NDArray[np.void]]], memoryview]:
+    """Parse the records behind a chunk.
+
+    Args:
+        trailer: Exactly the message index records and the record of arrival numbers.
+
+    Returns:
+        Channel id and entries (`log_time`, `offset`) of each message index; the body of the
+        record of arrival numbers.
+
+    Raises:
+        SegmentError: It holds other bytes.
+    """
+    view = memoryview(trailer)
+    found: list[tuple[int, NDArray[np.void]]] = []
+    at = 0
+    while at + INDEX_HEAD.size <= len(view) and view[at] != ARRIVAL_OPCODE:
+        opcode, length, channel, size = INDEX_HEAD.unpack_from(view, at)
+        start = at + INDEX_HEAD.size
+        at = start + size
+        is_index = opcode == Opcode.MESSAGE_INDEX and size + 6 == length
+        if not is_index or size % _INDEX_ENTRY.itemsize or at > len(view):
+            raise SegmentError("its message indexes are damaged")
+        found.append((channel, np.frombuffer(view[start:at], _INDEX_ENTRY)))
+    if at + RECORD_HEAD.size + PROOF.size > len(view):
+        raise SegmentError("its arrival numbers are missing")
+    opcode, length = RECORD_HEAD.unpack_from(view, at)
+    at += RECORD_HEAD.size
+    if opcode != ARRIVAL_OPCODE or at + length != len(view):
+        raise SegmentError("its arrival numbers are damaged")
+    return found, view[at:]
+
+
+def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:
+    """The messages of a chunk, given the starts of their records.
+
+    Args:
+        content: The uncompressed chunk.
+        starts: int64[n], ascending.
+
+    Returns:
+        None if `starts` is wrong, that is, if the records do not cover the content from the
+        first byte to the last.
+    """
+    if not len(starts) or starts[0] != 0 or int(starts[-1]) + MESSAGE_HEAD.itemsize > len(content):
+        return None
+    heads = windows(content, MESSAGE_HEAD.itemsize)[starts].view(MESSAGE_HEAD)
+    sizes = heads["length"].astype(np.int64)
+    ends = starts + sizes + RECORD_HEAD.size
+    whole = bool((heads["opcode"] == int(Opcode.MESSAGE)).all())
+    whole = whole and bool((ends[:-1] == starts[1:]).all()) and int(ends[-1]) == len(content)
+    if not whole or bool((sizes < MESSAGE_HEAD.itemsize - RECORD_HEAD.size).any()):
+        return None
+    return Batch(
+        content,
+        starts + MESSAGE_HEAD.itemsize,
+        sizes - (MESSAGE_HEAD.itemsize - RECORD_HEAD.size),
+        heads["channel"].astype(np.int32),
+        heads["log_time"].astype(np.int64),
+        heads["publish_time"].astype(np.int64),
+        heads["sequence"].astype(np.uint32),
+    )

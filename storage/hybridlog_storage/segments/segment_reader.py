@@ -1,0 +1,787 @@
+"""Reads segments: their summary, and chunks one at a time.
+
+A sealed segment never changes and every read names its position, so several threads may
+share a reader.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Metadata, MetadataIndex, Statistics
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Schema as SchemaRecord
+
+from hybridlog_storage import journal
+from hybridlog_storage.buffers import buffers
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.append_file import BLOCK, DIRECT
+from hybridlog_storage.errors import SegmentError, exhausted
+from hybridlog_storage.mcap.mcap_content import (
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    parse_content,
+    read_record,
+)
+from hybridlog_storage.messages import Buffer, Channel
+from hybridlog_storage.ordering import distinct
+from hybridlog_storage.segments.attachments import (
+    MAX_HEAD,
+    Attachment,
+    FileHandle,
+    parse_attachment,
+)
+from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk_table import ChunkTable
+from hybridlog_storage.segments.compression import FilePart, decompress
+from hybridlog_storage.segments.segment_file import digest_of
+from hybridlog_storage.segments.segment_format import (
+    CHUNK_HEAD,
+    CHUNK_TABLE_OPCODE,
+    COMPACTED_METADATA,
+    END_METADATA,
+    FORMAT_VERSION,
+    LOSSES_METADATA,
+    MAGIC,
+    MOVED_OPCODE,
+    MOVED_SIZE,
+    OUR_NAMES,
+    RECORDING_METADATA,
+    arrivals_of,
+    channel_of,
+    chunk_head,
+    index_order,
+    json_of,
+    message_indexes,
+    message_starts,
+    message_times,
+    messages_at,
+    split_trailer,
+)
+from hybridlog_storage.stopping import check_wanted
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Batch
+
+_T = TypeVar("_T")
+_FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
+_TAIL = _FOOTER.size + len(MAGIC)
+_MAX_SUMMARY = 1 << 30
+_PIECE = 4 << 20  # bytes read at once for a checksum
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkPlace:
+    """Position of a chunk in its segment.
+
+    Attributes:
+        number: Number of the chunk in its segment, from 0, in file order.
+        offset: Byte of the chunk record.
+        length: Bytes of the chunk record.
+        trailer: Bytes of message indexes and arrival numbers behind it.
+        first: Smallest log time in it, ns.
+        last: Largest log time in it, ns.
+        channels: Ids of the channels in it.
+        crc: CRC-32 of the chunk record, including its head.
+        trailer_crc: CRC-32 of the trailer.
+    """
+
+    number: int
+    offset: int
+    length: int
+    trailer: int
+    first: int
+    last: int
+    channels: tuple[int, ...]
+    crc: int
+    trailer_crc: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegmentSummary:
+    """The checked summary of a sealed segment.
+
+    Attributes:
+        recording: Catalog entry of the recording at the start of the segment.
+        end: The end of the recording; None except in its last segment.
+        channels: Channels by id.
+        schema_ids: Id of each channel's schema, 0 without one, by channel id.
+        counts: Number of messages by channel id.
+        losses: Rows of the loss ledger written with its messages.
+        attachments: Attachments of the source, in file order.
+        metadata: Metadata records of the source, in file order.
+        compacted: `digest` and `bytes` of a segment before chunks were moved, and the `files` of
+            columns that it needs; None in others.
+        table: The chunk table.
+        digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
+        size: Bytes of the file.
+    """
+
+    recording: dict[str, object]
+    end: dict[str, object] | None
+    channels: dict[int, Channel]
+    schema_ids: dict[int, int]
+    counts: dict[int, int]
+    losses: list[dict[str, Any]]
+    attachments: list[AttachmentIndex]
+    metadata: list[MetadataIndex]
+    compacted: dict[str, Any] | None
+    table: ChunkTable
+    digest: str
+    size: int
+
+    @property
+    def chunks(self) -> list[ChunkPlace]:
+        """Position of each chunk, in file order."""
+        return places_of(self.table)
+
+
+@dataclass(slots=True)
+class _Records:
+    """The needed records of a summary."""
+
+    schemas: dict[int, SchemaRecord]
+    channels: dict[int, ChannelRecord]
+    attachments: list[AttachmentIndex]
+    metadata: list[MetadataIndex]
+    statistics: Statistics | None
+    table: Buffer | None
+
+
+Contents = Callable[[int, int, int], Buffer]
+"""Returns the content of a moved chunk, by numbers of segment and chunk, and its size.
+
+It raises SegmentError when the content is missing or damaged. The caller checks it."""
+
+
+class SegmentReader:
+    """One sealed segment file.
+
+    Args:
+        path: The file.
+        number: Its number in the recording.
+        direct: Read past the page cache, if the file system allows it: for data that was
+            just written that way and will not be read again soon.
+        contents: Returns the content of moved chunks.
+
+    Raises:
+            SegmentError: The file is missing or cannot be opened.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        number: int,
+        *,
+        direct: bool = False,
+        contents: Contents | None = None,
+    ) -> None:
+        self.path = path
+        self.number = number
+        self._contents = contents
+        self._places: list[ChunkPlace] | None = None
+        self._direct = direct and bool(DIRECT)
+        cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
+        try:
+            # Opening must not block, for example on a named pipe.
+            self._fd = self._open(path)
+        except OSError as error:
+            problem = f"Segment {path} cannot be opened: {error.strerror}. {cure}"
+            raise (exhausted(error.errno, f"opening {path}") or SegmentError(problem)) from error
+        about = os.fstat(self._fd)
+        if not stat.S_ISREG(about.st_mode):
+            self.close()
+            raise SegmentError(f"Segment {path} is not an ordinary file. {cure}")
+        self.size = about.st_size
+        self.bytes_read = 0
+
+    def _open(self, path: Path) -> int:
+        flags = os.O_RDONLY | os.O_NONBLOCK
+        if self._direct:
+            with suppress(OSError):
+                return files.open_file(path, flags | DIRECT)
+            self._direct = False
+        return files.open_file(path, flags)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def __del__(self) -> None:
+        if hasattr(self, "_fd"):
+            self.close()
+
+    def __enter__(self) -> Self:
+        """Return this reader."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def stream(self) -> BinaryIO:
+        """A new handle of the file for `scan`; the caller closes it.
+
+        Raises:
+            SegmentError: It cannot be opened.
+        """
+        try:
+            return os.fdopen(os.dup(self._fd), "rb")
+        except OSError as error:
+            problem = f"{self.path} cannot be read: {error.strerror}."
+            raise (
+                exhausted(error.errno, f"reading {self.path}") or SegmentError(problem)
+            ) from error
+
+    def grow(self) -> None:
+        """Update the file's size after an append."""
+        self.size = os.fstat(self._fd).st_size
+
+    def summary(self) -> SegmentSummary:
+        """Channels, chunks and metadata, from the summary at the end of the file.
+
+        Raises:
+            SegmentError: It is missing, damaged, or has another format.
+        """
+        with self._explained():
+            start, tail = self._tail()
+            records = _records(tail[: len(tail) - _TAIL])
+            return self._summary(records, self._table(records, start), digest_of(tail))
+
+    def table(self) -> ChunkTable:
+        """The chunk table of the summary, without reading metadata.
+
+        Raises:
+            SegmentError: As `summary`.
+        """
+        with self._explained():
+            start, tail = self._tail()
+            return self._table(_records(tail[: len(tail) - _TAIL]), start)
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except _NoSummaryError as error:
+            raise SegmentError(
+                f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
+                "changed since: restore it, or see what is left with `mcap recover`."
+            ) from error
+
+    def _tail(self) -> tuple[int, memoryview]:
+        """Start of the summary, and the checked bytes from there on."""
+        if self.size < len(MAGIC) + _TAIL:
+            raise _NoSummaryError("it is too short")
+        tail = self.read(self.size - _TAIL, _TAIL)
+        opcode, length, start, offsets, crc = _FOOTER.unpack_from(tail)
+        if bytes(tail[_FOOTER.size :]) != MAGIC or opcode != Opcode.FOOTER or length != 20:
+            raise _NoSummaryError("its end is damaged or missing")
+        end = self.size - _TAIL
+        if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
+            raise _NoSummaryError("its footer is damaged")
+        data = self.read(start, self.size - start)
+        if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
+            raise _NoSummaryError("its checksum differs")
+        return start, data
+
+    def _table(self, records: _Records, start: int) -> ChunkTable:
+        if records.table is None:
+            self._refuse_other_format(records)
+            if all(index.name != RECORDING_METADATA for index in records.metadata):
+                raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
+            raise _NoSummaryError("its chunk table is missing")
+        try:
+            table = ChunkTable.from_bytes(records.table)
+        except SegmentError as error:
+            self._refuse_other_format(records)
+            raise _NoSummaryError(str(error)) from error
+        if table.end != start:
+            raise _NoSummaryError("its chunk table is of another file")
+        return table
+
+    def _refuse_other_format(self, records: _Records) -> None:
+        """Raise if the unchecked header names another format."""
+        for index in records.metadata:
+            if index.name == RECORDING_METADATA:
+                record = _metadata(self.read(index.offset, index.length), index.offset, self.path)
+                check_format(json_of(record), self.path)
+
+    def _summary(self, records: _Records, table: ChunkTable, digest: str) -> SegmentSummary:
+        found: dict[str, dict[str, object]] = {}
+        losses: list[dict[str, Any]] = []
+        for index in records.metadata:
+            if index.name in {RECORDING_METADATA, END_METADATA}:
+                found[index.name] = json_of(self.metadata(table, index))
+                if index.name == RECORDING_METADATA:
+                    check_format(found[index.name], self.path)
+                else:
+                    found[index.name] = _said(journal.end_of, found[index.name])
+            elif index.name == COMPACTED_METADATA:
+                value = json_of(self.metadata(table, index))
+                found[index.name] = _said(journal.compacted_of, value)
+            elif index.name == LOSSES_METADATA:
+                losses += loss_rows(json_of(self.metadata(table, index)))
+        if RECORDING_METADATA not in found:
+            raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
+        totals = table.by_channel()
+        counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
+        stated = records.statistics.channel_message_counts if records.statistics else {}
+        is_known = counts.keys() <= records.channels.keys()
+        if _listed_counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
+            raise _NoSummaryError("its statistics and its chunk table differ")
+        return SegmentSummary(
+            recording=found[RECORDING_METADATA],
+            end=found.get(END_METADATA),
+            channels={i: channel_of(r, records.schemas) for i, r in records.channels.items()},
+            schema_ids={i: r.schema_id for i, r in records.channels.items()},
+            counts=counts,
+            losses=losses,
+            attachments=records.attachments,
+            metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
+            compacted=found.get(COMPACTED_METADATA),
+            table=table,
+            digest=digest,
+            size=self.size,
+        )
+
+    def indexes(self) -> tuple[list[MetadataIndex], list[AttachmentIndex]]:
+        """Index records of the metadata and the attachments.
+
+        Raises:
+            SegmentError: As `summary`.
+        """
+        with self._explained():
+            _, tail = self._tail()
+            records = _records(tail[: len(tail) - _TAIL])
+            return records.metadata, records.attachments
+
+    def metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
+        """A metadata record, after checking the stretch that holds it.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        what = f"metadata record {index.name!r}"
+        start, length = self._check_stretch(table, index, what)
+        data = self.read(start, length)
+        at = index.offset - start
+        return _metadata(data[at : at + index.length], index.offset, self.path)
+
+    def attachment(self, table: ChunkTable, index: AttachmentIndex) -> Attachment:
+        """An attachment, after checking all its bytes; they are read again later.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        self._check_stretch(table, index, f"attachment {index.name!r}")
+        start, size = index.offset + RECORD_HEAD.size, index.length - RECORD_HEAD.size
+        head = self.read(start, max(min(size, MAX_HEAD), 0))
+        part = FilePart(FileHandle(self._fd), start, size)
+        found, _ = parse_attachment(head, part, check_crc=False)
+        if found.index(index.offset, index.length) != index:
+            raise SegmentError(f"{self.path}: another attachment is at byte {index.offset}.")
+        return found
+
+    def _check_stretch(
+        self, table: ChunkTable, index: MetadataIndex | AttachmentIndex, what: str
+    ) -> tuple[int, int]:
+        """Start and length of the stretch that holds a record, after checking it."""
+        stretch = table.stretch(index.offset, index.length)
+        if stretch is None:
+            raise _NoSummaryError(f"no {what} lies at byte {index.offset}")
+        start, length, crc = stretch
+        if self.checksum(start, length) != crc:
+            raise SegmentError(
+                f"{self.path}: bytes {start} to {start + length} are damaged, and with them the "
+                f"{what} at byte {index.offset}. Restore the file."
+            )
+        return start, length
+
+    def read_chunk(self, place: ChunkPlace) -> StoredChunk:
+        """Read, decompress and check one chunk.
+
+        Args:
+            place: Its position. Its checksums are compared before any byte of the chunk is
+                used. Damaged message indexes are ignored: messages and arrival numbers have
+                checksums of their own.
+
+        Raises:
+                SegmentError: It is missing or damaged; the message names file and offset.
+        """
+        return self._at_its_place(place, self._read_chunk)
+
+    def _read_chunk(self, place: ChunkPlace) -> StoredChunk:
+        data = self.read(place.offset, place.length + place.trailer)
+        record, trailer = data[: place.length], data[place.length :]
+        try:
+            if crc32(record) != place.crc:
+                raise SegmentError("its checksum differs")
+            if len(record) == MOVED_SIZE:
+                content, compressed = self._moved_content(place, record), 0
+            else:
+                content, compressed = open_chunk(record)
+            if crc32(trailer) != place.trailer_crc:
+                batch = parse_content(content).batch
+            else:
+                found = messages_at(content, message_starts(trailer))
+                if found is None:
+                    raise SegmentError("its message indexes do not fit its messages")
+                batch = found
+            seq = check_arrivals(trailer, place.offset, len(batch))
+        except SegmentError as error:
+            raise self._damaged(place, error) from error
+        return StoredChunk(
+            segment=self.number,
+            number=place.number,
+            offset=place.offset,
+            length=place.length,
+            trailer=place.trailer,
+            crc=place.crc,
+            trailer_crc=place.trailer_crc,
+            batch=batch,
+            seq=seq,
+            compressed_size=compressed,
+        )
+
+    def _moved_content(self, place: ChunkPlace, record: memoryview) -> Buffer:
+        """The content of a moved chunk, checked."""
+        opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
+        if opcode != MOVED_OPCODE or length + RECORD_HEAD.size != len(record):
+            raise SegmentError("no chunk record is there")
+        if self._contents is None:
+            raise SegmentError("its messages lie in columns of payloads")
+        content = self._contents(self.number, place.number, size)
+        if len(content) != size or crc32(content) != crc:
+            raise SegmentError("its messages do not come back from their columns")
+        return content
+
+    def _at_its_place(self, place: ChunkPlace, read: Callable[[ChunkPlace], _T]) -> _T:
+        """Read something of a chunk, whose place may be listed as before a rewriting.
+
+        A segment is written again when chunks are moved. Numbers of chunks stay.
+        """
+        check_wanted()
+        try:
+            return read(place)
+        except SegmentError:
+            if self._places is None:
+                self._places = []
+                with suppress(SegmentError):
+                    self._places = places_of(self.table())
+            if place.number >= len(self._places):
+                raise
+            now = self._places[place.number]
+            if (now.offset, now.length) == (place.offset, place.length):
+                raise
+            return read(now)
+
+    def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
+        return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
+
+    def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
+        """Log times of a chunk's messages by channel, from its message indexes alone.
+
+        If these are damaged, the chunk is read instead.
+
+        Returns:
+            int64[n], ns, ascending, by channel id.
+
+        Raises:
+            SegmentError: They are missing or damaged; the message names file and offset.
+        """
+        return self._at_its_place(place, self._read_times)
+
+    def _read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
+        trailer = self.read(place.offset + place.length, place.trailer)
+        if crc32(trailer) == place.trailer_crc:
+            return message_times(trailer)
+        batch = self.read_chunk(place).batch
+        channels = distinct(batch.channel).tolist()
+        return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
+
+    def read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
+        """Arrival numbers of a chunk's messages, without reading the chunk.
+
+        Args:
+            place: Its position, with the checksum of the trailer.
+            count: Number of its messages.
+
+        Returns:
+                int64[count].
+
+        Raises:
+                SegmentError: They are missing or damaged; the message names file and offset.
+        """
+        return self._at_its_place(place, lambda at: self._read_arrivals(at, count))
+
+    def _read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
+        trailer = self.read(place.offset + place.length, place.trailer)
+        try:
+            if crc32(trailer) != place.trailer_crc:
+                raise SegmentError("its message indexes or arrival numbers changed")
+            return check_arrivals(trailer, place.offset, count)
+        except SegmentError as error:
+            raise self._damaged(place, error) from error
+
+    def checksum(self, offset: int, length: int) -> int:
+        """CRC-32 of a range of bytes of the file.
+
+        Raises:
+            SegmentError: They cannot be read.
+        """
+        crc = 0
+        for at in range(offset, offset + length, _PIECE):
+            crc = crc32(self.read(at, min(_PIECE, offset + length - at)), crc)
+        return crc
+
+    def read(self, offset: int, length: int) -> memoryview:
+        """Unchecked bytes of the file.
+
+        Raises:
+            SegmentError: The file is too short, or cannot be read.
+        """
+        if offset + length > self.size:
+            raise SegmentError(
+                f"{self.path} ends at byte {self.size}, but bytes {offset} to "
+                f"{offset + length} are referred to: the file was cut short."
+            )
+        # Direct reads start and end at whole blocks, in the file and in memory.
+        ahead = offset % BLOCK if self._direct else 0
+        wanted = ahead + length
+        size = wanted + -wanted % BLOCK if self._direct else wanted
+        buffer = buffers.take(size, whole_pages=self._direct).data
+        try:
+            count = os.preadv(self._fd, [buffer[:size]], offset - ahead)
+        except OSError as error:
+            raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
+        if count < wanted:
+            raise SegmentError(f"{self.path} gives {count - ahead} bytes of {length} at {offset}.")
+        self.bytes_read += length
+        return buffer[ahead:wanted]
+
+
+class _NoSummaryError(SegmentError):
+    """A summary that is missing or damaged."""
+
+
+def _records(summary: memoryview) -> _Records:
+    """Parse a checked summary."""
+    found = _Records({}, {}, [], [], None, None)
+    at = 0
+    while at < len(summary):
+        if at + RECORD_HEAD.size > len(summary):
+            raise _NoSummaryError("it ends in the middle of a record")
+        opcode, length = RECORD_HEAD.unpack_from(summary, at)
+        at += RECORD_HEAD.size
+        if length > len(summary) - at:
+            raise _NoSummaryError("it ends in the middle of a record")
+        body = summary[at : at + length]
+        at += length
+        if opcode == CHUNK_TABLE_OPCODE:
+            found.table = body
+        if opcode not in _WANTED:
+            continue  # such as chunk indexes: the chunk table holds more and is faster to read
+        try:
+            record, _ = read_record(opcode, body)
+        except SegmentError as error:
+            raise _NoSummaryError(str(error)) from error
+        if isinstance(record, SchemaRecord):
+            found.schemas[record.id] = record
+        elif isinstance(record, ChannelRecord):
+            found.channels[record.id] = record
+        elif isinstance(record, AttachmentIndex):
+            found.attachments.append(record)
+        elif isinstance(record, MetadataIndex):
+            found.metadata.append(record)
+        elif isinstance(record, Statistics):
+            found.statistics = record
+    return found
+
+
+_WANTED = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+    }
+)
+
+
+def _listed_counts(table: ChunkTable) -> dict[int, int]:
+    """Messages of each channel in chunks that were not moved."""
+    rows = np.repeat(table.chunks["length"] != MOVED_SIZE, table.chunks["parts"])
+    totals = replace(table, parts=table.parts[rows]).by_channel()
+    return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
+
+
+def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:
+    try:
+        opcode, length = RECORD_HEAD.unpack_from(data)
+        if opcode == Opcode.METADATA and length == len(data) - RECORD_HEAD.size:
+            record, _ = read_record(opcode, data[RECORD_HEAD.size :])
+            if isinstance(record, Metadata):
+                return record
+    except (SegmentError, struct.error) as error:
+        raise SegmentError(f"Metadata at byte {offset} of {path} is damaged: {error}.") from error
+    raise SegmentError(f"No metadata record is at byte {offset} of {path}.")
+
+
+def places_of(table: ChunkTable) -> list[ChunkPlace]:
+    """Position of each chunk of a table, in file order."""
+    bounds = table.part_bounds()
+    return [place_of(table, number, bounds) for number in range(len(table.chunks))]
+
+
+def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = None) -> ChunkPlace:
+    """Position of a chunk of a table.
+
+    Args:
+        table: The chunks of a segment.
+        number: Number of the chunk.
+        bounds: The table's `part_bounds`, if they are at hand.
+    """
+    bounds = table.part_bounds() if bounds is None else bounds
+    offset, length, trailer, crc, trailer_crc, first, last, _ = table.chunks[number].item()
+    return ChunkPlace(
+        number=number,
+        offset=offset,
+        length=length,
+        trailer=trailer,
+        first=first,
+        last=last,
+        channels=tuple(table.parts["channel"][bounds[number] : bounds[number + 1]].tolist()),
+        crc=crc,
+        trailer_crc=trailer_crc,
+    )
+
+
+def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Rows of the loss ledger, from the value of its metadata record.
+
+    Raises:
+        SegmentError: The value is damaged.
+    """
+    return _said(journal.loss_rows, value.get("rows"))
+
+
+def _said(check: Callable[[Any], _T], value: object) -> _T:
+    try:
+        return check(value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
+
+
+def check_format(recording: Mapping[str, object], path: Path) -> None:
+    """Raise if a segment has another format.
+
+    Raises:
+        SegmentError: It has.
+    """
+    version = recording.get("format")
+    if version == FORMAT_VERSION:
+        return
+    if isinstance(version, int) and version < FORMAT_VERSION:
+        raise SegmentError(
+            f"{path} is of format {version}, which was never released. Record it again into a "
+            "new store."
+        )
+    raise SegmentError(
+        f"{path} is of format {version}, and this hybridlog knows format {FORMAT_VERSION}. "
+        "Install a newer hybridlog."
+    )
+
+
+def open_chunk(record: memoryview) -> tuple[Buffer, int]:
+    """Content and compressed size of a whole chunk record.
+
+    Args:
+        record: The chunk record, including its head, whose checksum was compared. So that of
+            uncompressed content is not computed again.
+
+    Raises:
+            SegmentError: It is not a chunk record, or damaged.
+    """
+    if len(record) < CHUNK_HEAD.size + 4:
+        raise SegmentError("the record is too short")
+    opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
+    if opcode != Opcode.CHUNK or length + RECORD_HEAD.size != len(record):
+        raise SegmentError("no chunk record is there")
+    at = CHUNK_HEAD.size
+    (name_length,) = struct.unpack_from("<I", record, at)
+    at += 4
+    if name_length > 16 or at + name_length + 8 > len(record):
+        raise SegmentError("its compression cannot be read")
+    compression = bytes(record[at : at + name_length]).decode("ascii", "replace")
+    at += name_length
+    (compressed,) = struct.unpack_from("<Q", record, at)
+    at += 8
+    if compressed != len(record) - at:
+        raise SegmentError("the length of its records is wrong")
+    content = decompress(compression, record[at:], size)
+    if compression and crc32(content) != crc:
+        raise SegmentError("its checksum differs")
+    return content, compressed
+
+
+def right_head(batch: Batch, size: int, crc: int, compression: str, compressed: int) -> bytes:
+    """The correct head of a chunk record.
+
+    Args:
+        batch: The messages of its content.
+        size: Bytes of the content.
+        crc: CRC-32 of the content.
+        compression: MCAP name of the codec.
+        compressed: Bytes of compressed content.
+    """
+    return chunk_head(
+        first=int(batch.log_time.min()),
+        last=int(batch.log_time.max()),
+        uncompressed_size=size,
+        crc=crc,
+        compression=compression,
+        compressed_size=compressed,
+    )
+
+
+def indexes_of(batch: Batch) -> dict[int, bytes]:
+    """The correct message index records of a chunk, by channel id."""
+    order = index_order(batch.channel, batch.log_time)
+    starts = batch.offset - MESSAGE_HEAD.itemsize
+    return message_indexes(batch.channel, batch.log_time, starts, order)
+
+
+def check_arrivals(trailer: Buffer, chunk_offset: int, count: int) -> NDArray[np.int64]:
+    """Parse and check the arrival numbers of a chunk's messages.
+
+    Args:
+        trailer: The message indexes and the record of arrival numbers.
+        chunk_offset: Byte of the file where the chunk starts.
+        count: Number of its messages.
+
+    Returns:
+        int64[count], in chunk order.
+
+    Raises:
+        SegmentError: They are missing, damaged, or belong to another chunk.
+    """
+    _, body = split_trailer(trailer)
+    owner, seq = arrivals_of(body, count)
+    if owner != chunk_offset:
+        raise SegmentError("its arrival numbers belong to another chunk")
+    return seq
