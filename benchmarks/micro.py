@@ -24,11 +24,11 @@ import hybridlog as hl
 from benchmarks.conftest import Inputs
 from benchmarks.loads import bags as logs
 from hybridlog.across.match import HOWS, How, match
+from hybridlog.columns.table_writer import TableWriter
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
-from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed
 from hybridlog_storage.segments.chunk import StoredChunk, pack

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
+from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.entries import channels_of, summary_of, take_inventory
 from hybridlog.index.connection import Connection
 from hybridlog.maintenance.opening import (
@@ -30,7 +31,6 @@ from hybridlog.maintenance.opening import (
     repair_on_open,
 )
 from hybridlog.maintenance.report import Progress, RepairReport
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
@@ -65,16 +65,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hybridlog.columns.payload_reader import ArrayTable
+    from hybridlog.columns.tables import Tables, TopicTable
     from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.index.index_version import GuardedIndex, IndexVersion
     from hybridlog.index.index_writer import IndexTarget
-    from hybridlog.payloads.reader import ArrayTable
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
     from hybridlog.query.question import Question
     from hybridlog.record.running import RunningRecording
     from hybridlog.snapshot import Snapshot
-    from hybridlog.tables.reader import Tables, TopicTable
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
@@ -1132,7 +1132,7 @@ class Session:
 
     def arrays(self, recording: RecordingEntry, topic: str) -> ArrayTable | None:
         """The arrays of a topic in columns; None without, or if they cannot be used."""
-        from hybridlog.payloads.reader import ArrayTable
+        from hybridlog.columns.payload_reader import ArrayTable
 
         with self._lock:
             contents = self._contents_of(self.directory.recording(recording.label))
@@ -1156,7 +1156,7 @@ class Session:
     @lazy
     def tables(self) -> Tables:
         """Parquet tables of topics; pyarrow is loaded for them."""
-        from hybridlog.tables.reader import Tables
+        from hybridlog.columns.tables import Tables
 
         return Tables(self.directory.path)
 

@@ -560,7 +560,7 @@ MARKED = "tests/test_repair.py::test_a_mark_beside_a_lost_segment_takes_nothing_
 
 MAINTENANCE = [
     *_of(
-        "hybridlog/payloads/writer.py",
+        "hybridlog/columns/payload_writer.py",
         (
             "late-row-groups-are-in-order",
             "file.last < first and order_of(time, seq) is None",
@@ -570,7 +570,7 @@ MAINTENANCE = [
         ("columns-are-not-synced", "close(about, sync=True)", "close(about)", POWER),
     ),
     *_of(
-        "hybridlog/payloads/files.py",
+        "hybridlog/columns/payload_files.py",
         (
             "columns-move-into-folders-that-are-not-synced",
             "            files.sync_folder(recording)\n            files.sync_folder(final, depth=files.IN_RECORDING)\n",
@@ -657,7 +657,7 @@ MAINTENANCE = [
         ),
     ),
     *_of(
-        "hybridlog/tables/reader.py",
+        "hybridlog/columns/tables.py",
         (
             "row-groups-that-overlap-are-in-order",
             "if run[-1].last < part.first:",
@@ -1119,7 +1119,7 @@ SILENT = [
         ),
     ),
     *_of(
-        "hybridlog/tables/reader.py",
+        "hybridlog/columns/tables.py",
         (
             "tables-with-other-rows-than-segments-are-believed",
             "if table is None or table.rows != sum(messages.get(number, 0) for number in segments):\n",

@@ -20,12 +20,12 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.columns.folders import files_of
 from hybridlog.maintenance import compact, edit, imports
 from hybridlog.maintenance.imports import ImportReport
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog.session import Session
-from hybridlog.tables.folders import files_of
 from hybridlog_storage import journal
 from hybridlog_storage.disk import directory as directory_module
 from hybridlog_storage.disk import files

@@ -60,8 +60,8 @@ def command(
 
 def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
     """Folders with rows of a topic in some recordings: files, rows, statement."""
-    from hybridlog.tables.folders import files_of
-    from hybridlog.tables.layout import type_prefix
+    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.layout import type_prefix
 
     topics = {one.channel.topic for one in channels}
     recordings = {one.recording.id for one in channels}

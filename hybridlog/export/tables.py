@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
+from hybridlog.columns.parquet_file import leaf_paths
 from hybridlog.export.base import FileWriter, Sink, Target
 from hybridlog.export.json_text import (
     PIECE_BYTES,
@@ -26,7 +27,6 @@ from hybridlog.export.json_text import (
 )
 from hybridlog.export.jsonl import rows_within
 from hybridlog.schema.arrow_types import common_schema, converted, is_bytes
-from hybridlog.tables.parquet_file import leaf_paths
 from hybridlog_storage.errors import UsageError
 
 HELD_BYTES = 32 << 20

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hybridlog.columns.table_writer import TableWriter
     from hybridlog.index.indexing import Documents
-    from hybridlog.tables.writer import TableWriter
     from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry, RecordingEntry
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database

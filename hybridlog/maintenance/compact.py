@@ -17,14 +17,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.columns import payload_files
+from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of, topic_folder
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import CompactedTopic
-from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
-from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
-from hybridlog.tables.layout import table_schema_of, topic_folder
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -38,10 +37,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hybridlog.columns.payload_rows import TopicColumns
+    from hybridlog.columns.payload_writer import TopicWriter
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress
-    from hybridlog.payloads.columns import TopicColumns
-    from hybridlog.payloads.writer import TopicWriter
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import PayloadFile
@@ -154,7 +153,7 @@ class _Compaction:
         Args:
             topics: Full names of the wanted ones; those that cannot are `refused` by name.
         """
-        from hybridlog.payloads.columns import TopicColumns
+        from hybridlog.columns.payload_rows import TopicColumns
 
         have = {file.topic for file in self._state.payloads.values()}
         found: dict[tuple[str, str], _Topic] = {}
@@ -204,14 +203,14 @@ class _Compaction:
 
     def write(self, chosen: Sequence[_Topic]) -> None:
         """Write the files; what does not fit its definition stays where it is."""
-        from hybridlog.payloads.writer import TopicWriter
+        from hybridlog.columns.payload_writer import TopicWriter
 
-        files.remove_tree(self.path / PARTS, depth=files.IN_RECORDING)
+        files.remove_tree(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
         numbers: defaultdict[str, count[int]] = defaultdict(count)
         for topic in chosen:
             topic.report.messages = 0
             topic.writer = TopicWriter(
-                self.path / PARTS,
+                self.path / PAYLOAD_PARTS,
                 self._inventory.id,
                 next(iter(topic.channels.values())),
                 topic.columns,
@@ -245,7 +244,11 @@ class _Compaction:
         The files of a topic that differs are removed.
         """
         left = {
-            number: (topic, RecordingPayloads(self.path, topic.files, PARTS), Counter[str]())
+            number: (
+                topic,
+                RecordingPayloads(self.path, topic.files, PAYLOAD_PARTS),
+                Counter[str](),
+            )
             for number, topic in enumerate(chosen)
             if topic.files
         }
@@ -265,7 +268,7 @@ class _Compaction:
         topic.keep(report.messages, problem)
         report.messages = report.payload_bytes = report.column_bytes = 0
         for file in topic.files:
-            files.unlink(self.path / PARTS / file.file, depth=IN_PAYLOADS)
+            files.unlink(self.path / PAYLOAD_PARTS / file.file, depth=IN_PAYLOADS)
         topic.files = []
 
     def announce(self, chosen: Sequence[_Topic]) -> Mapping[str, PayloadFile]:
@@ -273,9 +276,9 @@ class _Compaction:
         made = [file for topic in chosen for file in topic.files]
         if made:
             # Names have to be on the disk before the journal refers to them.
-            for folder in {(self.path / PARTS / file.file).parent for file in made}:
+            for folder in {(self.path / PAYLOAD_PARTS / file.file).parent for file in made}:
                 files.sync_folder(folder, depth=IN_PAYLOADS - 1)
-            files.sync_folder(self.path / PARTS, depth=files.IN_RECORDING)
+            files.sync_folder(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
             files.sync_folder(self.path)
             line = journal.event(journal.COMPACTED, files=[asdict(file) for file in made])
             Journal(self.path).append(line)
@@ -286,7 +289,7 @@ class _Compaction:
         with suppress(StoreError, OSError):
             state = journal.read(self.path)
             if state is not None and state.payloads.keys() == self._state.payloads.keys():
-                files.remove_tree(self.path / PARTS, depth=files.IN_RECORDING)
+                files.remove_tree(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
 
     def _chunks(
         self, topics: Sequence[_Topic], *, report: bool = False, tell: bool = False

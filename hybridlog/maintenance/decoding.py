@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from hybridlog.columns.contents import open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.opening import put_entry
-from hybridlog.payloads.contents import open_segment
 from hybridlog_storage.catalog import stamps_of
 from hybridlog_storage.errors import SegmentError
 

@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hybridlog.columns.layout import IN_PAYLOADS
 from hybridlog.entries import Inventory, take_inventory
 from hybridlog.maintenance.opening import clear_away
-from hybridlog.payloads.layout import IN_PAYLOADS
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import IMPORTING, LOCK_WAIT_S, PAYLOADS, payload_names
@@ -277,7 +277,7 @@ def _is_segment(path: Path, digest: str, size: int) -> bool:
 
 def _is_payload_file(folder: Path, file: PayloadFile) -> bool:
     """True if a copy of a file of columns is complete, byte for byte."""
-    from hybridlog.payloads.reader import PayloadReader
+    from hybridlog.columns.payload_reader import PayloadReader
 
     try:
         PayloadReader(folder, file).check()

@@ -10,12 +10,12 @@ from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.table_writer import TableWriter
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import Progress, RepairReport
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
-from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (

@@ -14,6 +14,8 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.columns import payload_files
+from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.entries import (
     describe,
     journal_from_segments,
@@ -21,8 +23,6 @@ from hybridlog.entries import (
     take_inventory,
     unlisted_lines,
 )
-from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.layout import PARTS
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog
@@ -356,7 +356,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         return ""
     if state is not None and state.torn:
         Journal(path).append()
-    if PARTS in listing.others:
+    if PAYLOAD_PARTS in listing.others:
         payload_files.publish(path, state.payloads if state is not None else {})
     thinned = state.thinned if state is not None else {}
     payload_files.replace_segments(path, listing.others, thinned)
@@ -394,7 +394,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
     patterns = (_LEFT_OVER, _MOVING, payload_files.THINNED)
-    return name == PARTS or any(pattern.fullmatch(name) for pattern in patterns)
+    return name == PAYLOAD_PARTS or any(pattern.fullmatch(name) for pattern in patterns)
 
 
 def clear_away(directory: StoreDirectory, label: str) -> None:

@@ -7,11 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from hybridlog.columns.contents import open_segment
 from hybridlog.entries import journal_from_segments, take_inventory, unlisted_lines
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, rebuild
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
-from hybridlog.payloads.contents import open_segment
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError

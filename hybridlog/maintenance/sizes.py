@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from hybridlog.columns.layout import type_prefix
 from hybridlog.maintenance.opening import put_again
-from hybridlog.tables.layout import type_prefix
 from hybridlog_storage.errors import CatalogError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
@@ -195,7 +195,7 @@ def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
 
 def _table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
     """Bytes of the tables by recording and topic: their share of the rows of each file."""
-    from hybridlog.tables.folders import files_of
+    from hybridlog.columns.folders import files_of
 
     found: Counter[tuple[str, str]] = Counter()
     types = {type_prefix(channel.type) for entry in entries for channel in entry.channels}

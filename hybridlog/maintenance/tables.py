@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
-from hybridlog.tables.layout import PARTS, parts_folder, topics_of, type_prefix
+from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from hybridlog.columns.parquet_file import ParquetFileReader
+    from hybridlog.columns.table_writer import TableWriter
+    from hybridlog.columns.tables import Tables, TopicTable
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.snapshot import Snapshot
-    from hybridlog.tables.parquet_file import ParquetFileReader
-    from hybridlog.tables.reader import Tables, TopicTable
-    from hybridlog.tables.writer import TableWriter
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
     """Topics whose tables are missing, or differ from the catalog."""
-    from hybridlog.tables.reader import Tables
+    from hybridlog.columns.tables import Tables
 
     tables = Tables(directory.path)
     possible = _possible(entry)
@@ -46,7 +46,7 @@ def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
 
 def _possible(entry: RecordingEntry) -> set[str]:
     """Topics that have a table when all is well: those with one definition."""
-    from hybridlog.tables.reader import has_one_definition
+    from hybridlog.columns.tables import has_one_definition
 
     by_topic: dict[str, list[ChannelEntry]] = {topic: [] for topic in topics_of(entry)}
     for channel in entry.channels:
@@ -76,7 +76,7 @@ def make(
         return True
     try:
         with directory.writing(entry.label, entry.id) as label:
-            from hybridlog.tables.writer import TableWriter
+            from hybridlog.columns.table_writer import TableWriter
 
             entry = replace(entry, label=label)
             writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=False)
@@ -158,7 +158,7 @@ class TableChecker:
     """
 
     def __init__(self, directory: StoreDirectory) -> None:
-        from hybridlog.tables.reader import Tables
+        from hybridlog.columns.tables import Tables
 
         self._tables = Tables(directory.path)
         self._checked: dict[int, str] = {}
@@ -206,7 +206,7 @@ def remove(directory: StoreDirectory, recording: str, types: Collection[str] | N
     Raises:
         OSError: a table cannot be removed.
     """
-    from hybridlog.tables.folders import TableFolders
+    from hybridlog.columns.folders import TableFolders
 
     announce_removal(directory, recording)
     prefixes = [""] if types is None else [type_prefix(one) for one in types]
@@ -250,7 +250,7 @@ def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> Non
         directory: The store.
         present: Keys of all recordings with a directory.
     """
-    from hybridlog.tables.folders import recordings_of
+    from hybridlog.columns.folders import recordings_of
 
     there = unfinished(directory) | recordings_of(directory.path)
     remove_all(directory, {one for one in there if one[:16] not in present})

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlog.columns import payload_files
+from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.layout import thinned_name
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.report import CompactedTopic
-from hybridlog.payloads import files as payload_files
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
-from hybridlog.payloads.layout import thinned_name
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.journal import Journal

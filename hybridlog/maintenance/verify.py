@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.opening import describe_inventory
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.mongo.index_documents import recording_key, with_prefix

@@ -15,11 +15,11 @@ from pathlib import Path
 from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import new_id, recording_metadata, sealed_event, text
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
-from hybridlog.tables.writer import TableWriter
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S

@@ -16,6 +16,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.columns.fields import LIMIT
+from hybridlog.columns.layout import OWN_COLUMNS, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import json_array
 from hybridlog.schema.arrow_types import (
@@ -33,8 +35,6 @@ from hybridlog.schema.arrow_types import (
     summary,
     with_values,
 )
-from hybridlog.tables.fields import LIMIT
-from hybridlog.tables.layout import OWN_COLUMNS, column_names
 
 OWN: Final = pa.schema(
     [

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from hybridlog.tables.layout import column_names
+from hybridlog.columns.layout import column_names
 from hybridlog_storage.mongo.collection_names import collection_of
 
 TABLES: Final = ("recordings", "topics", "losses", "marks")

@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.columns.fields import without
+from hybridlog.columns.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
 from hybridlog.sql.columns import whole_message
 from hybridlog.sql.counts import Paths, ScanCounts
-from hybridlog.tables.fields import without
-from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
-    from hybridlog.payloads.reader import ArrayTable
+    from hybridlog.columns.payload_reader import ArrayTable
+    from hybridlog.columns.tables import TablePart, TopicTable
     from hybridlog.session import Session
-    from hybridlog.tables.reader import TablePart, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader

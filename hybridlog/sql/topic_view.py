@@ -14,6 +14,9 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from pyarrow import acero, fs
 
+from hybridlog.columns.fields import without
+from hybridlog.columns.layout import STATES
+from hybridlog.columns.rows import REDUCED, UNREADABLE, WHOLE
 from hybridlog.sql.columns import (
     OWN,
     ViewColumn,
@@ -26,9 +29,6 @@ from hybridlog.sql.columns import (
 from hybridlog.sql.counts import ScanCounts
 from hybridlog.sql.pieces import Rows, RowSource, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
-from hybridlog.tables.fields import without
-from hybridlog.tables.layout import STATES
-from hybridlog.tables.rows import REDUCED, UNREADABLE, WHOLE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -470,6 +470,7 @@ def _serve() -> NoReturn:
     import pandas as pd
     import pymongo
 
+    import hybridlog.columns.tables
     import hybridlog.maintenance.edit
     import hybridlog.maintenance.imports
     import hybridlog.maintenance.index
@@ -478,7 +479,6 @@ def _serve() -> NoReturn:
     import hybridlog.record.recorder
     import hybridlog.sources.mcap
     import hybridlog.store
-    import hybridlog.tables.reader
     import tests.faults.logs
 
     logging.disable()

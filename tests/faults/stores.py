@@ -18,11 +18,11 @@ import bson
 from pymongo import MongoClient
 
 import hybridlog as hl
+from hybridlog.columns.folders import recordings_of
+from hybridlog.columns.layout import PARTS
 from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
 from hybridlog.record.losses import losses_of
-from hybridlog.tables.folders import recordings_of
-from hybridlog.tables.layout import PARTS
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.catalog import _crc as crc_of
 from hybridlog_storage.disk.directory import StoreDirectory

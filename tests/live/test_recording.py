@@ -21,13 +21,13 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
+from hybridlog.columns.table_writer import TableWriter
+from hybridlog.columns.tables import Tables
 from hybridlog.demo.write import write_bag
 from hybridlog.index import index_writer
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
-from hybridlog.tables.reader import Tables
-from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.disk import append_file
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybridlog.payloads.columns import Piece, Rebuilder, TopicColumns, rows_of
+from hybridlog.columns.payload_rows import Piece, Rebuilder, TopicColumns, rows_of
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder

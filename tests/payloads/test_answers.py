@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
-from hybridlog.payloads import writer
+from hybridlog.columns import payload_writer as writer
 from hybridlog.query.engines.base import Need
 from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import PayloadError

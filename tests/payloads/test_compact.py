@@ -16,8 +16,8 @@ import pyarrow.dataset as ds
 import pytest
 
 import hybridlog as hl
-from hybridlog.payloads import columns
-from hybridlog.payloads.columns import Rebuilder
+from hybridlog.columns import payload_rows as columns
+from hybridlog.columns.payload_rows import Rebuilder
 from hybridlog_storage import journal
 from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.journal import Journal

@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
-from hybridlog.payloads.contents import RecordingPayloads, open_segment
 from hybridlog_storage import journal
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, SegmentError

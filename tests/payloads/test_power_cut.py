@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns import payload_files
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.verify import verify
-from hybridlog.payloads import files as payload_files
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError

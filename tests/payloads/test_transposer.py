@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.payloads.clouds import PointField, PointLayout
-from hybridlog.payloads.columns import TopicColumns
+from hybridlog.columns.clouds import PointField, PointLayout
+from hybridlog.columns.payload_rows import TopicColumns
 from hybridlog.schema.definition import parse_definition
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Channel, Schema

@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.payloads import writer
-from hybridlog.payloads.zones import MAX_REGIONS, Zone, may_hold
+from hybridlog.columns import payload_writer as writer
+from hybridlog.columns.zones import MAX_REGIONS, Zone, may_hold
 from hybridlog.query.engines.base import Need
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool

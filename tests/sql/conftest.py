@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.tables import writer
+from hybridlog.columns import table_writer as writer
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings

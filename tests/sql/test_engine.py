@@ -17,10 +17,10 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns import table_writer as writer
+from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
-from hybridlog.tables import writer
-from hybridlog.tables.parquet_file import ParquetFileReader
 from hybridlog_storage.errors import (
     MissingDependencyError,
     ResourceError,

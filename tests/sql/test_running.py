@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns import table_writer as writer
 from hybridlog.live import LiveRecording
-from hybridlog.tables import writer
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.open_segment import OpenSegment

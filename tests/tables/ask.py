@@ -16,8 +16,8 @@ from hybridlog_storage.errors import StoreError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.columns.tables import TableRows, Tables, TopicTable
     from hybridlog.query.intervals import Span
-    from hybridlog.tables.reader import TableRows, Tables, TopicTable
     from hybridlog_storage.catalog import RecordingEntry
 
 Mask = Callable[[Any], "NDArray[np.bool_] | None"]

@@ -11,8 +11,8 @@ import duckdb
 import pyarrow.parquet as pq
 
 import hybridlog as hl
-from hybridlog.tables import writer as writing
-from hybridlog.tables.reader import Tables
+from hybridlog.columns import table_writer as writing
+from hybridlog.columns.tables import Tables
 from hybridlog_storage.messages import Schema
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import BASE, write_log

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns import table_writer as writing
+from hybridlog.columns.folders import TableFolders
+from hybridlog.columns.layout import PARTS, TABLES
+from hybridlog.columns.parquet_file import ParquetFileReader
+from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
-from hybridlog.tables import writer as writing
-from hybridlog.tables.folders import TableFolders
-from hybridlog.tables.layout import PARTS, TABLES
-from hybridlog.tables.parquet_file import ParquetFileReader
-from hybridlog.tables.reader import Tables
 from hybridlog_storage.disk import files
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings

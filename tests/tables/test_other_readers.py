@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.tables import writer as writing
+from hybridlog.columns import table_writer as writing
 from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer
 from tests.data import DATA, needs_data

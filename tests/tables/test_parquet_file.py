@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.tables import parquet_file
-from hybridlog.tables.layout import (
+from hybridlog.columns import parquet_file
+from hybridlog.columns.layout import (
     About,
     Section,
     TopicCounts,
@@ -20,7 +20,7 @@ from hybridlog.tables.layout import (
     shape_folder,
     type_prefix,
 )
-from hybridlog.tables.parquet_file import ParquetFileReader, ParquetFileWriter, leaves_of
+from hybridlog.columns.parquet_file import ParquetFileReader, ParquetFileWriter, leaves_of
 from hybridlog_storage.errors import StoreError
 
 ROWS = 20_000

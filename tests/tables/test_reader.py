@@ -18,10 +18,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.columns import tables as reader
+from hybridlog.columns.fields import FieldShape, UnfitError, alike, joined, records_of
+from hybridlog.columns.tables import Tables, TopicTable, _merged
 from hybridlog.maintenance import tables as making
-from hybridlog.tables import reader
-from hybridlog.tables.fields import FieldShape, UnfitError, alike, joined, records_of
-from hybridlog.tables.reader import Tables, TopicTable, _merged
 from hybridlog_storage.errors import StoreError
 from tests.tables import ask
 from tests.tables.conftest import SMALL_CHUNKS
@@ -113,7 +113,7 @@ def test_ranges_of_time(recorded: hl.Store, topic: str, bounds: list[int]) -> No
 def test_row_groups_out_of_range_are_not_read(
     recorded: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hybridlog.tables import writer
+    from hybridlog.columns import table_writer as writer
 
     monkeypatch.setattr(writer, "GROUP_ROWS", 100)
     monkeypatch.setattr(writer, "LONG_ROWS", 1000)

@@ -12,11 +12,12 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.columns import folders, parquet_file
+from hybridlog.columns import table_writer as writing
+from hybridlog.columns import tables as reader
+from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.maintenance import tables as making
 from hybridlog.query.predicate import to_mask as deciding
-from hybridlog.tables import folders, parquet_file, reader
-from hybridlog.tables import writer as writing
-from hybridlog.tables.parquet_file import ParquetFileReader
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Schema

@@ -15,12 +15,12 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns import table_writer as writing
+from hybridlog.columns.folders import TableFolders
+from hybridlog.columns.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
+from hybridlog.columns.table_writer import TableWriter
+from hybridlog.columns.tables import TableRows, Tables
 from hybridlog.maintenance import tables as making
-from hybridlog.tables import writer as writing
-from hybridlog.tables.folders import TableFolders
-from hybridlog.tables.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
-from hybridlog.tables.reader import TableRows, Tables
-from hybridlog.tables.writer import TableWriter
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Schema
@@ -410,7 +410,7 @@ def test_whatever_fails_the_recording_goes_on(
     elif place == "publish":
         monkeypatch.setattr(TableFolders, "_change", fail)
     else:
-        from hybridlog.tables.parquet_file import ParquetFileWriter
+        from hybridlog.columns.parquet_file import ParquetFileWriter
 
         monkeypatch.setattr(ParquetFileWriter, place, fail)
     said = [(BASE + n, "/large" if n % 50 else "/small", varied(n)) for n in range(1500)]

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.payloads.reader import ArrayTable
+    from hybridlog.columns.payload_reader import ArrayTable
+    from hybridlog.columns.tables import TableRows, TopicTable
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
     from hybridlog.query.predicate.tree import Node
     from hybridlog.query.question import Part
     from hybridlog.session import Session
-    from hybridlog.tables.reader import TableRows, TopicTable
 
 _OPEN_S = 2e-4  # seconds to query an open table
 _BYTE_S = 1.5e-9  # seconds to read and decode a stored byte

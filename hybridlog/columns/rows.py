@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.tables.layout import STATES
+from hybridlog.columns.layout import STATES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

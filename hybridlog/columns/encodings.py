@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hybridlog.payloads.columns import field_of
-from hybridlog.payloads.layout import RECIPE
-from hybridlog.tables.layout import OWN_COLUMNS
-from hybridlog.tables.parquet_file import DICTIONARY, leaf_paths
+from hybridlog.columns.layout import OWN_COLUMNS, RECIPE
+from hybridlog.columns.parquet_file import DICTIONARY, leaf_paths
+from hybridlog.columns.payload_rows import field_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,8 +23,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from hybridlog.columns.layout import ABOUT, IN_TYPE, About
 from hybridlog.schema.arrow_types import is_list
-from hybridlog.tables.layout import ABOUT, IN_TYPE, About
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted

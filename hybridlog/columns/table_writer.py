@@ -23,10 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.index.indexing import rows_by_channel
-from hybridlog.schema.codec import Codec
-from hybridlog.schema.codecs import codec_for
-from hybridlog.tables.layout import (
+from hybridlog.columns.layout import (
     IN_PARTS,
     SUFFIX,
     About,
@@ -38,7 +35,10 @@ from hybridlog.tables.layout import (
     topics_of,
     type_prefix,
 )
-from hybridlog.tables.rows import REDUCED, WHOLE, Messages, Piece, own_columns
+from hybridlog.columns.rows import REDUCED, WHOLE, Messages, Piece, own_columns
+from hybridlog.index.indexing import rows_by_channel
+from hybridlog.schema.codec import Codec
+from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import ORIGINAL_ENCODING
@@ -48,8 +48,8 @@ from hybridlog_storage.ordering import order_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.tables.fields import FieldShape
-    from hybridlog.tables.parquet_file import ParquetFileWriter
+    from hybridlog.columns.fields import FieldShape
+    from hybridlog.columns.parquet_file import ParquetFileWriter
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
@@ -81,7 +81,7 @@ class _Topic:
     """
 
     def __init__(self, recording: str, channel: Channel) -> None:
-        from hybridlog.tables.fields import FieldShape
+        from hybridlog.columns.fields import FieldShape
 
         self.recording = recording
         self.name = channel.topic
@@ -133,7 +133,7 @@ class _Topic:
         """
         import pyarrow as pa
 
-        from hybridlog.tables.fields import joined
+        from hybridlog.columns.fields import joined
 
         messages = Messages.joined([piece.messages for piece in pieces])
         segment = np.repeat(
@@ -209,7 +209,7 @@ class _File:
             OSError: the rows cannot be written.
             UnfitError: the type of their fields differs from the file's.
         """
-        from hybridlog.tables.parquet_file import ParquetFileWriter
+        from hybridlog.columns.parquet_file import ParquetFileWriter
 
         table = self._topic.table(pieces, self._has_publish_time)
         if self._writer is None:
@@ -233,7 +233,7 @@ class _File:
         """Rows with the columns of the file."""
         import pyarrow as pa
 
-        from hybridlog.tables.fields import UnfitError, joined
+        from hybridlog.columns.fields import UnfitError, joined
 
         kind = pa.struct(list(self.schema))
         fitting = joined([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
@@ -464,7 +464,7 @@ class TableWriter:
     def _add_fields(
         self, piece: Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
     ) -> None:
-        from hybridlog.tables.fields import detached, without
+        from hybridlog.columns.fields import detached, without
 
         decoded = codec.arrow(data.data, piece.messages.at, piece.messages.length, None)
         for bad in decoded.unreadable:
@@ -517,7 +517,7 @@ class TableWriter:
 
     def _write(self, topic: _Topic, segment: int, pieces: list[Piece]) -> int:
         """Write rows to the unfinished file of a segment; returns the number of new files."""
-        from hybridlog.tables.fields import UnfitError
+        from hybridlog.columns.fields import UnfitError
 
         if not pieces:
             return 0
@@ -587,7 +587,7 @@ class TableWriter:
                 topic.finished.append((folder, place))
 
     def _close(self, entry: RecordingEntry) -> None:
-        from hybridlog.tables.folders import Addition, TableFolders
+        from hybridlog.columns.folders import Addition, TableFolders
 
         self._decode()
         for number in sorted(self._seen.keys() - self._cut.keys()):

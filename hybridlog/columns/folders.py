@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from hybridlog.tables.layout import (
+from hybridlog.columns.layout import (
     IN_TABLES,
     IN_TYPE,
     SHARED,
@@ -28,7 +28,7 @@ from hybridlog.tables.layout import (
     is_of_folder,
     parts_folder,
 )
-from hybridlog.tables.parquet_file import (
+from hybridlog.columns.parquet_file import (
     KeptBytes,
     NoRoomError,
     ParquetFileReader,

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.payloads.columns import TopicColumns, field_of, rows_of, values_of
-from hybridlog.payloads.encodings import LEVEL, encodings_of
-from hybridlog.payloads.layout import IN_PAYLOADS, payload_file
-from hybridlog.payloads.zones import Zone
-from hybridlog.tables.layout import (
+from hybridlog.columns.encodings import LEVEL, encodings_of
+from hybridlog.columns.layout import (
+    IN_PAYLOADS,
     About,
     Section,
     TopicCounts,
+    payload_file,
     table_schema_of,
     topic_folder,
 )
-from hybridlog.tables.parquet_file import ParquetFileWriter
+from hybridlog.columns.parquet_file import ParquetFileWriter
+from hybridlog.columns.payload_rows import TopicColumns, field_of, rows_of, values_of
+from hybridlog.columns.zones import Zone
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.journal import PayloadFile
 from hybridlog_storage.ordering import order_of
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from hybridlog.payloads.clouds import PointLayout
-    from hybridlog.payloads.columns import Piece
+    from hybridlog.columns.clouds import PointLayout
+    from hybridlog.columns.payload_rows import Piece
     from hybridlog_storage.messages import Channel
 
 GROUP_BYTES: Final = 4 << 20

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.arrays.point_arrays import MAX_FIELDS, POINT_TYPES
+from hybridlog.columns.layout import column_names
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
-from hybridlog.tables.layout import column_names
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -24,10 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import is_list
-from hybridlog.schema.column import ranges
-from hybridlog.tables.fields import (
+from hybridlog.columns.fields import (
     SUMMARY_FIELDS,
     UnfitError,
     alike,
@@ -35,7 +32,7 @@ from hybridlog.tables.fields import (
     original_name,
     records_of,
 )
-from hybridlog.tables.layout import (
+from hybridlog.columns.layout import (
     IN_PARTS,
     IN_TABLES,
     ORIGINAL,
@@ -51,7 +48,10 @@ from hybridlog.tables.layout import (
     table_schema,
     type_prefix,
 )
-from hybridlog.tables.parquet_file import ParquetFileReader, leaves_of
+from hybridlog.columns.parquet_file import ParquetFileReader, leaves_of
+from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.arrow_types import is_list
+from hybridlog.schema.column import ranges
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, unreadable
 from hybridlog_storage.lazy import lazy

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.payloads.clouds import PointLayout
-from hybridlog.payloads.columns import NEEDED, Rebuilder
-from hybridlog.payloads.layout import IN_PAYLOADS
-from hybridlog.payloads.zones import Zone, may_hold
+from hybridlog.columns.clouds import PointLayout
+from hybridlog.columns.layout import IN_PAYLOADS, TopicCounts
+from hybridlog.columns.parquet_file import leaves_of
+from hybridlog.columns.payload_rows import NEEDED, Rebuilder
+from hybridlog.columns.tables import ColumnFile, TablePart, TopicTable, _Cache
+from hybridlog.columns.zones import Zone, may_hold
 from hybridlog.schema.arrow_types import converted, has_empty
-from hybridlog.tables.layout import TopicCounts
-from hybridlog.tables.parquet_file import leaves_of
-from hybridlog.tables.reader import ColumnFile, TablePart, TopicTable, _Cache
 from hybridlog_storage.errors import StoreError
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.payloads.columns import Rebuilt
+    from hybridlog.columns.payload_rows import Rebuilt
     from hybridlog.query.predicate.tree import Node
     from hybridlog.query.question import RecordedChannel
     from hybridlog.sql.counts import ScanCounts

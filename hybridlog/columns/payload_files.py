@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.payloads.layout import IN_PAYLOADS, PARTS
+from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import PAYLOADS, payload_names
 from hybridlog_storage.errors import SegmentError
@@ -32,9 +32,9 @@ def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
     Raises:
         HybridlogError: A file cannot be renamed or removed.
     """
-    parts, final = recording / PARTS, recording / PAYLOADS
+    parts, final = recording / PAYLOAD_PARTS, recording / PAYLOADS
     try:
-        names = sorted(payload_names(recording, PARTS))
+        names = sorted(payload_names(recording, PAYLOAD_PARTS))
         moved = [name for name in names if name in listed]
         folders = {(final / name).parent for name in moved}
         for folder in folders:

@@ -1,14 +1,16 @@
-"""Names of tables: folders, files, columns and the metadata of a file.
+"""Names of files of columns: folders, files, columns and the metadata of a file.
 
 ```
 tables/<type>~<shape8>/shared-<number>.parquet   several recordings
 tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
 tables.part/r<id>/                               unfinished files
 tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
+recordings/<label>/payloads/topic=<collection>/<schema8>-<number>.parquet
+recordings/<label>/payloads.part/                unfinished files
 ```
 
-A folder has the rows of all ended recordings of one message type. All of its files have the
-same schema, of which `shape8` is a hash.
+A folder of `tables` has the rows of all ended recordings of one message type. All of its
+files have the same schema, of which `shape8` is a hash.
 """
 
 from __future__ import annotations
@@ -70,6 +72,16 @@ ABOUT: Final = b"hybridlog"
 VERSION: Final = 2
 RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
+PAYLOAD_PARTS: Final = "payloads.part"
+"""Folder of a recording that holds unfinished files of payloads."""
+IN_PAYLOADS: Final = 5
+"""Depth of a file of payloads below the store."""
+RECIPE: Final = "recipe"
+"""Column with what the original bytes need besides the arrays."""
+POINTS: Final = "points"
+"""Column of the points of clouds, in place of their `data`."""
+PAYLOAD_RESERVED: Final = RESERVED | {"sequence", RECIPE, POINTS}
+"""Names that no column of a field has in a file of payloads."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
@@ -143,6 +155,22 @@ def table_schema_of(channel: Channel) -> str:
 def topics_of(entry: RecordingEntry) -> set[str]:
     """Topics of a recording that have messages."""
     return {c.topic for c in entry.channels if c.stats.messages}
+
+
+def thinned_name(segment: str) -> str:
+    """Name of a segment without moved chunks until it takes the place of the whole one."""
+    return f"{segment}.thinned"
+
+
+def payload_file(folder: str, schema: str, number: int) -> str:
+    """Path of a file below `payloads`.
+
+    Args:
+        folder: Folder of the topic.
+        schema: Hash of what determines the columns.
+        number: Number of files of the topic before.
+    """
+    return f"{folder}/{schema[:8]}-{number:06d}.parquet"
 
 
 def column_names(

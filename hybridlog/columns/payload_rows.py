@@ -16,9 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.payloads.clouds import CLOUD_TYPES, DATA, PointLayout, layout_of
-from hybridlog.payloads.layout import PAYLOAD_RESERVED, POINTS, RECIPE
-from hybridlog.payloads.transposer import (
+from hybridlog.columns.clouds import CLOUD_TYPES, DATA, PointLayout, layout_of
+from hybridlog.columns.fields import FieldShape, records_of
+from hybridlog.columns.layout import OWN, OWN_COLUMNS, PAYLOAD_RESERVED, POINTS, RECIPE
+from hybridlog.columns.rows import Messages, own_columns
+from hybridlog.columns.rows import Piece as TablePiece
+from hybridlog.columns.transposer import (
     Locator,
     NumberArray,
     Split,
@@ -32,10 +35,6 @@ from hybridlog.schema.arrow_columns import array_of, lists, numbers, structs
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, offsets
 from hybridlog.schema.definition import parse_definition
 from hybridlog.schema.wire import WireReader
-from hybridlog.tables.fields import FieldShape, records_of
-from hybridlog.tables.layout import OWN, OWN_COLUMNS
-from hybridlog.tables.rows import Messages, own_columns
-from hybridlog.tables.rows import Piece as TablePiece
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from hybridlog.payloads.reader import PayloadReader
+    from hybridlog.columns.payload_reader import PayloadReader
     from hybridlog_storage.journal import PayloadFile
     from hybridlog_storage.messages import Buffer
 
@@ -69,7 +69,7 @@ class RecordingPayloads:
         with self._lock:
             found = self._readers.get(listed.file)
             if found is None:
-                from hybridlog.payloads.reader import PayloadReader
+                from hybridlog.columns.payload_reader import PayloadReader
 
                 found = self._readers[listed.file] = PayloadReader(self._folder, listed)
             return found

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.columns.layout import ORIGINAL, RESERVED, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
     COLUMNS,
@@ -32,7 +33,6 @@ from hybridlog.schema.arrow_types import (
     summary,
     with_values,
 )
-from hybridlog.tables.layout import ORIGINAL, RESERVED, SUMMARY, column_names
 
 LIMIT: Final = 32
 """Maximum number of elements of an array stored in full."""

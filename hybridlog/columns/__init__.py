@@ -1,0 +1,1 @@
+"""Messages as columns in Parquet files: tables of fields, and payloads with their arrays."""

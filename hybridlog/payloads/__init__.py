@@ -1,1 +1,0 @@
-"""Payloads as columns: arrays of ended recordings in Parquet files, exact to the byte."""

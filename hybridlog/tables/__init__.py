@@ -1,1 +1,0 @@
-"""Parquet tables of topics: written beside the segments, read for answers."""
