@@ -219,7 +219,7 @@ UNNEEDED = {
 @pytest.mark.parametrize(
     ("wanted", "most"),
     # A slice parses definitions, to complete them.
-    [(("--count",), 105), (("-F", "raw"), 105), (("-F", "mcap"), 118)],
+    [(("--count",), 111), (("-F", "raw"), 111), (("-F", "mcap"), 124)],
 )
 def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     wanted: tuple[str, ...], most: int, store: Path
