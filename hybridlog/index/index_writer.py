@@ -45,6 +45,7 @@ INTERVAL_S = 5.0
 """Longest time between two passes over what was flushed, seconds."""
 _INTERVAL_BYTES = 64 << 20  # content that was flushed since the last pass, at most
 _SEND_BYTES = 8 << 20  # documents that are sent together, at most
+_CHECKPOINT_BYTES = 8 << 20  # documents of a recording that ask for a checkpoint at its end
 _GROUP_BYTES = 1 << 20  # content of small chunks that are decoded together
 _PAUSE_S = 0.002
 _RETRY_S = 2.0  # between attempts after the database has failed
@@ -90,7 +91,7 @@ class DocumentSender:
         self._database = database
         self._places = TopicPlaces(database)
         self._documents: dict[str, list[NDArray[np.uint8]]] = {}
-        self._size = 0
+        self._size = self._sent = 0
         self._thread = Threads(1, "hybridlog-send")
         self._sending: Future[None] | None = None
 
@@ -130,6 +131,16 @@ class DocumentSender:
             if wait:
                 self._sending.result()
 
+    def end(self) -> None:
+        """Send the rest, and leave no large journal behind.
+
+        Raises:
+            DatabaseError: This sending has failed, or an earlier one.
+        """
+        self.send(wait=True)
+        if self._sent >= _CHECKPOINT_BYTES:
+            self._database.checkpoint()
+
     def close(self) -> None:
         """Stop sending."""
         self._thread.shutdown(wait=True, cancel_futures=True)
@@ -140,6 +151,7 @@ class DocumentSender:
             data = b"".join(table.data for table in tables)
             lengths = np.repeat(widths, counts).astype(np.int64)
             self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
+            self._sent += len(data)
         IndexState(self._database).put_through(self._key, through)
         self.through = through
 
@@ -339,7 +351,7 @@ class IndexWriter:
             segment, first = segment + 1, 0
         if self._sender is not None:
             with self._noting_failure():
-                self._sender.send(wait=has_ended)
+                self._sender.end() if has_ended else self._sender.send()
 
     def _read(
         self, reader: SegmentReader, places: Sequence[ChunkPlace]

@@ -397,7 +397,7 @@ def _index(
             if len(stats) == len(catalog.table(entry, number).chunks):
                 rows = decoded_rows(stats.values())
                 catalog.put_stamps(entry.id, [(number, entry.digests[str(number)], rows)])
-        sender.send(wait=True)
+        sender.end()
         writer.close(entry)
     finally:
         sender.close()

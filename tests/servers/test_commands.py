@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.index import index_writer
 from hybridlog.query import index_reader
 from hybridlog.query.choice import Choice
 from hybridlog.query.counters import Counters
@@ -108,6 +109,22 @@ def test_no_question_asks_once_a_recording(tmp_path: Path) -> None:
     }
     assert all(few.values())
     assert "create" not in {one.name for one in few["record"]}, "once a topic, though it exists"
+
+
+@pytest.mark.parametrize("is_large", [False, True])
+def test_a_large_recording_leaves_no_journal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_large: bool
+) -> None:
+    """Its end asks the server for one checkpoint; that of a small one does not."""
+    if is_large:
+        monkeypatch.setattr(index_writer, "_CHECKPOINT_BYTES", 1)
+    log = logs.write(tmp_path / "one.mcap", logs.content(0, MESSAGES))
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        with commands() as sent:
+            store.connect()
+            store.record(log, name="one")
+            store.rebuild_index(["one"])
+        assert [one.name for one in sent].count("fsync") == (2 if is_large else 0)
 
 
 @pytest.mark.parametrize("most", [1, 100])

@@ -723,6 +723,19 @@ class Database:
         each = [DeleteMany(dict(query)) for query in filters]
         return self._again(lambda: of.bulk_write(each, ordered=False)).deleted_count
 
+    def checkpoint(self) -> None:
+        """Have the server write what is only in its journal, which it then shortens.
+
+        A server that refuses it, such as a shared one with users, does it by itself in time.
+        """
+        from pymongo.errors import OperationFailure
+
+        def ask() -> None:
+            with contextlib.suppress(OperationFailure):
+                self._client.admin.command("fsync")
+
+        self._again(ask)
+
     def drop(self, collection: str) -> None:
         """Remove a collection if it exists."""
         self._again(self._collection(collection).drop)
