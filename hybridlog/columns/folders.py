@@ -2,17 +2,24 @@
 
 All changes are made under a lock on the folder `tables`. A shared file is replaced by one
 rename, so readers find the old rows or the new ones.
+
+Beside a folder lies a list, `.<folder>.recordings`, which tells the shared files of a recording
+without opening any. Each line has an id, names of files and a checksum. It is written before
+the rows, so it lacks no file of a recording that it lists. Lines of removed recordings stay.
 """
 
 from __future__ import annotations
 
 import fcntl
 import logging
+import os
 import re
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from stat import S_ISDIR
 from typing import Any, Final
 
 import pyarrow as pa
@@ -34,14 +41,17 @@ from hybridlog.columns.parquet_file import (
     ParquetFileReader,
     ParquetFileWriter,
 )
-from hybridlog_storage.disk import files
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.errors import StoreError, unreadable
 
 MAX_SHARED_ROWS: Final = 50_000
 """Maximum number of rows of several recordings in one file."""
 MAX_SHARED_BYTES: Final = 4 << 20
 """Size from which a shared file gets no more recordings."""
 _SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{6,}}){re.escape(SUFFIX)}", re.ASCII)
+_MAX_LIST_BYTES: Final = 256 << 20
+_SETTLED_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 _log = logging.getLogger(__name__)
 
 
@@ -76,6 +86,9 @@ class TableFolders:
         self._recording = recording
         self._digests = digests or {}
         self._numbers = 0
+        # Of the folder that is changed:
+        self._is_listed = False
+        self._shared: set[str] = set()  # shared files that may have rows of the recording
 
     def add(
         self,
@@ -132,19 +145,50 @@ class TableFolders:
         place = self._root / TABLES / folder
         names = [n for n in files.names(place, depth=IN_TABLES) if n.endswith(SUFFIX)]
         shared = sorted(name for name in names if name.startswith(SHARED))
+        listed = shared_files(self._root, folder).get(self._recording)
+        self._is_listed, self._shared = listed is not None, listed or set()
         waiting, old = addition, []
         if goes is not None:
             old = self._own_files(place, names, goes)
-            for name in shared:
-                reader = _reader(place / name)
-                if reader is not None and reader.about.section(self._recording) is not None:
-                    self._rewrite(place / name, reader, waiting, goes)
-                    waiting = Addition()
+            for path, reader in self._shared_with_rows(place, shared):
+                self._rewrite(path, reader, waiting, goes)
+                waiting = Addition()
         if waiting.section is not None:
             self._merge(place, shared, waiting)
+        elif addition.files and not self._is_listed:
+            self._list(place)
         self._publish(place, addition.files, [name for name in names if name not in old], old)
         with suppress(OSError), files.folder(place.parent, IN_TABLES - 1) as fd:
             files.system.rmdir(folder, folder=fd)
+            files.system.unlink(_list_of(place).name, folder=fd)
+
+    def _shared_with_rows(
+        self, place: Path, shared: Sequence[str]
+    ) -> list[tuple[Path, ParquetFileReader]]:
+        """The shared files with rows of the recording; all are opened only if it is not listed."""
+        found = []
+        for name in shared:
+            is_other = self._is_listed and name not in self._shared
+            if is_other and _SHARED_NAME.fullmatch(name):
+                continue
+            reader = _reader(place / name)
+            if reader is not None and reader.about.section(self._recording) is not None:
+                found.append((place / name, reader))
+        self._shared.update(path.name for path, _ in found)
+        return found
+
+    def _list(self, place: Path, *names: str) -> None:
+        """List shared files of the recording, before they have rows of it."""
+        self._shared.update(names)
+        line = " ".join([self._recording, *sorted(self._shared)]).encode()
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+        fd = files.open_file(_list_of(place), flags, depth=IN_TABLES)
+        try:
+            # A line before it may have been cut by a crash.
+            durability.write_all(fd, [b"\n%b %b\n" % (line, _checksum(line))])
+        finally:
+            os.close(fd)
+        self._is_listed = True
 
     def _own_files(
         self, place: Path, names: Iterable[str], goes: Callable[[str], bool]
@@ -256,6 +300,9 @@ class TableFolders:
             part = self._part(sections, table, kept, in_front=in_front)
         except NoRoomError:
             part = self._part(sections, table, kept, in_front=False)
+        is_own = any(section.id == self._recording for section in sections)
+        if is_own and not (self._is_listed and path.name in self._shared):
+            self._list(path.parent, path.name)
         files.rename(part, path, depth=files.IN_RECORDING, new_depth=IN_TYPE)
 
     def _part(
@@ -315,7 +362,73 @@ def locked(root: Path) -> Iterator[None]:
 
 def _folders(root: Path) -> list[str]:
     """Names of the folders of tables."""
-    return sorted(name for name in files.names(root / TABLES, depth=1) if "~" in name)
+    found = files.names(root / TABLES, depth=1).items()
+    return sorted(name for name, about in found if "~" in name and S_ISDIR(about.st_mode))
+
+
+def shared_files(root: Path, folder: str) -> dict[str, set[str]]:
+    """Names of the shared files of a folder, by the recordings in its list.
+
+    A recording that is not listed may be in any of them.
+    """
+    found: dict[str, set[str]] = {}
+    path = _list_of(root / TABLES / folder)
+    with suppress(OSError):
+        for line in files.read_file(path, _MAX_LIST_BYTES, depth=IN_TABLES).splitlines():
+            content, _, checksum = line.rpartition(b" ")
+            if checksum == _checksum(content):
+                recording, *names = content.decode().split(" ")
+                found.setdefault(recording, set()).update(names)
+    return found
+
+
+def _list_of(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.recordings")
+
+
+def _checksum(content: bytes) -> bytes:
+    return f"{crc32(content):08x}".encode()
+
+
+class Listing:
+    """The entries of a folder, which are read again only after a change.
+
+    Args:
+        path: The folder.
+        depth: Parts of its path that lie inside the store.
+
+    Attributes:
+        names: The status of each entry, by name; empty without the folder.
+    """
+
+    def __init__(self, path: Path, depth: int) -> None:
+        self.names: dict[str, os.stat_result] = {}
+        self._path = path
+        self._depth = depth
+        self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
+
+    def look(self) -> bool:
+        """Read the entries if they may have changed; returns whether it did.
+
+        Raises:
+            StoreError: they cannot be read.
+        """
+        try:
+            with files.folder(self._path, self._depth) as fd:
+                about = os.fstat(fd)
+                now = about.st_ino, about.st_mtime_ns
+                if now == self._read_at:
+                    return False
+                self.names = files.names_in(fd)
+        except FileNotFoundError:
+            self.names, self._read_at = {}, None
+            return True
+        except OSError as error:
+            raise unreadable(error, self._path) from error
+        # A change within the same tick of the clock would have the same time.
+        is_settled = time.time_ns() - about.st_mtime_ns > _SETTLED_NS
+        self._read_at = now if is_settled else None
+        return True
 
 
 def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ParquetFileReader]:

@@ -10,9 +10,10 @@ reason to look at the folders again.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate, chain
@@ -32,6 +33,7 @@ from hybridlog.columns.fields import (
     original_name,
     records_of,
 )
+from hybridlog.columns.folders import Listing, shared_files
 from hybridlog.columns.layout import (
     IN_PARTS,
     IN_TABLES,
@@ -53,7 +55,7 @@ from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import is_list
 from hybridlog.schema.column import ranges
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import StoreError, unreadable
+from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.stopping import check_wanted
@@ -603,51 +605,126 @@ class _Folder:
         self._path = path
         self._depth = depth
         self._cache = cache
+        self._listing = Listing(path, depth)
+        self._shared: list[str] = []
+        self._own: dict[str, list[str]] = {}  # files of long topics, by recording
+        self._listed: Mapping[str, Collection[str]] = {}
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
         self._rows: dict[str, list[_Rows]] = {}
-        self.damaged: list[str] = []
+
+    @property
+    def damaged(self) -> list[str]:
+        """Files that were looked at and cannot be read."""
+        return [str(self._path / name) for name, (_, file) in self._files.items() if file is None]
 
     def rows(self, recording: str) -> list[_Rows]:
-        """The rows of a recording."""
+        """The rows of a recording in the files that were looked at."""
         return self._rows.get(recording, [])
 
-    def look(self, recording: str | None) -> None:
-        """Open files that are new or were replaced.
+    def look(self, recording: str, *, everywhere: bool) -> None:
+        """Open files that may have rows of a recording, if they are new or were replaced.
 
         Args:
-            recording: Files of long topics of other recordings are not opened; None for all.
+            recording: Id of the recording.
+            everywhere: True for all shared files, False for those that are listed for it.
         """
-        try:
-            names = files.names(self._path, depth=self._depth)
-            found = {name: about for name, about in names.items() if name.endswith(SUFFIX)}
-        except FileNotFoundError:
-            found = {}
-        except OSError as error:
-            raise unreadable(error, self._path) from error
-        before, self._files, self.damaged = self._files, {}, []
-        for name, status in sorted(found.items()):
-            same = status.st_ino, status.st_size, status.st_mtime_ns
-            known = before.get(name)
-            if known is not None and known[0] == same:
-                self._files[name] = known
-            elif recording is None or name.startswith((SHARED, f"{recording}-")):
-                self._files[name] = same, self._opened(name)
-            if name in self._files and self._files[name][1] is None:
-                self.damaged.append(str(self._path / name))
-        self._rows = defaultdict(list)
-        for file in (file for _, file in self._files.values() if file is not None):
-            for begin, section in file.sections():
-                self._rows[section.id].append(_Rows(file, begin, section))
+        self._look()
+        listed = self._shared if everywhere else self._listed.get(recording, ())
+        for name in (*self._own.get(recording, ()), *sorted(listed)):
+            self._open(name)
 
-    def _opened(self, name: str) -> ColumnFile | None:
-        try:
+    def look_at_all(self) -> None:
+        """Open all files that are new or were replaced."""
+        self._look()
+        for name in sorted(self._listing.names):
+            if name.endswith(SUFFIX):
+                self._open(name)
+
+    def _look(self) -> None:
+        """Look which files there are, and drop those that were replaced."""
+        if not self._listing.look():
+            return
+        names = self._listing.names
+        before = self._files
+        self._files = {
+            name: known
+            for name, known in before.items()
+            if name in names and known[0] == _identity(names[name])
+        }
+        if len(self._files) < len(before):
+            self._rows = {}
+            for _, file in self._files.values():
+                self._add(file)
+        tables = sorted(name for name in names if name.endswith(SUFFIX))
+        self._shared = [name for name in tables if name.startswith(SHARED)]
+        self._own = {}
+        for name in tables:
+            self._own.setdefault(name.rpartition("-")[0], []).append(name)
+        root, folder = self._path.parent.parent, self._path.name
+        self._listed = shared_files(root, folder) if self._shared else {}
+
+    def _open(self, name: str) -> None:
+        status = self._listing.names.get(name)
+        if name in self._files or status is None:
+            return
+        file: ColumnFile | None = None
+        with suppress(FileNotFoundError, StoreError):
             file = ColumnFile(self._path / name, depth=self._depth + 1)
-        except (FileNotFoundError, StoreError):
-            return None
-        if not is_of_folder(self._path.name, file.schema):
-            return None
-        self._cache.opened(file)
-        return file
+            self._cache.opened(file)
+        if file is not None and not is_of_folder(self._path.name, file.schema):
+            file = None
+        self._files[name] = _identity(status), file
+        self._add(file)
+
+    def _add(self, file: ColumnFile | None) -> None:
+        if file is not None:
+            for begin, section in file.sections():
+                self._rows.setdefault(section.id, []).append(_Rows(file, begin, section))
+
+
+def _identity(status: os.stat_result) -> tuple[int, int, int]:
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+class _Folders:
+    """The folders in one place.
+
+    Args:
+        place: Where they are.
+        depth: Parts of its path that lie inside the store.
+        cache: Knows the open files.
+    """
+
+    def __init__(self, place: Path, depth: int, cache: _Cache) -> None:
+        self._place = place
+        self._depth = depth
+        self._cache = cache
+        self._listing = Listing(place, depth)
+        self._known: dict[str, _Folder] = {}
+        self._by_type: dict[str, list[_Folder]] = {}
+
+    def look(self) -> None:
+        """Look which folders there are."""
+        if not self._listing.look():
+            return
+        before = self._known
+        self._known = {
+            name: before.get(name) or _Folder(self._place / name, self._depth + 1, self._cache)
+            for name, about in sorted(self._listing.names.items())
+            if S_ISDIR(about.st_mode)
+        }
+        self._by_type = {}
+
+    def of(self, types: Iterable[str]) -> list[_Folder]:
+        """The folders of some message types."""
+        found: list[_Folder] = []
+        for one in types:
+            if one not in self._by_type:
+                prefix = type_prefix(one)
+                folders = self._known.items()
+                self._by_type[one] = [own for name, own in folders if name.startswith(prefix)]
+            found += self._by_type[one]
+        return found
 
 
 class Tables:
@@ -662,9 +739,9 @@ class Tables:
         self._root = root
         self._cache = _Cache(most_bytes)
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
-        self._folders: dict[str, _Folder] = {}
-        self._by_type: dict[str, list[_Folder]] = {}
-        self._sealed: OrderedDict[str, dict[str, _Folder]] = OrderedDict()
+        self._folders = _Folders(root / TABLES, IN_TABLES - 1, self._cache)
+        self._looked_at: set[str] = set()  # types whose folders were looked at
+        self._sealed: OrderedDict[str, _Folders] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._generation = 0
         self._lock = threading.RLock()
@@ -679,8 +756,8 @@ class Tables:
         with self._lock:
             self._generation += 1
             self._found.clear()
-            self._folders.clear()
-            self._by_type.clear()
+            self._looked_at.clear()
+            self._folders = _Folders(self._root / TABLES, IN_TABLES - 1, self._cache)
             self._sealed.clear()
             self._channels = None
         self._cache.clear()
@@ -708,7 +785,7 @@ class Tables:
         with self._lock:
             self._generation += 1
             self._found.clear()
-            self._by_type.clear()
+            self._looked_at.clear()
 
     def forget(self, recording: RecordingEntry, topics: Collection[str]) -> None:
         """Look for tables of a recording again."""
@@ -716,7 +793,7 @@ class Tables:
             for topic in topics:
                 self._found.pop((recording.id, topic), None)
             types = {channel.type for channel in recording.channels if channel.topic in topics}
-            self._look(types, recording.id)
+            self._looked_at -= types
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """Ignore the table from now on, because it was found to be damaged."""
@@ -773,14 +850,28 @@ class Tables:
     def _rows_of(
         self, recording: RecordingEntry, topic: str, channels: Sequence[ChannelEntry]
     ) -> tuple[list[_Rows], list[str]]:
-        """The rows of a recording in the folders of a topic, and damaged files there."""
+        """The rows of a recording in the folders of a topic, and damaged files there.
+
+        Shared files that are not listed for it are opened only if rows are missing otherwise.
+        """
         types = {channel.type for channel in channels}
+        messages = sum(channel.stats.messages for channel in channels)
+        rows: list[_Rows] = []
         with self._lock:
-            rows = [rows for folder in self._of_types(types) for rows in folder.rows(recording.id)]
-            if not any(topic in one.section.topics for one in rows):
-                folders = self._look(types, recording.id)
-                rows = [rows for folder in folders for rows in folder.rows(recording.id)]
-            return rows, [path for folder in self._of_types(types) for path in folder.damaged]
+            if types <= self._looked_at:
+                rows = self._known_rows(recording, types)
+            for everywhere in (False, True):
+                if sum(_rows_in(one.section, topic) for one in rows) == messages:
+                    break
+                self._folders.look()
+                for folder in self._folders.of(types):
+                    folder.look(recording.id, everywhere=everywhere)
+                self._looked_at |= types
+                rows = self._known_rows(recording, types)
+            return rows, [path for folder in self._folders.of(types) for path in folder.damaged]
+
+    def _known_rows(self, recording: RecordingEntry, types: Collection[str]) -> list[_Rows]:
+        return [rows for one in self._folders.of(types) for rows in one.rows(recording.id)]
 
     def _table(
         self, recording: RecordingEntry, topic: str, found: Sequence[_Rows]
@@ -825,12 +916,14 @@ class Tables:
         if not has_one_definition(channels):
             return None
         with self._lock:
-            known = self._sealed.setdefault(recording.id, {})
             place = parts_folder(self._root, recording.id)
-            prefixes = tuple(type_prefix(channel.type) for channel in channels)
-            folders = _matching(place, IN_PARTS - 2, prefixes, known, self._cache)
+            known = self._sealed.setdefault(
+                recording.id, _Folders(place, IN_PARTS - 2, self._cache)
+            )
+            known.look()
+            folders = known.of({channel.type for channel in channels})
             for folder in folders:
-                folder.look(None)
+                folder.look_at_all()
             rows = [rows for folder in folders for rows in folder.rows(recording.id)]
             while len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)
@@ -854,36 +947,10 @@ class Tables:
             found = self._channels = recording, dict(by_topic)
         return found[1].get(topic, [])
 
-    def _of_types(self, types: Collection[str]) -> list[_Folder]:
-        """The known folders of some message types."""
-        return [folder for one in types for folder in self._by_type.get(one, ())]
 
-    def _look(self, types: Collection[str], recording: str) -> list[_Folder]:
-        """Look at the folders of some message types again."""
-        for one in types:
-            place, prefixes = self._root / TABLES, (type_prefix(one),)
-            found = _matching(place, IN_TABLES - 1, prefixes, self._folders, self._cache)
-            self._by_type[one] = found
-        folders = self._of_types(types)
-        for folder in folders:
-            folder.look(recording)
-        return folders
-
-
-def _matching(
-    place: Path, depth: int, prefixes: tuple[str, ...], known: dict[str, _Folder], cache: _Cache
-) -> list[_Folder]:
-    """Folders whose names begin in one of several ways; new ones are added to the known ones."""
-    try:
-        names = files.names(place, depth=depth)
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise unreadable(error, place) from error
-    for name in sorted(names):
-        if name.startswith(prefixes) and name not in known and S_ISDIR(names[name].st_mode):
-            known[name] = _Folder(place / name, depth + 1, cache)
-    return [folder for name, folder in known.items() if name.startswith(prefixes)]
+def _rows_in(section: Section, topic: str) -> int:
+    counts = section.topics.get(topic)
+    return 0 if counts is None else counts.rows
 
 
 def has_one_definition(channels: Sequence[ChannelEntry]) -> bool:

@@ -69,6 +69,7 @@ def repair(
         catalog.rebuild()
         done.append(Repaired("", "catalog", "rebuilt"))
         entries = None  # all other rows are lost, too
+    checker = tables.TableChecker(directory)
     chosen = [(label, "") for label in directory.labels()]
     for label, recording in chosen if entries is None else [(e.label, e.id) for e in entries]:
         if label in repairs.copies:
@@ -80,7 +81,10 @@ def repair(
             with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
                 done += _repair_one(directory, now)
                 entry = put_entry(directory, catalog, now)
-            done += _repair_tables(directory, entry)
+            if entry.status not in {"damaged", "open"}:
+                # Tables of lost data are valid again after its restoration.
+                made = checker.repair(entry)
+                done += [Repaired(entry.label, f"table of {topic}", "made again") for topic in made]
         except HeldError as error:
             if recording:
                 done.append(Repaired(label, "recording", str(error), is_cured=False))
@@ -98,16 +102,6 @@ def _repair_one(directory: StoreDirectory, label: str) -> list[Repaired]:
         place = misfit.file or f"segment {misfit.segment}"
         done.append(Repaired(label, place, what, is_cured=False))
     return done
-
-
-def _repair_tables(directory: StoreDirectory, entry: RecordingEntry) -> list[Repaired]:
-    """Rebuild damaged tables."""
-    if entry.status == "damaged":
-        return []  # tables of lost data are valid again after its restoration
-    damaged = tables.TableChecker(directory).damage(entry)
-    if not damaged or not tables.make(directory, entry, damaged):
-        return []
-    return [Repaired(entry.label, f"table of {topic}", "made again") for topic in damaged]
 
 
 def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:

@@ -30,11 +30,19 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk_table import ChunkTable
 
 
-def missing(directory: StoreDirectory, entry: RecordingEntry) -> set[str]:
-    """Topics whose tables are missing, or differ from the catalog."""
+def missing(
+    directory: StoreDirectory, entry: RecordingEntry, tables: Tables | None = None
+) -> set[str]:
+    """Topics whose tables are missing, or differ from the catalog.
+
+    Args:
+        directory: The store.
+        entry: The recording's entry in the catalog.
+        tables: Finds the tables.
+    """
     from hybridlog.columns.tables import Tables
 
-    tables = Tables(directory.path)
+    tables = tables or Tables(directory.path)
     possible = _possible(entry)
     return {
         topic
@@ -160,8 +168,17 @@ class TableChecker:
     def __init__(self, directory: StoreDirectory) -> None:
         from hybridlog.columns.tables import Tables
 
+        self._directory = directory
         self._tables = Tables(directory.path)
         self._checked: dict[int, str] = {}
+
+    def repair(self, entry: RecordingEntry) -> list[str]:
+        """Make missing and damaged tables of a recording again; returns their topics."""
+        wanted = missing(self._directory, entry, self._tables).union(self.damage(entry))
+        if not wanted or not make(self._directory, entry, wanted):
+            return []
+        self._tables.forget(entry, wanted)
+        return sorted(wanted - missing(self._directory, entry, self._tables))
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:
         """Problems of the existing tables, by topic. Reads every byte of them."""

@@ -195,6 +195,19 @@ def test_topics_of_one_file_are_made_alone(few: hl.Store) -> None:
     assert contents(few) == before
 
 
+def test_repair_makes_missing_tables(few: hl.Store) -> None:
+    before = contents(few)
+    for path in (few.directory.path / TABLES).glob("*/*.parquet"):
+        path.unlink()
+    done = few.repair()
+    assert [(one.place, one.is_cured) for one in done] == [
+        ("table of /a", True),
+        ("table of /b", True),
+    ]
+    assert contents(few) == before
+    assert not few.repair()
+
+
 def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     """Stale rows are no damage; a topic that is made again makes no other one valid again."""
     (entry,) = few.recordings()

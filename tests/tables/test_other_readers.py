@@ -205,7 +205,7 @@ def counts_of(store: hl.Store) -> dict[tuple[str, str], int]:
 
 
 def folders_of(store: hl.Store) -> list[Path]:
-    return sorted((store.directory.path / "tables").glob("*~*"))
+    return sorted(path for path in (store.directory.path / "tables").iterdir() if path.is_dir())
 
 
 def count_duckdb(folder: Path) -> list[Row]:

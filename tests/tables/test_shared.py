@@ -142,6 +142,85 @@ def test_a_full_file_gets_no_more_rows(
     assert compare(store) == 120
 
 
+@pytest.fixture
+def apart(store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> hl.Store:
+    """A store of nine recordings, in three shared files."""
+    monkeypatch.setattr(folders, "MAX_SHARED_ROWS", 100)
+    for number in range(9):
+        record(store, tmp_path, number)
+    assert len(files_of(store)) == 3
+    store.refresh()
+    return store
+
+
+def lists_of(store: hl.Store) -> list[Path]:
+    return sorted((store.directory.path / "tables").glob(".*.recordings"))
+
+
+def test_other_shared_files_are_not_opened(
+    apart: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two, _ = files_of(apart)
+    opened = opened_files(monkeypatch)
+    assert apart.query(["/a"], ["r1"]).where("i8 > 0").count() == 6
+    assert set(opened) == {one}
+    opened.clear()
+    apart.remove("r4")
+    assert set(opened) & set(files_of(apart)) == {two}
+    assert compare(apart) == 8 * 30
+
+
+@pytest.mark.parametrize("harm", ["lost", "cut", "changed"])
+def test_lists_of_shared_files_that_are_lost_or_damaged(
+    apart: hl.Store, monkeypatch: pytest.MonkeyPatch, harm: str
+) -> None:
+    """Then all shared files are opened: nothing is missed, or left by a removal."""
+    (path,) = lists_of(apart)
+    if harm == "lost":
+        path.unlink()
+    elif harm == "cut":
+        path.write_bytes(path.read_bytes()[:-3])
+    else:
+        path.write_bytes(path.read_bytes().replace(b"shared-000002", b"shared-000001"))
+    removed = apart.entry("r8").id
+    opened = opened_files(monkeypatch)
+    assert apart.query(["/a"], ["r8"]).where("i8 > 0").count() == 6
+    assert set(opened) == set(files_of(apart))
+    apart.remove("r8")
+    assert not any(
+        removed in pq.read_table(path).column("recording").to_pylist() for path in files_of(apart)
+    )
+    assert compare(apart) == 8 * 30
+    assert {one.id for one in apart.recordings()} == folders.recordings_of(apart.directory.path)
+
+
+def test_lists_go_with_their_folders(several: hl.Store) -> None:
+    assert lists_of(several)
+    for one in list(several.recordings()):
+        several.remove(one.label)
+    assert not list((several.directory.path / "tables").iterdir())
+
+
+def test_folders_are_read_once_for_all_recordings_without_tables(
+    several: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (path,) = files_of(several)
+    path.unlink()
+    monkeypatch.setattr(folders, "_SETTLED_NS", -1)
+    entries = list(several.recordings())
+    read: list[int] = []
+    real = files.names_in
+
+    def seen(fd: int) -> Any:
+        read.append(fd)
+        return real(fd)
+
+    monkeypatch.setattr(files, "names_in", seen)
+    tables = reader.Tables(several.directory.path)
+    assert all(tables.of(one, topic) is None for one in entries for topic in ("/a", "/b"))
+    assert len(read) == 2  # all folders, and this one
+
+
 def test_rows_are_by_recording_topic_and_time(several: hl.Store, tmp_path: Path) -> None:
     record(several, tmp_path, -3)
     (path,) = files_of(several)
