@@ -61,7 +61,7 @@ GROUP_BYTES: Final = 32 << 20
 _ARENA = 8 << 20  # bytes of payloads collected: each topic's part costs a millisecond
 _ENOUGH = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
 _ROWS = 1 << 18  # messages collected
-_PENDING = 48 << 20  # bytes of rows waiting in memory
+_PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
 LONG_ROWS = 10_000
 """Number of rows from which a topic has files of its own."""

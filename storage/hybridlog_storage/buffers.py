@@ -26,7 +26,7 @@ SLAB = 8 << 20
 """Bytes allocated from the system at a time; buffers up to this size are cut from them."""
 
 _LEAST = 1 << 18  # smaller buffers come from malloc
-_SPARE_BYTES = 96 << 20
+_SPARE_BYTES = 64 << 20
 _HUGE_PAGE = 2 << 20
 _FILLED = 8 << 20  # bytes of a new buffer; larger content is copied by a thread that can wait
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
