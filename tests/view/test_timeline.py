@@ -480,3 +480,20 @@ def test_keys_alone(page: Page, demo_url: str) -> None:
     page.keyboard.press(" ")
     until(page, f"Number(document.querySelector('.density').ariaValueNow) > {length - 0.001}")
     page.get_by_role("button", name="Play or pause").filter(has_text="Play").wait_for()
+
+
+@pytest.mark.peer("browser")
+@pytest.mark.parametrize("range_of", ["", "&begin=-5000000000&end=5000000000"])
+def test_a_range_longer_than_the_recording_is_not_asked_for_forever(
+    tmp_path: Path, page: Page, range_of: str
+) -> None:
+    asked: list[str] = []
+    page.on("request", lambda one: asked.append(one.url) if "/timeline?" in one.url else None)
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("one") as recording:
+            recording.write(Channel("/a", "json", None), b"{}", log_time=SECOND)
+        with served(store) as url:
+            page.goto(f"{url}#recording=one&panels=[]{range_of}")
+            page.locator(".timeline .density").wait_for()
+            page.wait_for_load_state("networkidle")
+    assert len(asked) < 4  # once more for what was drawn meanwhile

@@ -76,12 +76,15 @@ export class Lanes {
 
   /** Asks for what a picture needs and is not there; `isNew` asks for it in any case. */
   want(begin, end, pixels, topics, isNew = false) {
+    const { info } = this.recording;
+    // A range may be longer than the recording, outside of which there is nothing to ask for.
+    const [low, high] = [Math.max(begin, Number(info.begin)), Math.min(end, Number(info.end))];
     const isThere = (topic) => {
       const lane = this.near.get(topic);
       if (!lane) return false;
       const last = lane.begin + lane.width * lane.counts.length;
       const isFine = lane.width <= Math.max(widthOf(end - begin, pixels), 1);
-      return isFine && lane.begin <= begin && last >= end;
+      return isFine && lane.begin <= low && last >= high;
     };
     const lacking = isNew ? topics : topics.filter((topic) => !isThere(topic));
     this.wanted = lacking.length ? { begin, end, pixels, topics: lacking } : null;
