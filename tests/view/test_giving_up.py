@@ -20,7 +20,6 @@ from hybridlog.view import context
 from hybridlog.view.app import make_app
 from hybridlog.view.routes import ask
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
 
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.view.question import PageQuestion
 
 S = 10**9
+MS = 10**6
 WHOLE = {"begin": 0, "end": 20 * S, "pixels": 100}
 SCAN = {"recording": "robot", "topic": "/base/scan"}
 NEAR = {**SCAN, "where": "ranges.min < 0.8"}
@@ -155,19 +155,16 @@ def test_an_update_waits_for_the_answer_before(page: Page, demo_url: str) -> Non
 
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[hl.Store]:
-    """A store, as another process has it open, with a recording that goes on and on."""
-    settings = SegmentSettings(segment_size=1)
+    """A store, as another process has it open, with a recording that goes on."""
     ended = threading.Event()
     with hl.open(tmp_path / "store", create=True) as writing, ExitStack() as stack:
-        recording = stack.enter_context(
-            writing.start("live", settings=settings, flush_interval_s=0.05)
-        )
+        recording = stack.enter_context(writing.start("live", flush_interval_s=0.05))
 
         def write() -> None:
-            n = 0
-            while not ended.wait(0.05):
-                recording.write(Channel("/a", "json", None), b'{"n": %d}' % n, log_time=S + n)
-                n += 1
+            for n in range(1000):
+                recording.write(Channel("/a", "json", None), b'{"n": %d}' % n, log_time=S + n * MS)
+                if ended.wait(0.2):
+                    break
 
         writer = threading.Thread(target=write)
         writer.start()
@@ -185,13 +182,12 @@ def test_updates_do_not_starve_a_question(
     question_of = ask.question_of
 
     def slow(context: context.Context, asked: Asked) -> PageQuestion:
-        time.sleep(1.5)
+        time.sleep(1.2)
         return question_of(context, asked)
 
     monkeypatch.setattr(ask, "question_of", slow)
-    until = time.monotonic() + 30
-    while running.entry("live").messages == 0 if running.summaries() else True:
-        assert time.monotonic() < until
+    page.set_default_timeout(60_000)
+    while not running.summaries() or not running.entry("live").messages:
         time.sleep(0.1)
         running.refresh()
     with served(running) as url:
