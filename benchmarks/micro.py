@@ -29,6 +29,7 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.index_bodies import index_bodies
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed
 from hybridlog_storage.segments.chunk import StoredChunk, pack
@@ -254,7 +255,7 @@ def bench_transcode(case: str, bags: Path, benchmark: Any) -> None:
 
     def transcode() -> int:
         documents = 0
-        for group in codec.bodies(batch.buffer, batch.offset, batch.length):
+        for group in index_bodies(codec, batch.buffer, batch.offset, batch.length):
             table = assembler.assemble(placed, group.rows, group.body, group.error)
             assert group.error is None
             documents += len(table)
@@ -438,7 +439,7 @@ def bench_decode(case: str, bags: Path, benchmark: Any) -> None:
     stream = read(bags / name, topic, count)
     codec = codec_for(stream.channel())
     batch: Any = stream.batches(count)[0]
-    decoded = benchmark(codec.columns, batch.buffer, batch.offset, batch.length, None)
+    decoded = benchmark(codec.columns, batch.buffer, batch.offset, batch.length)
     assert len(decoded.records) == count
 
 

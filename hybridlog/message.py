@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from hybridlog.query.times import format_time
-from hybridlog.schema.codec import DecodedArrow
-from hybridlog_storage.errors import HybridlogError, PayloadError
+from hybridlog.schema.codec import one_message
+from hybridlog.schema.column import Records
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -160,12 +160,9 @@ class Message:
             PayloadError: the payload does not fit its definition.
             DefinitionError: no usable definition exists.
         """
-        start, size = np.zeros(1, np.int64), np.array([self._view.nbytes], np.int64)
-        objects = self._codec.objects(self._view, start, size)
-        decoded = objects or self._codec.arrow(self._view, start, size, None)
-        if decoded.unreadable:
-            raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
-        values: Any = decoded.records if isinstance(decoded, DecodedArrow) else decoded.objects
+        decoded = one_message(self._codec, self._view)
+        has_columns = isinstance(decoded.records, Records)
+        values: Any = decoded.arrow() if has_columns else decoded.plain()
         return cast("pa.StructScalar | Mapping[str, Any]", values[0])
 
     def to_numpy(self) -> NDArray[Any]:
@@ -198,18 +195,19 @@ class Documents:
 
     def fields(self, row: int) -> dict[str, object]:
         """The fields of one message, as in its index document."""
-        import bson
+        from hybridlog.schema.index_bodies import document_of
 
         if row not in self._bodies:
             self._make(int(self._batch.channel[row]))
-        body = self._bodies[row]
-        document = struct.pack("<i", len(body) + 5) + body + b"\x00"
-        return bson.decode(document)
+        return document_of(self._bodies[row])
 
     def _make(self, index: int) -> None:
+        from hybridlog.schema.index_bodies import index_bodies
+
         rows = np.flatnonzero(self._batch.channel == index)
         part = self._batch.take(rows)
-        for group in self._channels[index].codec.bodies(part.buffer, part.offset, part.length):
+        codec = self._channels[index].codec
+        for group in index_bodies(codec, part.buffer, part.offset, part.length):
             for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
                 self._bodies[row] = body.tobytes()
 

@@ -25,13 +25,11 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 ALLOWED = {
     "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
     "bson": (
-        "hybridlog.message",  # whole index documents, for people,
-        "hybridlog.query.answers.index_documents",  # and those as MongoDB has them
-        "hybridlog.schema.json_codec",
-        "hybridlog.schema.object_rows",
+        "hybridlog.query.answers.index_documents",  # as MongoDB has them
+        "hybridlog.schema.index_bodies",
+        "hybridlog.schema.objects",
         "hybridlog.schema.protobuf_codec",
         "hybridlog.schema.reduced_codec",
-        "hybridlog.schema.ros_codec",
         "hybridlog_storage.mongo.database",
     ),
     "click": ("hybridlog.cli",),

@@ -1116,7 +1116,7 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
 def test_the_specification_names_what_there_is() -> None:
     from dataclasses import fields
 
-    from hybridlog.index.indexing import ARRAY_LIMIT
+    from hybridlog.schema.index_bodies import ARRAY_LIMIT
     from hybridlog_storage import journal
     from hybridlog_storage.catalog import CATALOG, ChannelStats, RecordingEntry
     from hybridlog_storage.disk import directory

@@ -452,13 +452,11 @@ def test_real_log_agrees_with_rosbags(topic: str) -> None:
     for start in range(0, len(raw), 100):
         part = raw[start : start + 100]
         offset = offsets([data for _, data in part])
-        decoded = codec.arrow(
-            b"".join(data for _, data in part), offset[:-1], np.diff(offset), None
-        )
+        decoded = codec.columns(b"".join(data for _, data in part), offset[:-1], np.diff(offset))
         time = times(*(time for time, _ in part))
         seq = np.arange(start, start + len(part))
         for builder in tables:
-            builder.append(Block(topic, time, seq, {}, decoded.records, 0))
+            builder.append(Block(topic, time, seq, {}, decoded.arrow(), 0))
     frame, table = tables[0].to_pandas(), tables[1].to_arrow()
     table.validate(full=True)
     assert frame.index.astype("int64").tolist() == sorted(time for time, _ in raw)

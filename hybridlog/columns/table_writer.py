@@ -173,7 +173,7 @@ def _defined_fields(channel: Channel, shape: FieldShape) -> Any:
     if not codec.indexed:
         return None
     none = np.empty(0, np.int64)
-    kind = shape.columns(codec.arrow(b"", none, none, None).records).type
+    kind = shape.columns(codec.columns(b"", none, none).arrow()).type
     return kind if kind.num_fields else None
 
 
@@ -466,13 +466,11 @@ class TableWriter:
     ) -> None:
         from hybridlog.columns.fields import detached, without
 
-        decoded = codec.arrow(data.data, piece.messages.at, piece.messages.length, None)
-        for bad in decoded.unreadable:
-            reason = f"the payload does not fit {topic.type}: {bad.reason}"
-            piece.errors.append((bad.rows, reason))
+        decoded = codec.columns(data.data, piece.messages.at, piece.messages.length)
+        piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
         if not len(decoded.rows):
             return
-        columns = topic.shape.columns(decoded.records)
+        columns = topic.shape.columns(decoded.arrow())
         begin = data.ctypes.data
         columns = detached(columns, begin, begin + data.nbytes)
         piece.fields = without(columns, decoded.rows, piece.rows)

@@ -135,7 +135,7 @@ class Locator:
         is_big = big_endian_rows(self._wire, buffer, offset, length)
         for rows in (np.flatnonzero(~is_big), np.flatnonzero(is_big)):
             decoded = self._reader.read(buffer, offset[rows], length[rows])
-            if decoded.unreadable:
+            if decoded.unreadable or not isinstance(decoded.records, Records):
                 return None
             if len(rows):
                 self._fill(found, rows, decoded.records)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Part, Question, RecordedChannel
+    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
 
 _BLOCK_ROWS = 65_536
@@ -206,7 +207,7 @@ class Decoder:
         batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
         for number, channel in enumerate(self.channels):
             if not channel.is_reduced:
-                yield self.block(number, batch, none)[0]
+                yield self.block(number, batch, none, self.decoded(number, batch))
 
     def blocks(self, run: MessageRun) -> Iterator[Block]:
         """The messages of a run, by channel."""
@@ -215,28 +216,30 @@ class Decoder:
             if self.channels[number].is_reduced and not self._takes_reduced:
                 self._counters.reduced += len(rows)
             else:
-                yield self.block(number, run.batch.take(rows), run.seq[rows])[0]
+                batch = run.batch.take(rows)
+                yield self.block(number, batch, run.seq[rows], self.decoded(number, batch))
 
-    def block(
-        self, number: int, batch: Batch, seq: NDArray[np.int64]
-    ) -> tuple[Block, NDArray[np.intp]]:
-        """Messages of one channel, and the mask of the readable rows."""
+    def decoded(self, number: int, batch: Batch) -> Decoded:
+        """The fields of messages of one channel; those that cannot be read are counted."""
+        where = batch.buffer, batch.offset, batch.length
+        found = self.channels[number].codec.columns(*where, self._fields[number])
+        self._counters.unreadable += len(batch) - len(found.rows)
+        return found
+
+    def block(self, number: int, batch: Batch, seq: NDArray[np.int64], decoded: Decoded) -> Block:
+        """The readable messages of one channel."""
         channel = self.channels[number]
-        decoded = channel.codec.arrow(
-            batch.buffer, batch.offset, batch.length, self._fields[number]
-        )
-        records, good = decoded.records, decoded.rows
+        records, good = decoded.arrow(), decoded.rows
         stamps = None
         if "stamp" in self._own:
             stamps = stamp_array(records)
             records = _without_stamp(records, self._chosen)
         if len(good) < len(batch):
-            self._counters.unreadable += len(batch) - len(good)
             batch, seq = batch.take(good), seq[good]
         own = self.own_columns(number, batch, seq, stamps)
         order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
         topic = channel.channel.topic
-        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes), good
+        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes)
 
     def own_columns(
         self,

@@ -16,6 +16,7 @@ from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import below, values_array
 from hybridlog.schema.arrow_types import plain_values
+from hybridlog.schema.column import Records
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
-    from hybridlog.schema.codec import DecodedObjects
+    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.messages import Batch
 
 
@@ -53,15 +54,14 @@ def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[Line]
             planner.counters.reduced += len(rows)
             continue
         batch, seq = run.batch.take(rows), run.seq[rows]
-        objects = channel.codec.objects(batch.buffer, batch.offset, batch.length)
-        if objects is None:
-            block, good = decoder.block(number, batch, seq)
+        decoded = decoder.decoded(number, batch)
+        if isinstance(decoded.records, Records):
+            block = decoder.block(number, batch, seq, decoded)
             made = _of_columns(block, channel.channel.topic, planner.question.fields)
         else:
-            good = objects.rows
-            firsts = _firsts(decoder, number, batch.take(good), seq[good])
-            made = _of_objects(firsts, objects, planner.question.fields)
-        for row, line in zip(rows[good].tolist(), made, strict=True):
+            firsts = _firsts(decoder, number, batch, seq, decoded)
+            made = _of_objects(firsts, decoded.plain(), planner.question.fields)
+        for row, line in zip(rows[decoded.rows].tolist(), made, strict=True):
             found[row] = line
     return [line for line in found if line is not None]
 
@@ -87,16 +87,17 @@ def _repeated(text: str, rows: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def _firsts(
-    decoder: Decoder, number: int, batch: Batch, seq: NDArray[np.int64]
+    decoder: Decoder, number: int, batch: Batch, seq: NDArray[np.int64], decoded: Decoded
 ) -> list[dict[str, Any]]:
     """The beginnings of the lines of messages: the built-in columns."""
-    own = decoder.own_columns(number, batch, seq)
+    good = decoded.rows
+    own = decoder.own_columns(number, batch.take(good), seq[good])
     if "stamp" in own:
-        own = dict(decoder.block(number, batch, seq)[0].own)
+        own = dict(decoder.block(number, batch, seq, decoded).own)
     topic = decoder.channels[number].channel.topic
     names = ("log_time_ns", "topic", *(name for name in own if name != "topic"))
     columns = [plain_values(own[name]) for name in names[2:]]
-    times = batch.log_time.tolist()
+    times = batch.log_time[good].tolist()
     return [
         dict(zip(names, values, strict=True))
         for values in zip(times, [topic] * len(times), *columns, strict=True)
@@ -104,13 +105,15 @@ def _firsts(
 
 
 def _of_objects(
-    firsts: Sequence[Mapping[str, Any]], decoded: DecodedObjects, fields: Sequence[str] | None
+    firsts: Sequence[Mapping[str, Any]],
+    messages: Sequence[Mapping[str, Any]],
+    fields: Sequence[str] | None,
 ) -> Iterator[Line]:
     """Lines of messages with different fields."""
     wanted = None
     if fields is not None:
         wanted = [path.replace("[]", "").split(".") for path in fields]
-    for first, message in zip(firsts, decoded.objects, strict=True):
+    for first, message in zip(firsts, messages, strict=True):
         row = dict(first)
         leaves = _flat(_chosen(message, wanted))
         if fields is not None:

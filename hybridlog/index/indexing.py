@@ -15,6 +15,7 @@ import numpy as np
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import STAMP
+from hybridlog.schema.index_bodies import index_bodies
 from hybridlog.schema.stamps import stamps_of
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.messages import Batch, Channel
@@ -24,8 +25,6 @@ from hybridlog_storage.segments.chunk import StoredChunk
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-ARRAY_LIMIT = 32
 
 
 class Documents(NamedTuple):
@@ -50,16 +49,12 @@ class ChunkIndexer:
 
     Args:
         recording: Id or key of the recording.
-        array_limit: Longest array that is indexed whole.
         has_documents: False to make only the chunks' catalog entries.
     """
 
-    def __init__(
-        self, recording: str, *, array_limit: int = ARRAY_LIMIT, has_documents: bool = True
-    ) -> None:
+    def __init__(self, recording: str, *, has_documents: bool = True) -> None:
         self.recording = recording
         self._key = recording[:16]
-        self._array_limit = array_limit
         self._has_documents = has_documents
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
         self._lock = threading.Lock()
@@ -84,7 +79,7 @@ class ChunkIndexer:
                 batch, placed.number[rows], has_publish_time=channel.has_publish_time
             )
             tables: list[NDArray[np.uint8]] = []
-            for group in codec.bodies(batch.buffer, batch.offset, batch.length):
+            for group in index_bodies(codec, batch.buffer, batch.offset, batch.length):
                 if group.stamps is not None:
                     found.stamped(group.rows, group.stamps)
                 if group.error is not None:
@@ -120,7 +115,7 @@ class ChunkIndexer:
 
     def prepare(self, channel: Channel) -> None:
         """Compile a channel's definition before its first message."""
-        codec_for(channel, array_limit=self._array_limit).paths()
+        codec_for(channel).paths()
 
     def reason(self, channel_id: int, channel: Channel) -> str | None:
         """Reason why a channel's fields are not indexed, None if they are."""
@@ -130,7 +125,7 @@ class ChunkIndexer:
         with self._lock:
             part = self._parts.get(channel_id)
             if part is None:
-                codec = codec_for(channel, array_limit=self._array_limit)
+                codec = codec_for(channel)
                 stamped = any(path.path == STAMP and path.type == "time" for path in codec.paths())
                 origin = Origin(self._key, channel.topic, channel.has_publish_time)
                 part = self._parts[channel_id] = codec, DocumentAssembler(origin), stamped

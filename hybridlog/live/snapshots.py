@@ -21,7 +21,9 @@ from hybridlog.query.predicate.to_bool import numbers_at, to_bool
 from hybridlog.query.predicate.types import check
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
 from hybridlog.record.losses import Cause, Ledger
+from hybridlog.schema.codec import plain_message
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.index_bodies import index_fields
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
@@ -309,11 +311,8 @@ class Snapshots:
         """Values of a field in the ring's latest messages since a log time, ns."""
         with self._lock:
             latest = self._ring.latest(topic, begin, _MAX_WATCHED)
-        return [
-            number
-            for message in latest
-            for number in numbers_at(codec_for(message.channel).fields(message.payload), path)
-        ]
+        fields = (index_fields(codec_for(one.channel), one.payload) for one in latest)
+        return [number for message in fields for number in numbers_at(message, path)]
 
     def _watches(self, channel: Channel) -> Iterator[_Watch]:
         """The triggers for a channel; reports those that can never fire on it."""
@@ -401,7 +400,7 @@ def _happened(watches: tuple[_Watch, ...], message: BufferedMessage) -> Iterator
     for reason, test, _ in watches:
         if test is not None and fields is None:
             try:
-                fields = codec_for(message.channel).plain(message.payload, names)
+                fields = plain_message(codec_for(message.channel), message.payload, names)
             except (PayloadError, DefinitionError):
                 fields = {}  # it has no fields, as in an answer
         if test is None or (fields is not None and test(fields)):

@@ -9,6 +9,7 @@ import numpy as np
 
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.tree import Predicate
+from hybridlog.schema.codec import plain_message
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -58,10 +59,10 @@ class MessageFilter:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
         from hybridlog.query.predicate.to_mask import to_mask
 
-        decoded = channel.codec.arrow(
+        decoded = channel.codec.columns(
             batch.buffer, batch.offset, batch.length, self._fields - {"_meta"}
         )
-        records = decoded.records
+        records = decoded.arrow()
         if "_meta" in self._fields:
             good = decoded.rows
             times = batch.log_time[good], seq[good], batch.publish_time[good]
@@ -89,7 +90,7 @@ class MessageFilter:
         unreadable = 0
         for row in rows.tolist():
             try:
-                fields = dict(channel.codec.plain(batch.payload(row), self._fields))
+                fields = plain_message(channel.codec, batch.payload(row), self._fields)
             except (PayloadError, DefinitionError):
                 if self._fields != {"_meta"}:
                     unreadable += 1

@@ -107,7 +107,7 @@ class RecordedChannel:
             fields: Only these fields; None for all.
         """
         none = np.empty(0, np.int64)
-        return self.codec.arrow(b"", none, none, fields).records.type
+        return self.codec.columns(b"", none, none, fields).arrow().type
 
     @property
     def is_reduced(self) -> bool:

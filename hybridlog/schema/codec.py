@@ -1,83 +1,97 @@
-"""Codecs: payloads of any encoding to index bodies, columns and objects."""
+"""Codecs: payloads of any encoding as columns.
+
+A codec has one method for many messages, `columns`. Arrow arrays, plain objects and index
+documents are made from its result, in one way for all encodings.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import numpy as np
 
-from hybridlog_storage.errors import DefinitionError
+from hybridlog.schema.column import Records, row_of
+from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection
 
     import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.schema.definition import FieldPath
-    from hybridlog.schema.wire import Unreadable
+    from hybridlog.schema.objects import Objects
     from hybridlog_storage.messages import Buffer
 
 
-_NONE: NDArray[np.intp] = np.empty(0, np.intp)
-
-
-class BodyGroup(NamedTuple):
-    """Bodies of index documents of equal width.
-
-    Attributes:
-        rows: intp[k], rows of the input.
-        body: uint8[k, width], BSON elements without the document's length and end.
-        error: Reason why these payloads could not be read; the width is then 0.
-        stamps: int64[k], header stamps, ns; None if there are none, or if only
-            `Codec.columns` provides them.
-        surplus: intp[j], rows of these with bytes left over behind the message.
-    """
-
-    rows: NDArray[np.intp]
-    body: NDArray[np.uint8]
-    error: str | None
-    stamps: NDArray[np.int64] | None = None
-    surplus: NDArray[np.intp] = _NONE
+NO_ROWS: NDArray[np.intp] = np.empty(0, np.intp)
+RESERVED = ("_id", "_meta")
+"""Names that no field has in an index document."""
 
 
 @dataclass(slots=True)
-class DecodedArrow:
-    """Messages as Arrow holds them: exact values, nested as the messages are.
-
-    A field that is missing and one that is null are null. Integers have their wire type,
-    those of JSON int64, or uint64 from 2^63 on. A field without a common exact type is
-    JSON text, of the type `pa.json_()`. Times are timestamp[ns, UTC], durations
-    duration[ns], protobuf `bytes` binary, arrays whole.
+class Unreadable:
+    """Payloads that cannot be read, all for the same reason.
 
     Attributes:
-        rows: Rows of the input that could be read, ascending.
+        rows: Rows of the input, ascending.
+        reason: A sentence: `the payload does not fit pkg/Type: it ends early`.
+    """
+
+    rows: NDArray[np.intp]
+    reason: str
+
+
+@dataclass(slots=True)
+class Decoded:
+    """Some messages as columns, or as objects where no definition fixes their layout.
+
+    Attributes:
+        rows: Readable rows of the input, ascending.
         records: Their fields; as many rows as `rows`.
         unreadable: The other rows, each in one of these.
+        surplus: Readable rows with bytes left over behind the message, ascending.
     """
 
     rows: NDArray[np.intp]
-    records: pa.StructArray
+    records: Records | Objects
     unreadable: list[Unreadable]
+    surplus: NDArray[np.intp]
 
+    def arrow(self) -> pa.StructArray:
+        """The messages as Arrow holds them: exact values, nested as the messages are.
 
-@dataclass(slots=True)
-class DecodedObjects:
-    """Messages as plain objects, for JSON lines.
+        A field that is missing and one that is null are null. Integers have their wire type,
+        those of JSON int64, or uint64 from 2^63 on. A field without a common exact type is
+        JSON text, of the type `pa.json_()`. Times are timestamp[ns, UTC], durations
+        duration[ns], protobuf `bytes` binary, arrays whole. Numbers may be views into the
+        buffer that was read, which they keep.
+        """
+        if not isinstance(self.records, Records):
+            return self.records.arrow()
+        from hybridlog.schema.arrow_columns import records_array
 
-    A field that a message lacks is not there, and one that is null is None. Times are
-    nanoseconds; bytes are bytes.
+        return records_array(self.records)
 
-    Attributes:
-        rows: Rows of the input that could be read, ascending.
-        objects: One for each of them.
-        unreadable: The other rows, each in one of these.
-    """
+    def plain(
+        self, names: Collection[str] | None = None, *, whole: bool = True
+    ) -> list[dict[str, object]]:
+        """The messages as plain values: dict, list, str, bytes, bool, int, float, None.
 
-    rows: NDArray[np.intp]
-    objects: Sequence[Mapping[str, object]]
-    unreadable: list[Unreadable]
+        A field that a message lacks is not there. Times and durations are integer nanoseconds.
+
+        Args:
+            names: Fields of the top level that are needed, at least; None for all.
+            whole: False for `{"n": length}` in place of protobuf's `bytes`.
+        """
+        if not isinstance(self.records, Records):
+            return self.records.plain(whole=whole)
+        columns = self.records.fields
+        spelled = zip(top_level_names(columns), columns.values(), strict=True)
+        chosen = [(n, column) for n, column in spelled if names is None or n in names]
+        rows = range(self.records.rows)
+        return [{name: row_of(column, row) for name, column in chosen} for row in rows]
 
 
 class Codec(Protocol):
@@ -85,7 +99,7 @@ class Codec(Protocol):
 
     @property
     def indexed(self) -> bool:
-        """False if only `_meta` is indexed."""
+        """False if only `_meta` is indexed, and nothing can be decoded."""
 
     @property
     def reason(self) -> str | None:
@@ -94,52 +108,14 @@ class Codec(Protocol):
     def paths(self) -> list[FieldPath]:
         """The fields for predicates; empty if no definition fixes them."""
 
-    def bodies(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> Iterator[BodyGroup]:
-        """Make index bodies; each row of the input is in exactly one group.
-
-        Args:
-            buffer: Holds the payloads.
-            offset: int64[n], where each payload starts.
-            length: int64[n], bytes of each payload.
-        """
-
-    def fields(self, payload: Buffer) -> dict[str, object]:
-        """The fields of this message in its index document; empty without any."""
-
-    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
-        """The whole message as plain values: dict, list, str, bool, int, float, None.
-
-        Times and durations are integer nanoseconds; protobuf `bytes` are `{"n": length}`.
-
-        Args:
-            payload: The serialized message.
-            names: Fields of the top level that are needed, at least; None for all.
-
-        Raises:
-            PayloadError: The payload does not fit its definition.
-            DefinitionError: There is no definition to read it by.
-        """
-
-    def decode(self, payload: Buffer) -> object:
-        """Decode the whole message into an object.
-
-        Raises:
-            PayloadError: The payload does not fit its definition.
-            DefinitionError: It has no definition.
-        """
-
-    def arrow(
+    def columns(
         self,
         buffer: Buffer,
         offset: NDArray[np.int64],
         length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> DecodedArrow:
-        """Messages as an Arrow struct array, arrays whole.
-
-        Numbers may be views into `buffer`, which they keep.
+        fields: Collection[str] | None = None,
+    ) -> Decoded:
+        """Decode messages.
 
         Args:
             buffer: Holds the payloads.
@@ -151,15 +127,12 @@ class Codec(Protocol):
             DefinitionError: There is no definition to read them by.
         """
 
-    def objects(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> DecodedObjects | None:
-        """Messages as plain objects; None when every message has every field.
+    def decode(self, payload: Buffer) -> object:
+        """One message as the usual library of its format has it.
 
-        Args:
-            buffer: Holds the payloads.
-            offset: int64[n], where each payload starts.
-            length: int64[n], bytes of each payload.
+        Raises:
+            PayloadError: The payload does not fit its definition.
+            DefinitionError: It has no definition.
         """
 
 
@@ -179,56 +152,68 @@ class OpaqueCodec:
         """No fields are known."""
         return []
 
-    def bodies(
+    def columns(
         self,
         buffer: Buffer,
         offset: NDArray[np.int64],
         length: NDArray[np.int64],
-    ) -> Iterator[BodyGroup]:
-        """One group of empty bodies."""
-        if len(offset):
-            yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
-
-    def fields(self, payload: Buffer) -> dict[str, object]:
-        """Nothing."""
-        return {}
-
-    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
-        """Nothing."""
-        return {}
-
-    def decode(self, payload: Buffer) -> object:
-        """Raise, since the payload cannot be decoded.
-
-        Raises:
-            DefinitionError: Always.
-        """
-        raise self._refusal()
-
-    def arrow(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> DecodedArrow:
+        fields: Collection[str] | None = None,
+    ) -> NoReturn:
         """Refuses.
 
         Raises:
             DefinitionError: Always.
         """
-        raise self._refusal()
+        raise DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")
 
-    def objects(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> DecodedObjects | None:
-        """None: there are no fields."""
-        return None
+    def decode(self, payload: Buffer) -> NoReturn:
+        """Refuses.
 
-    def _refusal(self) -> DefinitionError:
-        return DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")
+        Raises:
+            DefinitionError: Always.
+        """
+        self.columns(payload, NO_ROWS, NO_ROWS)
 
 
-def error_group(rows: NDArray[np.intp], error: str) -> BodyGroup:
-    """The group of unreadable payloads."""
-    return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
+def one_message(codec: Codec, payload: Buffer) -> Decoded:
+    """The columns of one message.
+
+    Raises:
+        PayloadError: The payload does not fit its definition.
+        DefinitionError: There is no definition to read it by.
+    """
+    size = np.array([memoryview(payload).nbytes], np.int64)
+    decoded = codec.columns(payload, np.zeros(1, np.int64), size)
+    if decoded.unreadable:
+        raise PayloadError(decoded.unreadable[0].reason)
+    return decoded
+
+
+def plain_message(
+    codec: Codec, payload: Buffer, names: Collection[str] | None = None
+) -> dict[str, object]:
+    """One message as plain values, for predicates; empty if nothing can be decoded.
+
+    Args:
+        codec: Its codec.
+        payload: The serialized message.
+        names: Fields of the top level that are needed, at least; None for all.
+
+    Raises:
+        PayloadError: The payload does not fit its definition.
+    """
+    return one_message(codec, payload).plain(names, whole=False)[0] if codec.indexed else {}
+
+
+def top_level_names(names: Collection[str]) -> list[str]:
+    """Names of the fields in the index document, where `_id` and `_meta` are reserved.
+
+    A field with such a name gets as many trailing underscores as make it unique.
+    """
+    spelled = []
+    for name in names:
+        if name in RESERVED:
+            while name in names:
+                name += "_"  # noqa: PLW2901
+        spelled.append(name)
+    return spelled

@@ -18,12 +18,11 @@ _MAX_NAME = 1000  # bytes
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
 
-def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:
+def codec_for(channel: Channel) -> Codec:
     """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
 
     Args:
         channel: The channel; its message encoding and schema determine the codec.
-        array_limit: Arrays of more elements are summarised in the index.
     """
     schema = channel.schema
     if schema is not None and has_hidden_fields(channel):
@@ -31,30 +30,30 @@ def codec_for(channel: Channel, *, array_limit: int = 32) -> Codec:
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "
             "has fields"
         )
-    return _codec(channel.message_encoding, schema, array_limit)
+    return _codec(channel.message_encoding, schema)
 
 
 @lru_cache(maxsize=1024)
-def _codec(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+def _codec(encoding: str, schema: Schema | None) -> Codec:
     try:
-        return _made(encoding, schema, array_limit)
+        return _made(encoding, schema)
     except DefinitionError as error:
         return OpaqueCodec(str(error))
 
 
-def _made(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+def _made(encoding: str, schema: Schema | None) -> Codec:
     if encoding == "json":
         from hybridlog.schema.json_codec import JsonCodec
 
-        return JsonCodec(array_limit)
+        return JsonCodec()
     if encoding == REDUCED:
         from hybridlog.schema.reduced_codec import ReducedCodec
 
         return ReducedCodec()
-    return _defined(encoding, schema, array_limit)
+    return _defined(encoding, schema)
 
 
-def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
+def _defined(encoding: str, schema: Schema | None) -> Codec:
     """The codec of messages that need a definition."""
     if encoding not in {"ros1", "cdr", "protobuf"}:
         named = f"encoding {encoding!r}" if encoding else "a message without an encoding"
@@ -68,11 +67,11 @@ def _defined(encoding: str, schema: Schema | None, array_limit: int) -> Codec:
     if (encoding, schema.encoding) in _ROS:
         from hybridlog.schema.ros_codec import RosCodec
 
-        return RosCodec(schema, "ros1" if encoding == "ros1" else "cdr", array_limit)
+        return RosCodec(schema, "ros1" if encoding == "ros1" else "cdr")
     if (encoding, schema.encoding) == ("protobuf", "protobuf"):
         from hybridlog.schema.protobuf_codec import ProtobufCodec
 
-        return ProtobufCodec(schema, array_limit)
+        return ProtobufCodec(schema)
     return OpaqueCodec(
         f"{schema.name}: encoding {encoding!r} with a definition in {schema.encoding!r} "
         "is stored and fetched, not indexed"

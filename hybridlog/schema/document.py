@@ -10,12 +10,13 @@ rows. Elements of lists of messages are rows, too, and need no special case.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from hybridlog.schema.codec import top_level_names
 from hybridlog.schema.column import LONG, Arrays, Records, Scalars, Strings, offsets, ranges, take
 from hybridlog.schema.summary import summarise
 
@@ -31,9 +32,6 @@ _SLAB = 32 << 20
 
 _UNROLL = 16
 """Rows per list element from which each element is written with separate operations."""
-
-
-_RESERVED = ("_id", "_meta")
 
 
 class Bodies(NamedTuple):
@@ -103,21 +101,6 @@ def _made(top: _Record, rows: NDArray[np.intp], width: NDArray[np.int64]) -> Ite
         size = len(part) * int(width[part[0]])
         yield Bodies(rows[part], out[begin : begin + size].reshape(len(part), -1))
         begin += size
-
-
-def top_level_names(names: Iterable[str]) -> list[str]:
-    """Names of the fields in the index document, where `_id` and `_meta` are reserved.
-
-    A field with such a name gets as many trailing underscores as make it unique.
-    """
-    given = list(names)
-    spelled = []
-    for name in given:
-        if name in _RESERVED:
-            while name in given:
-                name += "_"  # noqa: PLW2901
-        spelled.append(name)
-    return spelled
 
 
 def _spread(value: _Each, rows: int) -> NDArray[np.int64]:

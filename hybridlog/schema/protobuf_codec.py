@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-import struct
+from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, cast
 
-import bson
 from bson.int64 import Int64
 
+from hybridlog.schema.codec import top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
-from hybridlog.schema.document import top_level_names
-from hybridlog.schema.object_rows import (
-    Duration,
-    Nanoseconds,
-    arrow_of,
-    body_groups,
-    body_of,
-    objects_of,
-    payloads_of,
-    top,
-)
+from hybridlog.schema.objects import Duration, Nanoseconds, Objects, decode_each, top
 from hybridlog.schema.protobuf_fields import (
     TIMES,
     TYPES,
@@ -34,7 +24,7 @@ from hybridlog.schema.protobuf_fields import (
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection
     from collections.abc import Set as AbstractSet
 
     import numpy as np
@@ -45,8 +35,8 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects
-    from hybridlog.schema.object_rows import Plain
+    from hybridlog.schema.codec import Decoded
+    from hybridlog.schema.objects import Plain
     from hybridlog_storage.messages import Buffer, Schema
 
 _MAX_DEPTH = 32
@@ -78,7 +68,6 @@ class ProtobufCodec:
 
     Args:
         schema: Name of the type, and a `FileDescriptorSet` with its dependencies.
-        array_limit: Arrays of more elements are summarised in the index.
 
     Raises:
         DefinitionError: The package is missing, or the definition cannot be used.
@@ -87,9 +76,8 @@ class ProtobufCodec:
     indexed = True
     reason: str | None = None
 
-    def __init__(self, schema: Schema, array_limit: int) -> None:
+    def __init__(self, schema: Schema) -> None:
         self._name = schema.name
-        self._limit = array_limit
         self._class = _message_class(schema)
 
     def paths(self) -> list[FieldPath]:
@@ -98,58 +86,26 @@ class ProtobufCodec:
         _add_paths(found, self._class.DESCRIPTOR, "", [], within_array=False)
         return found
 
-    def bodies(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> Iterator[BodyGroup]:
-        """Index bodies; see `Codec.bodies`."""
-        return body_groups(map(self._body, payloads_of(buffer, offset, length)))
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None = None,
+    ) -> Decoded:
+        """Decode messages; see `Codec.columns`."""
 
-    def fields(self, payload: Buffer) -> dict[str, object]:
-        """The fields of this message in its index document."""
-        body = self._body(memoryview(payload))
-        if isinstance(body, PayloadError):
-            return {}
-        return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
+        def form(values: list[Message]) -> Objects:
+            return _Messages(values, fields, self._class.DESCRIPTOR)
 
-    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
-        """The message as plain values; `bytes` are their length, `{"n": 1024}`."""
-        return cast("dict[str, object]", top(_plain(self._parsed(memoryview(payload)))))
+        return decode_each(self.decode, form, buffer, offset, length)
 
-    def decode(self, payload: Buffer) -> object:
+    def decode(self, payload: Buffer) -> Message:
         """Decode the protobuf message.
 
         Raises:
             PayloadError: The payload is not of this type.
         """
-        return self._parsed(memoryview(payload))
-
-    def arrow(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> DecodedArrow:
-        """Fields as Arrow arrays of the types that the definition names; see `Codec.arrow`."""
-        from hybridlog.schema.arrow_protobuf import messages_array
-
-        def build(
-            messages: Sequence[Message], wanted: Sequence[Sequence[str]] | None
-        ) -> pa.StructArray:
-            return messages_array(self._class.DESCRIPTOR, messages, wanted)
-
-        return arrow_of(self._parsed, build, payloads_of(buffer, offset, length), fields)
-
-    def objects(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> DecodedObjects | None:
-        """The fields that are set, or that do not track whether they are; see `Codec.objects`."""
-        return objects_of(
-            lambda payload: top(_plain(self._parsed(payload), whole=True)),
-            payloads_of(buffer, offset, length),
-        )
-
-    def _parsed(self, payload: memoryview) -> Message:
         from google.protobuf.message import DecodeError
 
         message = self._class()
@@ -161,15 +117,28 @@ class ProtobufCodec:
             ) from error
         return message
 
-    def _body(self, payload: memoryview) -> bytes | PayloadError:
-        try:
-            message = self._parsed(payload)
-        except PayloadError as error:
-            return error
-        try:
-            return body_of(_plain(message), self._limit)
-        except PayloadError as error:
-            return PayloadError(f"the payload is {self._name}, but {error}")
+
+@dataclass(slots=True)
+class _Messages(Objects):
+    """Some protobuf messages.
+
+    Attributes:
+        descriptor: Their type.
+    """
+
+    descriptor: Descriptor | None = None
+
+    def plain(self, *, whole: bool) -> list[dict[str, object]]:
+        """The fields that are set, or that do not track whether they are."""
+        made = (top(_plain(message, whole=whole)) for message in self.values)
+        return cast("list[dict[str, object]]", list(made))
+
+    def arrow(self) -> pa.StructArray:
+        """Arrays of the types that the definition names."""
+        from hybridlog.schema.arrow_protobuf import messages_array
+
+        assert self.descriptor is not None
+        return messages_array(self.descriptor, self.values, self.wanted())
 
 
 def _message_class(schema: Schema) -> type[Message]:
@@ -263,7 +232,7 @@ def _standard_file(name: str) -> FileDescriptorProto:
     return FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
 
 
-def _plain(message: Message, *, whole: bool = False) -> dict[str, Plain]:
+def _plain(message: Message, *, whole: bool) -> dict[str, Plain]:
     """A message as a plain object, its fields in the order of the definition.
 
     Args:

@@ -13,22 +13,23 @@ from __future__ import annotations
 import hashlib
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, NoReturn
 
-import bson
 import numpy as np
 from bson.errors import BSONError
 
-from hybridlog.schema.object_rows import arrow_of, body_groups, objects_of, payloads_of
+from hybridlog.schema.index_bodies import document_of, index_bodies
+from hybridlog.schema.objects import Objects, decode_each
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED, Channel
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import BodyGroup, Codec, DecodedArrow, DecodedObjects
+    from hybridlog.schema.codec import Codec, Decoded
     from hybridlog.schema.definition import FieldPath
     from hybridlog_storage.messages import Buffer
 
@@ -70,10 +71,8 @@ def reduce(codec: Codec, payload: bytes) -> bytes:
     """
     head = _HEAD.pack(len(payload), hashlib.sha256(payload).digest())
     one = np.zeros(1, np.int64)
-    for group in codec.bodies(payload, one, one + len(payload)):
-        if group.error is None:
-            return head + bytes(group.body[0])
-    return head
+    group = next(index_bodies(codec, payload, one, one + len(payload)))
+    return head + group.body.tobytes()
 
 
 def remains_of(payload: Buffer) -> Remains:
@@ -88,7 +87,10 @@ def remains_of(payload: Buffer) -> Remains:
 
 
 class ReducedCodec:
-    """Codec of reduced messages."""
+    """Codec of reduced messages: their values are those of the index documents.
+
+    Integers are int64, and arrays over the limit are summaries.
+    """
 
     indexed = True
     reason: str | None = None
@@ -97,22 +99,17 @@ class ReducedCodec:
         """No fields of its own: the fields are those of complete messages."""
         return []
 
-    def bodies(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> Iterator[BodyGroup]:
-        """Index bodies; see `Codec.bodies`."""
-        return body_groups(map(_body, payloads_of(buffer, offset, length)))
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None = None,
+    ) -> Decoded:
+        """Decode the stored fields; see `Codec.columns`."""
+        return decode_each(_fields_in, partial(Objects, fields=fields), buffer, offset, length)
 
-    def fields(self, payload: Buffer) -> dict[str, object]:
-        """The fields of this message in its index document."""
-        body = _body(memoryview(payload))
-        return {} if isinstance(body, PayloadError) else _document(body)
-
-    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
-        """The stored fields; long arrays are summaries."""
-        return self.fields(payload)
-
-    def decode(self, payload: Buffer) -> object:
+    def decode(self, payload: Buffer) -> NoReturn:
         """Raise, since the payload cannot be decoded.
 
         Raises:
@@ -121,45 +118,10 @@ class ReducedCodec:
         remains = remains_of(payload)
         raise PayloadError(f"{_GIVEN_UP} ({remains.size} bytes, SHA-256 {remains.sha256.hex()})")
 
-    def arrow(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> DecodedArrow:
-        """The values of the index documents, as Arrow arrays; see `Codec.arrow`.
 
-        Integers are int64, and arrays over the limit are summaries.
-        """
-        from hybridlog.schema.arrow_objects import objects_array
-
-        return arrow_of(_fields, objects_array, payloads_of(buffer, offset, length), fields)
-
-    def objects(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> DecodedObjects | None:
-        """The values of the index documents."""
-        return objects_of(_fields, payloads_of(buffer, offset, length))
-
-
-def _fields(payload: memoryview) -> dict[str, object]:
-    body = _body(payload)
-    if isinstance(body, PayloadError):
-        raise body
-    return _document(body)
-
-
-def _document(body: bytes) -> dict[str, object]:
-    return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
-
-
-def _body(payload: memoryview) -> bytes | PayloadError:
+def _fields_in(payload: memoryview) -> dict[str, object]:
     try:
         remains_of(payload)
-        body = bytes(payload[_HEAD.size :])
-        # The elements go into the index unchanged, so they must be valid.
-        _document(body)
+        return document_of(bytes(payload[_HEAD.size :]))
     except (BSONError, PayloadError) as error:
-        return PayloadError(f"the payload is not a reduced message: {error}")
-    return body
+        raise PayloadError(f"the payload is not a reduced message: {error}") from error

@@ -9,11 +9,6 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, cast
 
-import bson
-import numpy as np
-
-from hybridlog.schema.codec import BodyGroup, DecodedArrow, DecodedObjects, error_group
-from hybridlog.schema.column import header_stamps, row_of
 from hybridlog.schema.definition import (
     ArrayOf,
     FieldPath,
@@ -25,22 +20,21 @@ from hybridlog.schema.definition import (
     parse_definition,
     paths,
 )
-from hybridlog.schema.document import TooLarge, bodies, top_level_names
-from hybridlog.schema.wire import Decoded, WireReader
+from hybridlog.schema.wire import WireReader
 from hybridlog.schema.wire_scan import MisfitError
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.forks import taken_by_forks
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection
 
+    import numpy as np
     from numpy.typing import NDArray
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
+    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.messages import Buffer, Schema
 
-_NONE = np.empty(0, np.intp)
-_MAX_BYTES = 8 << 20
 _MAX_UNROLLED = 10_000
 """Most elements of fixed arrays of strings and messages that rosbags unrolls into code."""
 
@@ -56,7 +50,6 @@ class RosCodec:
     Args:
         schema: Their definition.
         wire: Their format.
-        array_limit: Arrays of more elements are summarised in the index.
 
     Raises:
         DefinitionError: The definition cannot be used.
@@ -65,10 +58,9 @@ class RosCodec:
     indexed = True
     reason: str | None = None
 
-    def __init__(self, schema: Schema, wire: Literal["ros1", "cdr"], array_limit: int) -> None:
+    def __init__(self, schema: Schema, wire: Literal["ros1", "cdr"]) -> None:
         self._name = schema.name
         self._wire: Literal["ros1", "cdr"] = wire
-        self._limit = array_limit
         self._type = parse_definition(schema)
         self._paths = paths(self._type)
         self._reader = WireReader(self._type, wire)
@@ -78,43 +70,6 @@ class RosCodec:
     def paths(self) -> list[FieldPath]:
         """All fields, in the order of the definition."""
         return self._paths
-
-    def bodies(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> Iterator[BodyGroup]:
-        """Index bodies; see `Codec.bodies`."""
-        decoded = self._reader.read(buffer, offset, length)
-        stamps = header_stamps(decoded.records)
-        for group in bodies(decoded.records, array_limit=self._limit, max_bytes=_MAX_BYTES):
-            rows = decoded.rows[group.rows]
-            if isinstance(group, TooLarge):
-                text = f"the fields of {self._name} take more than {_MAX_BYTES >> 20} MiB"
-                yield error_group(rows, text)
-            else:
-                own = None if stamps is None else stamps[group.rows]
-                surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else _NONE
-                yield BodyGroup(rows, group.body, None, own, surplus)
-        for bad in decoded.unreadable:
-            text = f"the payload does not fit {self._name}: {bad.reason}"
-            yield error_group(bad.rows, text)
-
-    def fields(self, payload: Buffer) -> dict[str, object]:
-        """The fields of this message in its index document."""
-        start, size = np.zeros(1, np.int64), np.array([memoryview(payload).nbytes], np.int64)
-        (group,) = self.bodies(payload, start, size)
-        body = group.body.tobytes()
-        return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
-
-    def plain(self, payload: Buffer, names: Collection[str] | None = None) -> dict[str, object]:
-        """The message as plain values; see `Codec.plain`."""
-        start, size = np.zeros(1, np.int64), np.array([memoryview(payload).nbytes], np.int64)
-        decoded = self.columns(payload, start, size, None)
-        if decoded.unreadable:
-            reason = decoded.unreadable[0].reason
-            raise PayloadError(f"the payload does not fit {self._name}: {reason}")
-        columns = decoded.records.fields
-        spelled = zip(top_level_names(columns), columns.values(), strict=True)
-        return {n: row_of(column, 0) for n, column in spelled if names is None or n in names}
 
     def decode(self, payload: Buffer) -> object:
         """Decode the message with rosbags: fields as attributes, arrays as numpy views.
@@ -139,30 +94,14 @@ class RosCodec:
         buffer: Buffer,
         offset: NDArray[np.int64],
         length: NDArray[np.int64],
-        fields: Collection[str] | None,
+        fields: Collection[str] | None = None,
     ) -> Decoded:
-        """Fields as columns; see `Codec.columns`."""
+        """Decode messages; see `Codec.columns`."""
         reader = self._reader if fields is None else self._selecting(frozenset(fields))
-        return reader.read(buffer, offset, length)
-
-    def arrow(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None,
-    ) -> DecodedArrow:
-        """Fields as Arrow arrays over the columns; see `Codec.arrow`."""
-        from hybridlog.schema.arrow_columns import records_array
-
-        decoded = self.columns(buffer, offset, length, fields)
-        return DecodedArrow(decoded.rows, records_array(decoded.records), decoded.unreadable)
-
-    def objects(
-        self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]
-    ) -> DecodedObjects | None:
-        """None: every message has every field."""
-        return None
+        decoded = reader.read(buffer, offset, length)
+        for bad in decoded.unreadable:
+            bad.reason = f"the payload does not fit {self._name}: {bad.reason}"
+        return decoded
 
     def _reader_of(self, fields: frozenset[str]) -> WireReader:
         return WireReader(self._type, self._wire, fields)

@@ -26,8 +26,8 @@ def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.
     Returns:
         Rows of the messages that have a stamp, and the stamps, ns.
     """
-    decoded = codec.arrow(batch.buffer, batch.offset, batch.length, {STAMP})
-    found = stamp_array(decoded.records)
+    decoded = codec.columns(batch.buffer, batch.offset, batch.length, {STAMP})
+    found = stamp_array(decoded.arrow())
     if found is None:
         return np.empty(0, np.intp), np.empty(0, np.int64)
     there = found.is_valid().to_numpy(zero_copy_only=False)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from hybridlog.schema.codec import NO_ROWS, Decoded, Unreadable
 from hybridlog.schema.column import Records, concatenate, take
 from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
@@ -40,36 +41,6 @@ _OTHER_ENCAPSULATIONS = {
     0x000A: "XCDR2 (parameter list)",
     0x000B: "XCDR2 (parameter list)",
 }
-
-
-@dataclass(slots=True)
-class Unreadable:
-    """Rows that do not fit the definition, all for the same reason.
-
-    Attributes:
-        rows: Rows of the input, ascending.
-        reason: The problem and its place, without the topic or the file.
-    """
-
-    rows: NDArray[np.intp]
-    reason: str
-
-
-@dataclass(slots=True)
-class Decoded:
-    """The result of reading.
-
-    Attributes:
-        rows: Readable rows of the input, ascending.
-        records: Their columns; as many rows as `rows`.
-        unreadable: The other rows, each in one of these.
-        surplus: Readable rows with bytes left over behind the message, ascending.
-    """
-
-    rows: NDArray[np.intp]
-    records: Records
-    unreadable: list[Unreadable]
-    surplus: NDArray[np.intp]
 
 
 @dataclass(slots=True)
@@ -132,7 +103,7 @@ class WireReader:
         else:
             good, records = self._read_cdr(buffer, rows, offset, end, odd)
         unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
-        surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else np.empty(0, np.intp)
+        surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else NO_ROWS
         return Decoded(good, records, unreadable, surplus)
 
     def message_in(self, payload: Buffer) -> memoryview:

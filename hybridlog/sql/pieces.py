@@ -279,13 +279,12 @@ class _ChunkRows:
             piece.state = REDUCED
         elif channel.codec.indexed:
             wanted = None if paths is None else {*paths, "header.stamp"}
-            decoded = channel.codec.arrow(chunk.batch.buffer, messages.at, messages.length, wanted)
+            data = chunk.batch.buffer
+            decoded = channel.codec.columns(data, messages.at, messages.length, wanted)
             counts.payload_bytes += int(messages.length.sum())
-            name = channel.channel.schema.name if channel.channel.schema is not None else ""
-            for bad in decoded.unreadable:
-                piece.errors.append((bad.rows, f"the payload does not fit {name}: {bad.reason}"))
+            piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
             if len(decoded.rows):
-                records = without(decoded.records, decoded.rows, count)
+                records = without(decoded.arrow(), decoded.rows, count)
         segment = np.full(count, self._segment, np.int32)
         publishes = {channel.channel_id: channel.channel.has_publish_time}
         fields = records if records.type.num_fields else None

@@ -471,9 +471,9 @@ def _from_payloads(
         if records is None:
             chunk = recording.chunk(*place, counts)
             buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]
-            decoded = own.codec.arrow(buffer, at, length, paths)
+            decoded = own.codec.columns(buffer, at, length, paths)
             counts.payload_bytes += int(length.sum())
-            records, good = decoded.records, decoded.rows
+            records, good = decoded.arrow(), decoded.rows
         for key, leaf in leaves.items():
             values = _at(records, leaf.source)
             if values is None:

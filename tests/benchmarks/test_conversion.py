@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from benchmarks.backends.conversion import converter_for, iso_text, without_nul
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.index_bodies import index_fields
 from hybridlog.sources.detect import open_source
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -258,7 +259,7 @@ def test_real_messages_say_what_hybridlog_reads_in_them(log: str) -> None:
                 channel = source.channels[int(batch.channel[row])]
                 payload = bytes(batch.payload(row))
                 document = converter_for(channel).document(T, payload)
-                for name, value in codec_for(channel).fields(payload).items():
+                for name, value in index_fields(codec_for(channel), payload).items():
                     if isinstance(value, bool | int | float | str) and not isinstance(
                         document[name], dict
                     ):

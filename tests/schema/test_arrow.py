@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog.schema.codec import Codec, Decoded, OpaqueCodec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DefinitionError
@@ -25,11 +25,15 @@ CASES = Path(__file__).parents[1] / "cases"
 JSON = codec_for(Channel("/t", "json", None))
 
 
-def arrow_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Any:
+def decoded_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Decoded:
     length = np.array([len(p) for p in payloads], np.int64)
-    decoded = codec.arrow(b"".join(payloads), np.cumsum(length) - length, length, fields)
-    decoded.records.validate(full=True)
-    return decoded
+    return codec.columns(b"".join(payloads), np.cumsum(length) - length, length, fields)
+
+
+def arrow_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None) -> Any:
+    records = decoded_of(codec, payloads, fields).arrow()
+    records.validate(full=True)
+    return records
 
 
 def messages_of(name: str) -> dict[str, tuple[Channel, list[bytes]]]:
@@ -77,10 +81,10 @@ def same(one: Any, other: Any) -> bool:
 
 def test_json_integers_are_exact_whatever_is_missing() -> None:
     for channel, payloads in messages_of("json_int64_missing.mcap").values():
-        records = arrow_of(codec_for(channel), payloads).records
+        records = arrow_of(codec_for(channel), payloads)
         for found, payload in zip(records.to_pylist(), payloads, strict=True):
             check(records.type, found, json.loads(payload))
-    records = arrow_of(JSON, messages_of("json_int64_missing.mcap")["/j"][1]).records
+    records = arrow_of(JSON, messages_of("json_int64_missing.mcap")["/j"][1])
     assert records.field("t_ns").type == pa.int64()
     assert records.field("t_ns").to_pylist() == [1700000000123456789, None, 1700000000123456790]
 
@@ -88,10 +92,10 @@ def test_json_integers_are_exact_whatever_is_missing() -> None:
 def test_json_missing_and_null_are_null_and_empty_is_empty() -> None:
     seen = messages_of("json_optional_keys.mcap")
     for channel, payloads in seen.values():
-        records = arrow_of(codec_for(channel), payloads).records
+        records = arrow_of(codec_for(channel), payloads)
         for found, payload in zip(records.to_pylist(), payloads, strict=True):
             check(records.type, found, json.loads(payload))
-    types = {name: arrow_of(JSON, payloads).records.type for name, (_, payloads) in seen.items()}
+    types = {name: arrow_of(JSON, payloads).type for name, (_, payloads) in seen.items()}
     assert types["/opt"].field("ok").type == pa.bool_()
     assert types["/opt"].field("n").type == pa.int64()
     assert types["/opt"].field("list").type == pa.list_(pa.int64())
@@ -106,7 +110,7 @@ def test_json_numbers() -> None:
         b'{"i": -9223372036854775808, "u": 0, "f": 0.5, "n": 1.5, "big": 1}',
         b'{"u": null, "f": 9007199254740992, "n": null, "big": -1, "z": []}',
     ]
-    records = arrow_of(JSON, rows).records
+    records = arrow_of(JSON, rows)
     assert records.field("i").to_pylist() == [1, -(1 << 63), None]
     assert records.field("u").type == pa.uint64()
     assert records.field("u").to_pylist() == [(1 << 64) - 1, 0, None]
@@ -123,7 +127,7 @@ def test_json_numbers() -> None:
 
 def test_json_text_is_json_also_of_nan_and_surrogates() -> None:
     rows = [b'{"v": [NaN, Infinity, "a"]}', b'{"v": "\\ud800"}', b'{"v": {"k": -Infinity}}']
-    texts = arrow_of(JSON, rows).records.field("v").to_pylist()
+    texts = arrow_of(JSON, rows).field("v").to_pylist()
     assert [json.loads(text, parse_constant=pytest.fail) for text in texts] == [
         ["NaN", "Infinity", "a"],
         "\ufffd",
@@ -145,17 +149,16 @@ JSON_VALUES = st.recursive(
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.dictionaries(st.sampled_from("xyz"), JSON_VALUES), min_size=1, max_size=5))
 def test_any_json_is_exact(rows: list[dict[str, Any]]) -> None:
-    decoded = arrow_of(JSON, [json.dumps(row).encode() for row in rows])
-    assert decoded.rows.tolist() == list(range(len(rows)))
-    for found, row in zip(decoded.records.to_pylist(), rows, strict=True):
-        check(decoded.records.type, found, row)
+    records = arrow_of(JSON, [json.dumps(row).encode() for row in rows])
+    for found, row in zip(records.to_pylist(), rows, strict=True):
+        check(records.type, found, row)
 
 
 def test_json_rows_that_cannot_be_read_and_values_that_are_no_objects() -> None:
-    decoded = arrow_of(JSON, [b'{"a": 1}', b"broken", b"[2]", b"null"])
+    decoded = decoded_of(JSON, [b'{"a": 1}', b"broken", b"[2]", b"null"])
     assert decoded.rows.tolist() == [0, 2, 3]
     assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
-    assert decoded.records.to_pylist() == [
+    assert decoded.arrow().to_pylist() == [
         {"a": 1, "value": None},
         {"a": None, "value": [2]},
         {"a": None, "value": None},
@@ -164,12 +167,12 @@ def test_json_rows_that_cannot_be_read_and_values_that_are_no_objects() -> None:
 
 def test_chosen_fields() -> None:
     rows = [b'{"a": {"x": 1, "y": 2}, "b": 3, "c": [{"d": 1, "e": 2}], "_id": 7}', b'{"b": 4}']
-    chosen = arrow_of(JSON, rows, {"a.x", "c[].d", "_id_"}).records
+    chosen = arrow_of(JSON, rows, {"a.x", "c[].d", "_id_"})
     assert chosen.to_pylist() == [
         {"a": {"x": 1}, "c": [{"d": 1}], "_id_": 7},
         {"a": None, "c": None, "_id_": None},
     ]
-    assert arrow_of(JSON, rows, {"a"}).records.field("a").to_pylist() == [{"x": 1, "y": 2}, None]
+    assert arrow_of(JSON, rows, {"a"}).field("a").to_pylist() == [{"x": 1, "y": 2}, None]
 
 
 def test_protobuf_is_whole() -> None:
@@ -184,7 +187,7 @@ def test_protobuf_is_whole() -> None:
         for _, channel, _, message in reader.iter_decoded_messages():
             objects.setdefault(channel.topic, []).append(message)
     for topic, (channel, payloads) in messages_of("foxglove_protobuf.mcap").items():
-        records = arrow_of(codec_for(channel), payloads).records
+        records = arrow_of(codec_for(channel), payloads)
         for found, message in zip(records.to_pylist(), objects[topic], strict=True):
             for name in ("data", "width", "height", "line", "point_stride", "message"):
                 if hasattr(message, name):
@@ -203,7 +206,7 @@ def test_protobuf_is_whole() -> None:
                 }
     assert seen > 10
     image = messages_of("foxglove_protobuf.mcap")["/raw"]
-    kinds = arrow_of(codec_for(image[0]), image[1]).records.type
+    kinds = arrow_of(codec_for(image[0]), image[1]).type
     assert kinds.field("width").type == pa.uint32()
     assert kinds.field("data").type == pa.binary()
 
@@ -212,7 +215,7 @@ def test_protobuf_types_that_writers_leave_out() -> None:
     ((channel, payloads),) = messages_of("pb_std_imports_missing.mcap").values()
     codec = codec_for(channel)
     assert codec.reason is None
-    records = arrow_of(codec, payloads).records
+    records = arrow_of(codec, payloads)
     first = records[0].as_py()
     assert first["speed"] == {"value": 2.5}
     assert first["n"] == 7
@@ -247,7 +250,7 @@ def test_protobuf_presence_maps_and_extremes() -> None:
     ]
     schema = Schema("t.M", "protobuf", FileDescriptorSet(file=[file]).SerializeToString())
     codec = codec_for(Channel("/t", "protobuf", schema))
-    records = arrow_of(codec, [row.SerializeToString() for row in rows]).records
+    records = arrow_of(codec, [row.SerializeToString() for row in rows])
     first, second = records.to_pylist()
     assert first["u"] == (1 << 64) - 1
     assert first["s"] == ""
@@ -260,7 +263,7 @@ def test_protobuf_presence_maps_and_extremes() -> None:
     assert second["l"][0]["u"] == 1
     assert second["l"][1]["m"]["m"]["u"] == 2
     assert first["_id_"] == -1
-    assert arrow_of(codec, [], {"u", "m.s"}).records.type.field("u").type == pa.uint64()
+    assert arrow_of(codec, [], {"u", "m.s"}).type.field("u").type == pa.uint64()
 
 
 def test_ros_is_what_rosbags_reads() -> None:
@@ -270,7 +273,7 @@ def test_ros_is_what_rosbags_reads() -> None:
     ((channel, payloads),) = messages_of("uint64_extremes.mcap").values()
     assert channel.schema is not None
     store.register(get_types_from_msg(channel.schema.data.decode(), channel.schema.name))
-    records = arrow_of(codec_for(channel), payloads).records
+    records = arrow_of(codec_for(channel), payloads)
     kinds = records.type
     assert kinds.field("big").type == pa.uint64()
     assert kinds.field("stamp").type == pa.timestamp("ns", "UTC")
@@ -295,7 +298,7 @@ def test_ros_is_what_rosbags_reads() -> None:
 
 def test_empty_clouds_are_empty_lists() -> None:
     ((channel, payloads),) = messages_of("clouds_mixed_empty.mcap").values()
-    data = arrow_of(codec_for(channel), payloads).records.field("data")
+    data = arrow_of(codec_for(channel), payloads).field("data")
     assert data.null_count == 0
     assert len(data[0]) == 0
     assert max(len(row) for row in data) > 0
@@ -304,7 +307,7 @@ def test_empty_clouds_are_empty_lists() -> None:
 def test_ros_numbers_are_not_copied_and_outlive_their_column() -> None:
     codec = codec_for(Channel("/t", "ros1", Schema("p/T", "ros1msg", b"float64 x\nbool[2] b")))
     payloads = [np.array([x]).tobytes() + b"\1\0" for x in (1.5, math.nan)]
-    records = arrow_of(codec, payloads).records
+    records = arrow_of(codec, payloads)
     assert records.field("x")[0].as_py() == 1.5
     assert math.isnan(records.field("x")[1].as_py())
     assert records.field("b").to_pylist() == [[True, False]] * 2
@@ -314,9 +317,9 @@ def test_messages_without_fields_have_rows() -> None:
     codec = codec_for(Channel("/t", "ros1", Schema("std_msgs/Empty", "ros1msg", b"")))
     if isinstance(codec, OpaqueCodec):
         pytest.skip("a definition without text is no definition here")
-    assert len(arrow_of(codec, [b"", b""]).records) == 2
-    assert len(arrow_of(JSON, [b"{}", b"{}"]).records) == 2
-    assert arrow_of(JSON, [b'{"m": {}}', b"{}"]).records.to_pylist() == [{"m": {}}, {"m": None}]
+    assert len(arrow_of(codec, [b"", b""])) == 2
+    assert len(arrow_of(JSON, [b"{}", b"{}"])) == 2
+    assert arrow_of(JSON, [b'{"m": {}}', b"{}"]).to_pylist() == [{"m": {}}, {"m": None}]
 
 
 def test_reduced_messages_have_what_the_index_has() -> None:
@@ -325,10 +328,10 @@ def test_reduced_messages_have_what_the_index_has() -> None:
     )
     payload = struct.pack("<I100fiI1sII", 100, *range(100), 7, 1, b"x", 5, 6)
     codec = codec_for(reduced_channel(channel))
-    decoded = arrow_of(codec, [reduce(codec_for(channel), payload), b"short"])
+    decoded = decoded_of(codec, [reduce(codec_for(channel), payload), b"short"])
     assert decoded.rows.tolist() == [0]
     assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
-    (row,) = decoded.records.to_pylist()
+    (row,) = decoded.arrow().to_pylist()
     assert row["r"] == {"n": 100, "min": 0.0, "max": 99.0, "mean": 49.5}
     assert (row["n"], row["s"], row["t"]) == (7, "x", 5 * 10**9 + 6)
 

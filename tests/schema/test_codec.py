@@ -27,8 +27,9 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog.schema.codec import Codec, OpaqueCodec, plain_message
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.index_bodies import index_bodies, index_fields
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -104,7 +105,7 @@ def joined(payloads: list[bytes]) -> tuple[bytes, np.ndarray, np.ndarray]:  # ty
 
 def bodies_of(codec: Codec, payloads: list[bytes]) -> list[bytes | str]:
     found: dict[int, bytes | str] = {}
-    for group in codec.bodies(*joined(payloads)):
+    for group in index_bodies(codec, *joined(payloads)):
         assert len(group.rows) == len(group.body)
         if group.error is not None:
             assert group.body.shape[1] == 0
@@ -205,7 +206,7 @@ def test_bodies_fields_and_objects_of_real_logs(file: str) -> None:
             compared += 1
         for payload, body in zip(payloads[:3], bodies[:3], strict=True):
             assert isinstance(body, bytes)
-            assert bson.encode(codec.fields(payload)) == document_of(body)
+            assert bson.encode(index_fields(codec, payload)) == document_of(body)
             assert same_object(codec.decode(memoryview(payload)), read(payload, name))
     assert compared > 0
 
@@ -313,7 +314,7 @@ def test_random_types_through_rosbags(definition: tuple[int, str], data: st.Data
     for payload, body in zip(payloads, bodies_of(codec, payloads), strict=True):
         plain = {k.removesuffix("_"): v for k, v in vars(read(payload, "pkg/msg/Outer")).items()}
         check(body, record_with(plain, store, ros))
-        assert bson.encode(codec.fields(payload)) == document_of(body)  # type: ignore[arg-type]
+        assert bson.encode(index_fields(codec, payload)) == document_of(body)  # type: ignore[arg-type]
 
 
 def times_in(message: Any) -> Iterator[Any]:
@@ -357,7 +358,7 @@ def ros1(text: str, name: str = "pkg/T") -> Codec:
 def test_invalid_utf8_is_mended_in_the_index() -> None:
     codec = ros1("string s\nuint8 v")
     payload = b"\x03\0\0\0a\xff\xc3\x07"
-    assert codec.fields(payload) == {"s": "a\ufffd\ufffd", "v": 7}
+    assert index_fields(codec, payload) == {"s": "a\ufffd\ufffd", "v": 7}
     with pytest.raises(PayloadError, match=r"\.raw"):
         codec.decode(payload)
 
@@ -369,10 +370,10 @@ def test_payloads_that_do_not_fit_are_errors_and_the_others_are_read() -> None:
     assert [isinstance(b, bytes) for b in bodies] == [True, False, True, False, True]
     for row in (1, 3):
         assert "pkg/T" in str(bodies[row])
-    assert codec.fields(b"short") == {}
+    assert index_fields(codec, b"short") == {}
     with pytest.raises(PayloadError, match="pkg/T"):
         codec.decode(b"short")
-    decoded = codec.arrow(*joined([good, b"short"]), None)
+    decoded = codec.columns(*joined([good, b"short"]))
     assert decoded.rows.tolist() == [0]
 
 
@@ -383,16 +384,16 @@ def test_a_document_past_8_mib_is_an_error() -> None:
     bodies = bodies_of(codec, [huge, small])
     assert "8 MiB" in str(bodies[0])
     check(bodies[1], {"s": "x", "v": 0})
-    assert codec.fields(huge) == {}
+    assert index_fields(codec, huge) == {}
 
 
 def test_no_rows_at_all() -> None:
     nothing = joined([])
     for codec in (ros1("string s"), codec_for(Channel("/t", "json", None)), OpaqueCodec("x")):
-        assert list(codec.bodies(*nothing)) == []
-    decoded = ros1("string s\nfloat64 x").arrow(*nothing, None)
-    assert [field.name for field in decoded.records.type] == ["s", "x"]
-    assert len(codec_for(Channel("/t", "json", None)).arrow(*nothing, None).records) == 0
+        assert list(index_bodies(codec, *nothing)) == []
+    decoded = ros1("string s\nfloat64 x").columns(*nothing)
+    assert [field.name for field in decoded.arrow().type] == ["s", "x"]
+    assert len(codec_for(Channel("/t", "json", None)).columns(*nothing).records) == 0
 
 
 def test_big_arrays_of_objects_are_views() -> None:
@@ -415,7 +416,7 @@ def test_objects_of_payloads_with_bytes_left_over(surplus: bytes) -> None:
         assert (found.s, found.n) == ("hi", 9)
     with pytest.raises(PayloadError, match="does not fit"):
         plain.decode(b"\x02\0\0\0\x07\x08\x01")
-    for group in plain.bodies(b"\0\0\0\0\1\2" + surplus, np.zeros(2, int), np.array([6, 7])):
+    for group in index_bodies(plain, b"\0\0\0\0\1\2" + surplus, np.zeros(2, int), np.array([6, 7])):
         assert group.surplus.tolist() == [1]
 
 
@@ -428,11 +429,11 @@ def test_arrays_without_elements() -> None:
     payload = struct.pack("<BI2bh", 7, 2, 1, 2, -3)
     inner = [{"z": [], "w": 1}, {"z": [], "w": 2}]
     wanted = {"a": [], "b": 7, "c": [], "d": [], "e": [], "f": inner, "g": [], "h": -3}
-    assert codec.plain(payload) == wanted
+    assert plain_message(codec, payload) == wanted
     for count in (1, 20):
         length = np.full(count, len(payload))
-        found = codec.arrow(payload * count, np.arange(count) * len(payload), length, None)
-        table = pa.Table.from_struct_array(found.records)
+        found = codec.columns(payload * count, np.arange(count) * len(payload), length)
+        table = pa.Table.from_struct_array(found.arrow())
         stream = io.BytesIO()
         pq.write_table(table, stream)
         assert pq.read_table(stream).to_pylist() == table.to_pylist() == [wanted] * count
@@ -467,12 +468,12 @@ def test_what_cannot_be_read_is_opaque_and_says_why(
     assert not codec.indexed
     assert reason in str(codec.reason)
     assert bodies_of(codec, [b"abc", b""]) == [b"", b""]
-    assert codec.fields(b"abc") == {}
+    assert index_fields(codec, b"abc") == {}
     assert codec.paths() == []
     with pytest.raises(DefinitionError, match="raw"):
         codec.decode(b"abc")
     with pytest.raises(DefinitionError):
-        codec.arrow(*joined([b"abc"]), None)
+        codec.columns(*joined([b"abc"]))
 
 
 def test_codecs_are_shared() -> None:
@@ -480,13 +481,14 @@ def test_codecs_are_shared() -> None:
     one = codec_for(Channel("/a", "ros1", schema))
     two = codec_for(Channel("/b", "ros1", Schema("pkg/T", "ros1msg", b"int32 x")))
     assert one is two
-    assert codec_for(Channel("/a", "ros1", schema), array_limit=5) is not one
 
 
 def test_array_limit() -> None:
     schema = Schema("pkg/T", "ros1msg", b"uint8[3] a")
-    codec = codec_for(Channel("/a", "ros1", schema), array_limit=2)
-    assert codec.fields(b"\x01\x02\x06") == {"a": {"n": 3, "min": 1, "max": 6, "mean": 3.0}}
+    codec = codec_for(Channel("/a", "ros1", schema))
+    assert index_fields(codec, b"\x01\x02\x06", array_limit=2) == {
+        "a": {"n": 3, "min": 1, "max": 6, "mean": 3.0}
+    }
 
 
 def test_objects_of_hostile_definitions() -> None:
@@ -516,8 +518,8 @@ def indexed(text: str | bytes) -> dict[str, object]:
     payload = text.encode() if isinstance(text, str) else text
     (body,) = bodies_of(JSON, [payload])
     assert isinstance(body, bytes), body
-    assert bson.encode(JSON.fields(payload)) == document_of(body)
-    return JSON.fields(payload)
+    assert bson.encode(index_fields(JSON, payload)) == document_of(body)
+    return index_fields(JSON, payload)
 
 
 plain = st.recursive(
@@ -612,7 +614,7 @@ def test_json_that_cannot_be_indexed(payload: bytes, why: str) -> None:
     assert why in bodies[1]
     check(bodies[0], {"a": 1})
     check(bodies[2], {"b": 2})
-    assert JSON.fields(payload) == {}
+    assert index_fields(JSON, payload) == {}
     if why == "not JSON":
         with pytest.raises(PayloadError):
             JSON.decode(payload)
@@ -771,7 +773,7 @@ def test_protobuf_rules() -> None:
     message.map["b"] = 1
     message.map["a"] = 2
     payload = message.SerializeToString()
-    found = codec.fields(payload)
+    found = index_fields(codec, payload)
     assert found["stamp"] == 1_700_000_000_000_000_005
     assert type(found["stamp"]) is Int64
     assert found["took"] == -1_000_000_500
@@ -805,10 +807,11 @@ def test_protobuf_rules() -> None:
     assert types["child"] == "t.All"
     assert "child.child" not in types
     assert types["_id_"] == "int32"
-    decoded = codec.arrow(*joined([payload, b""]), {"stamp", "double_3", "int32_1"})
-    stamps = decoded.records.field("stamp").view("int64").to_pylist()
+    wanted = {"stamp", "double_3", "int32_1"}
+    records = codec.columns(*joined([payload, b""]), wanted).arrow()
+    stamps = records.field("stamp").view("int64").to_pylist()
     assert stamps == [1_700_000_000_000_000_005, None]
-    assert [len(row) for row in decoded.records.field("double_3").to_pylist()] == [33, 0]
+    assert [len(row) for row in records.field("double_3").to_pylist()] == [33, 0]
 
 
 @needs_data
@@ -824,7 +827,7 @@ def test_protobuf_of_real_logs(file: str) -> None:
         codec = codec_for(channel)
         assert codec.indexed, codec.reason
         for payload in payloads:
-            fields = codec.fields(payload)
+            fields = index_fields(codec, payload)
             message: Any = codec.decode(payload)
             mapped = MessageToDict(
                 message, preserving_proto_field_name=True, use_integers_for_enums=True

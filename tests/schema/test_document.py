@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlog.schema import document
+from hybridlog.schema.codec import top_level_names
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
-from hybridlog.schema.document import Bodies, TooLarge, bodies, top_level_names
+from hybridlog.schema.document import Bodies, TooLarge, bodies
 
 LIMIT = 4
 DTYPES = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]

@@ -76,22 +76,18 @@ class PayloadScan:
         """Fields of the messages of a plan, in order."""
         for channel, run in self._by_channel(plan):
             batch = run.batch
-            decoded = channel.codec.arrow(batch.buffer, batch.offset, batch.length, fields)
+            decoded = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
             good = decoded.rows
             self._counters.unreadable += len(batch) - len(good)
-            yield Values(batch.log_time[good], run.seq[good], decoded.records)
+            yield Values(batch.log_time[good], run.seq[good], decoded.arrow())
 
     def objects_of(self, plan: ScanPlan) -> Iterator[Objects]:
         """The messages of a plan as plain objects, in order."""
-        from hybridlog.schema.object_rows import objects_of, payloads_of
-
         for channel, run in self._by_channel(plan):
-            where = run.batch.buffer, run.batch.offset, run.batch.length
-            found = channel.codec.objects(*where)
-            if found is None:
-                found = objects_of(channel.codec.plain, payloads_of(*where))
-            self._counters.unreadable += len(run.batch) - len(found.rows)
-            yield run.batch.log_time[found.rows], found.objects
+            batch = run.batch
+            found = channel.codec.columns(batch.buffer, batch.offset, batch.length)
+            self._counters.unreadable += len(batch) - len(found.rows)
+            yield batch.log_time[found.rows], found.plain()
 
     def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
         """The whole messages of a plan in order, those of one channel at a time."""

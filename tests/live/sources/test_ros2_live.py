@@ -19,6 +19,7 @@ from hybridlog.live.sources.ros2.child.definitions import Definitions
 from hybridlog.live.sources.ros2.source import Ros2Source
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.definition import parse_definition
+from hybridlog.schema.index_bodies import index_fields
 from hybridlog_storage.messages import Schema
 from tests.live.sources.ros2_peers import (
     Memory,
@@ -192,7 +193,7 @@ def test_calls_of_services_and_states_of_actions_are_heard(python: str, talker: 
     channel = memory.taken[0].channel
     assert channel.schema is not None
     assert channel.schema.name == "rcl_interfaces/srv/ListParameters_Event"
-    rows = [codec_for(channel).fields(taken.payload) for taken in memory.taken]
+    rows = [index_fields(codec_for(channel), taken.payload) for taken in memory.taken]
     # Sent and received request, sent and received answer; the two ends may be in any order.
     assert sorted(row["info"]["event_type"] for row in rows) == [0, 1, 2, 3]
     requests = [row["request"] for row in rows if row["info"]["event_type"] < 2]

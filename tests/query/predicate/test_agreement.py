@@ -24,6 +24,7 @@ from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.index_bodies import index_fields
 from hybridlog_storage.messages import Channel, Schema
 from tests.schema.wire_oracle import oracle
 
@@ -303,8 +304,10 @@ SLOW = settings(
 @example([{"m": {"n": {}}}, {"m": {"n": 4}}], ["m.`0` missing", "`m`.`0` missing", "m[1] exists"])
 @example([{"a": [{"n": 1}] * 40}], ["a.n >= 40", "a.n == 1", "a.min missing"])
 def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
-    codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
-    documents = [codec.fields(json.dumps(message).encode()) for message in messages]
+    codec = codec_for(Channel("/j", "json", None))
+    documents = [
+        index_fields(codec, json.dumps(message).encode(), array_limit=LIMIT) for message in messages
+    ]
     ask(messages, documents, questions, None)
 
 
@@ -315,8 +318,10 @@ def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> Non
 )
 @example([{"g": [None, [0, 1, 2, 3]]}], ["g[0][1:3] !~ '^$'", "g[1][1:3] == 2"])
 def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
-    codec = codec_for(Channel("/j", "json", None), array_limit=LIMIT)
-    documents = [codec.fields(json.dumps(message).encode()) for message in messages]
+    codec = codec_for(Channel("/j", "json", None))
+    documents = [
+        index_fields(codec, json.dumps(message).encode(), array_limit=LIMIT) for message in messages
+    ]
     ask(messages, documents, questions, None)
 
 
@@ -365,7 +370,7 @@ def test_what_json_arrays_answer(ask: Ask, where: str, expected: str) -> None:
         "named": {"a": [{"n": 9}, {"n": 8}]},
     }
     codec = codec_for(Channel("/j", "json", None))
-    documents = [codec.fields(json.dumps(message).encode()) for message in messages.values()]
+    documents = [index_fields(codec, json.dumps(message).encode()) for message in messages.values()]
     ask(list(messages.values()), documents, [where], None)
     test = to_bool(parse(where))
     assert [name for name, message in messages.items() if test(message)] == expected.split()
@@ -404,7 +409,7 @@ def test_arrays_of_arrays_are_looked_into(ask: Ask, where: str, expected: str) -
         "empty": {"a": [[], [[]]]},
     }
     codec = codec_for(Channel("/j", "json", None))
-    documents = [codec.fields(json.dumps(message).encode()) for message in messages.values()]
+    documents = [index_fields(codec, json.dumps(message).encode()) for message in messages.values()]
     ask(list(messages.values()), documents, [where], None)
     for one, document in zip(messages.values(), documents, strict=True):
         ask([one], [document], [where], None)  # columns of one kind
@@ -414,7 +419,7 @@ def test_arrays_of_arrays_are_looked_into(ask: Ask, where: str, expected: str) -
 
 def ros_codec() -> Codec:
     schema = Schema("demo/Whole", "ros1msg", DEFINITION.encode())
-    return codec_for(Channel("/r", "ros1", schema), array_limit=LIMIT)
+    return codec_for(Channel("/r", "ros1", schema))
 
 
 doubles = st.sampled_from([-1.0, 0.0, -0.0, 0.25, 1.0, 1.5, 2.0, math.nan, math.inf, -math.inf])
@@ -471,7 +476,12 @@ def test_of_ros_messages(ask: Ask, messages: list[Message], questions: list[str]
     codec = ros_codec()
     types = {path.path: path.type for path in codec.paths()}
     asked = [*questions, *ROS_QUESTIONS]
-    ask(messages, [codec.fields(serialised(message)) for message in messages], asked, types)
+    ask(
+        messages,
+        [index_fields(codec, serialised(message), array_limit=LIMIT) for message in messages],
+        asked,
+        types,
+    )
 
 
 ROS_QUESTIONS = [
@@ -527,4 +537,9 @@ def part(values: Message) -> object:
 def test_of_filters(ask: Ask, question: Message, messages: list[Message]) -> None:
     codec = ros_codec()
     types = {path.path: path.type for path in codec.paths()}
-    ask(messages, [codec.fields(serialised(message)) for message in messages], [question], types)
+    ask(
+        messages,
+        [index_fields(codec, serialised(message), array_limit=LIMIT) for message in messages],
+        [question],
+        types,
+    )

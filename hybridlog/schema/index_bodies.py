@@ -1,0 +1,107 @@
+"""Bodies of index documents: the fields of messages as BSON, long arrays summarised."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from hybridlog.schema.codec import NO_ROWS
+from hybridlog.schema.column import Records, header_stamps
+from hybridlog.schema.document import TooLarge, bodies
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.codec import Codec, Decoded
+    from hybridlog_storage.messages import Buffer
+
+ARRAY_LIMIT: Final = 32
+"""Arrays of more elements are summarised."""
+MAX_BYTES: Final = 8 << 20
+
+
+class BodyGroup(NamedTuple):
+    """Bodies of index documents of equal width.
+
+    Attributes:
+        rows: intp[k], rows of the input.
+        body: uint8[k, width], BSON elements without the document's length and end.
+        error: Reason why these payloads could not be read; the width is then 0.
+        stamps: int64[k], header stamps, ns; None if there are none, or if they are not at
+            hand.
+        surplus: intp[j], rows of these with bytes left over behind the message.
+    """
+
+    rows: NDArray[np.intp]
+    body: NDArray[np.uint8]
+    error: str | None
+    stamps: NDArray[np.int64] | None = None
+    surplus: NDArray[np.intp] = NO_ROWS
+
+
+def index_bodies(
+    codec: Codec,
+    buffer: Buffer,
+    offset: NDArray[np.int64],
+    length: NDArray[np.int64],
+    *,
+    array_limit: int = ARRAY_LIMIT,
+) -> Iterator[BodyGroup]:
+    """Make index bodies; each row of the input is in exactly one group.
+
+    Args:
+        codec: The codec of the messages.
+        buffer: Holds the payloads.
+        offset: int64[n], where each payload starts.
+        length: int64[n], bytes of each payload.
+        array_limit: Arrays of more elements are summarised.
+    """
+    if not codec.indexed:
+        if len(offset):
+            yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
+        return
+    decoded = codec.columns(buffer, offset, length)
+    if isinstance(decoded.records, Records):
+        yield from _of_columns(decoded, decoded.records, array_limit)
+    else:
+        for made, own in decoded.records.bodies(array_limit, MAX_BYTES):
+            rows = decoded.rows[own]
+            yield _error(rows, made) if isinstance(made, str) else BodyGroup(rows, made, None)
+    for bad in decoded.unreadable:
+        yield _error(bad.rows, bad.reason)
+
+
+def _of_columns(decoded: Decoded, records: Records, array_limit: int) -> Iterator[BodyGroup]:
+    stamps = header_stamps(records)
+    for group in bodies(records, array_limit=array_limit, max_bytes=MAX_BYTES):
+        rows = decoded.rows[group.rows]
+        if isinstance(group, TooLarge):
+            yield _error(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
+            continue
+        own = None if stamps is None else stamps[group.rows]
+        surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else NO_ROWS
+        yield BodyGroup(rows, group.body, None, own, surplus)
+
+
+def _error(rows: NDArray[np.intp], error: str) -> BodyGroup:
+    return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
+
+
+def index_fields(
+    codec: Codec, payload: Buffer, *, array_limit: int = ARRAY_LIMIT
+) -> dict[str, object]:
+    """The fields of a message in its index document; empty without any."""
+    size = np.array([memoryview(payload).nbytes], np.int64)
+    groups = index_bodies(codec, payload, np.zeros(1, np.int64), size, array_limit=array_limit)
+    return document_of(next(groups).body.tobytes())
+
+
+def document_of(body: bytes) -> dict[str, object]:
+    """The document of a body."""
+    import bson
+
+    return bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")

@@ -1,0 +1,198 @@
+"""Messages that are decoded to Python objects one by one, such as those of JSON.
+
+JSON and protobuf have no fixed layout, so their payloads cannot be read by columns. Each
+becomes a plain object (dict, list, str, bool, int, float, None); this module makes index
+bodies by the rules of `document.py` from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import bson
+import numpy as np
+from bson.errors import BSONError
+from bson.int64 import Int64
+
+from hybridlog.schema.codec import NO_ROWS, RESERVED, Decoded, Unreadable, top_level_names
+from hybridlog.schema.summary import nearest_double, summary_of
+from hybridlog.schema.utf8 import repaired_text
+from hybridlog_storage.errors import PayloadError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator
+
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Buffer
+
+Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bytes | bool | int | float | None"
+"""What a payload is made of. An `Int64` is stored as int64 whatever its value."""
+
+MAX_DEPTH = 100
+"""Deepest nesting that MongoDB surely accepts."""
+
+_INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
+
+
+class Nanoseconds(Int64):
+    """A time or a duration.
+
+    Attributes:
+        kind: Time or duration.
+    """
+
+    kind: str = "time"
+
+
+class Duration(Nanoseconds):
+    """A duration."""
+
+    kind = "duration"
+
+
+@dataclass(slots=True)
+class Objects:
+    """Some messages as Python objects.
+
+    Attributes:
+        values: The objects, as `Codec.decode` returns them.
+        fields: Dotted paths of those wanted in `arrow`, each with all below it; None for all.
+    """
+
+    values: list[Any]
+    fields: Collection[str] | None = None
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.values)
+
+    def plain(self, *, whole: bool) -> list[dict[str, object]]:
+        """The messages as plain values; see `Decoded.plain`."""
+        return [cast("dict[str, object]", top(value)) for value in self.values]
+
+    def arrow(self) -> pa.StructArray:
+        """The messages as an Arrow array; see `Decoded.arrow`."""
+        from hybridlog.schema.arrow_objects import objects_array
+
+        return objects_array(self.plain(whole=True), self.wanted())
+
+    def wanted(self) -> list[list[str]] | None:
+        """The wanted paths as the names they consist of."""
+        if self.fields is None:
+            return None
+        return [path.replace("[]", "").split(".") for path in self.fields]
+
+    def bodies(
+        self, array_limit: int, max_bytes: int
+    ) -> Iterator[tuple[NDArray[np.uint8] | str, NDArray[np.intp]]]:
+        """Bodies of index documents of equal width, or the reason why there are none.
+
+        Args:
+            array_limit: Arrays of more elements are summarised.
+            max_bytes: Largest body.
+
+        Returns:
+            For each, the messages that it is about.
+        """
+        found: dict[int | str, tuple[list[int], list[bytes]]] = {}
+        for row, value in enumerate(self.plain(whole=False)):
+            body = _body_of(value, array_limit, max_bytes)
+            rows, parts = found.setdefault(body if isinstance(body, str) else len(body), ([], []))
+            rows.append(row)
+            parts += [body] if isinstance(body, bytes) else []
+        for key, (rows, parts) in found.items():
+            table = np.frombuffer(b"".join(parts), np.uint8)
+            made = key if isinstance(key, str) else table.reshape(len(rows), key)
+            yield made, np.array(rows, np.intp)
+
+
+def decode_each(
+    read: Callable[[memoryview], Any],
+    form: Callable[[list[Any]], Objects],
+    buffer: Buffer,
+    offset: NDArray[np.int64],
+    length: NDArray[np.int64],
+) -> Decoded:
+    """Decode payloads to objects one by one.
+
+    Args:
+        read: Makes the object; raises PayloadError.
+        form: Makes the objects one value.
+        buffer: Holds the payloads.
+        offset: int64[n], where each payload starts.
+        length: int64[n], bytes of each payload.
+    """
+    rows: list[int] = []
+    objects: list[Any] = []
+    bad: dict[str, list[int]] = {}
+    view = memoryview(buffer)
+    places = zip(offset.tolist(), length.tolist(), strict=True)
+    for row, (start, size) in enumerate(places):
+        try:
+            objects.append(read(view[start : start + size]))
+        except PayloadError as error:
+            bad.setdefault(str(error), []).append(row)
+        else:
+            rows.append(row)
+    unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
+    return Decoded(np.array(rows, np.intp), form(objects), unreadable, NO_ROWS)
+
+
+def _body_of(value: dict[str, Any], array_limit: int, max_bytes: int) -> bytes | str:
+    """The BSON elements of the index document of one message, or why there are none."""
+    try:
+        document = bson.encode({_key(k): _indexed(v, array_limit, 2) for k, v in value.items()})
+        if len(document) - 5 > max_bytes:
+            raise PayloadError(f"its fields take more than {max_bytes >> 20} MiB")
+    except (PayloadError, BSONError, OverflowError, ValueError, RecursionError) as error:
+        return f"it cannot be a document: {error}"
+    return document[4:-1]
+
+
+def top(value: Plain) -> dict[str, Plain]:
+    """The top level of the document that a value becomes."""
+    if not isinstance(value, dict):
+        return {"value": value}
+    if not value.keys().isdisjoint(RESERVED):
+        return dict(zip(top_level_names(value), value.values(), strict=True))
+    return value
+
+
+def _indexed(value: Plain, limit: int, depth: int) -> object:
+    if isinstance(value, dict | list) and depth > MAX_DEPTH:
+        raise PayloadError(f"it is nested deeper than {MAX_DEPTH}")
+    if isinstance(value, dict):
+        return {_key(k): _indexed(v, limit, depth + 1) for k, v in value.items()}
+    if isinstance(value, list):
+        if len(value) > limit:
+            return _summary(value)
+        return [_indexed(v, limit, depth + 1) for v in value]
+    if isinstance(value, str):
+        return repaired_text(value)
+    if isinstance(value, int) and not _INT64_MIN <= value <= _INT64_MAX:
+        return nearest_double(value)
+    return value
+
+
+def _key(key: str) -> str:
+    return repaired_text(key).replace("\0", "\N{REPLACEMENT CHARACTER}")
+
+
+def _summary(values: list[Plain]) -> dict[str, object]:
+    found: dict[str, object] = {"n": Int64(len(values))}
+    summary = summary_of(values)
+    if summary is None:
+        return found
+    if not summary.has[0]:
+        return found | {"min": None, "max": None, "mean": None}
+    low, high = _element(summary.min[0].item()), _element(summary.max[0].item())
+    return found | {"min": low, "max": high, "mean": summary.mean[0].item()}
+
+
+def _element(value: float) -> float:
+    if isinstance(value, int):
+        return Int64(value) if value <= _INT64_MAX else float(value)
+    return value
