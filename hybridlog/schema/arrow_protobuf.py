@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import lists, structs
 from hybridlog.schema.arrow_objects import below, missing_rows, offsets_of, times_array
-from hybridlog.schema.codec import top_level_names
+from hybridlog.schema.column import top_level_names
 from hybridlog.schema.protobuf_fields import (
     TIMES,
     TYPES,

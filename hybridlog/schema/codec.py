@@ -7,15 +7,15 @@ documents are made from its result, in one way for all encodings.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 import numpy as np
 
-from hybridlog.schema.column import Records, row_of
+from hybridlog.schema.column import Records, row_of, top_level_names
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 
 NO_ROWS: NDArray[np.intp] = np.empty(0, np.intp)
-RESERVED = ("_id", "_meta")
-"""Names that no field has in an index document."""
 
 
 @dataclass(slots=True)
@@ -175,6 +173,38 @@ class OpaqueCodec:
         self.columns(payload, NO_ROWS, NO_ROWS)
 
 
+def decode_each(
+    read: Callable[[memoryview], Any],
+    form: Callable[[list[Any]], Objects],
+    buffer: Buffer,
+    offset: NDArray[np.int64],
+    length: NDArray[np.int64],
+) -> Decoded:
+    """Decode payloads to objects one by one.
+
+    Args:
+        read: Makes the object; raises PayloadError.
+        form: Makes the objects one value.
+        buffer: Holds the payloads.
+        offset: int64[n], where each payload starts.
+        length: int64[n], bytes of each payload.
+    """
+    rows: list[int] = []
+    objects: list[Any] = []
+    bad: dict[str, list[int]] = {}
+    view = memoryview(buffer)
+    places = zip(offset.tolist(), length.tolist(), strict=True)
+    for row, (start, size) in enumerate(places):
+        try:
+            objects.append(read(view[start : start + size]))
+        except PayloadError as error:
+            bad.setdefault(str(error), []).append(row)
+        else:
+            rows.append(row)
+    unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
+    return Decoded(np.array(rows, np.intp), form(objects), unreadable, NO_ROWS)
+
+
 def one_message(codec: Codec, payload: Buffer) -> Decoded:
     """The columns of one message.
 
@@ -203,17 +233,3 @@ def plain_message(
         PayloadError: The payload does not fit its definition.
     """
     return one_message(codec, payload).plain(names, whole=False)[0] if codec.indexed else {}
-
-
-def top_level_names(names: Collection[str]) -> list[str]:
-    """Names of the fields in the index document, where `_id` and `_meta` are reserved.
-
-    A field with such a name gets as many trailing underscores as make it unique.
-    """
-    spelled = []
-    for name in names:
-        if name in RESERVED:
-            while name in names:
-                name += "_"  # noqa: PLW2901
-        spelled.append(name)
-    return spelled

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, cast
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from numpy.typing import NDArray
 
@@ -202,3 +202,21 @@ def header_stamps(records: Records) -> NDArray[np.int64] | None:
     header = records.fields.get("header")
     stamp = header.fields.get("stamp") if isinstance(header, Records) else None
     return stamp.values if isinstance(stamp, Scalars) and stamp.kind == "time" else None
+
+
+RESERVED: Final = ("_id", "_meta")
+"""Names that no field has in an index document."""
+
+
+def top_level_names(names: Collection[str]) -> list[str]:
+    """Names of the fields in the index document, where `_id` and `_meta` are reserved.
+
+    A field with such a name gets as many trailing underscores as make it unique.
+    """
+    spelled = []
+    for name in names:
+        if name in RESERVED:
+            while name in names:
+                name += "_"  # noqa: PLW2901
+        spelled.append(name)
+    return spelled

@@ -16,8 +16,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from hybridlog.schema.codec import top_level_names
-from hybridlog.schema.column import LONG, Arrays, Records, Scalars, Strings, offsets, ranges, take
+from hybridlog.schema.column import (
+    LONG,
+    Arrays,
+    Records,
+    Scalars,
+    Strings,
+    offsets,
+    ranges,
+    take,
+    top_level_names,
+)
 from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:

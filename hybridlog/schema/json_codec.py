@@ -6,7 +6,8 @@ import json
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from hybridlog.schema.objects import Objects, decode_each
+from hybridlog.schema.codec import decode_each
+from hybridlog.schema.objects import Objects
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:

@@ -15,18 +15,16 @@ import numpy as np
 from bson.errors import BSONError
 from bson.int64 import Int64
 
-from hybridlog.schema.codec import NO_ROWS, RESERVED, Decoded, Unreadable, top_level_names
+from hybridlog.schema.column import RESERVED, top_level_names
 from hybridlog.schema.summary import nearest_double, summary_of
 from hybridlog.schema.utf8 import repaired_text
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Collection, Iterator
 
     import pyarrow as pa
     from numpy.typing import NDArray
-
-    from hybridlog_storage.messages import Buffer
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | bytes | bool | int | float | None"
 """What a payload is made of. An `Int64` is stored as int64 whatever its value."""
@@ -107,38 +105,6 @@ class Objects:
             table = np.frombuffer(b"".join(parts), np.uint8)
             made = key if isinstance(key, str) else table.reshape(len(rows), key)
             yield made, np.array(rows, np.intp)
-
-
-def decode_each(
-    read: Callable[[memoryview], Any],
-    form: Callable[[list[Any]], Objects],
-    buffer: Buffer,
-    offset: NDArray[np.int64],
-    length: NDArray[np.int64],
-) -> Decoded:
-    """Decode payloads to objects one by one.
-
-    Args:
-        read: Makes the object; raises PayloadError.
-        form: Makes the objects one value.
-        buffer: Holds the payloads.
-        offset: int64[n], where each payload starts.
-        length: int64[n], bytes of each payload.
-    """
-    rows: list[int] = []
-    objects: list[Any] = []
-    bad: dict[str, list[int]] = {}
-    view = memoryview(buffer)
-    places = zip(offset.tolist(), length.tolist(), strict=True)
-    for row, (start, size) in enumerate(places):
-        try:
-            objects.append(read(view[start : start + size]))
-        except PayloadError as error:
-            bad.setdefault(str(error), []).append(row)
-        else:
-            rows.append(row)
-    unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
-    return Decoded(np.array(rows, np.intp), form(objects), unreadable, NO_ROWS)
 
 
 def _body_of(value: dict[str, Any], array_limit: int, max_bytes: int) -> bytes | str:

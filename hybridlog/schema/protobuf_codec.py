@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, cast
 
 from bson.int64 import Int64
 
-from hybridlog.schema.codec import top_level_names
+from hybridlog.schema.codec import decode_each
+from hybridlog.schema.column import top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
-from hybridlog.schema.objects import Duration, Nanoseconds, Objects, decode_each, top
+from hybridlog.schema.objects import Duration, Nanoseconds, Objects, top
 from hybridlog.schema.protobuf_fields import (
     TIMES,
     TYPES,

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from bson.errors import BSONError
 
+from hybridlog.schema.codec import decode_each
 from hybridlog.schema.index_bodies import document_of, index_bodies
-from hybridlog.schema.objects import Objects, decode_each
+from hybridlog.schema.objects import Objects
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED, Channel
 

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlog.schema import document
-from hybridlog.schema.codec import top_level_names
-from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take
+from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take, top_level_names
 from hybridlog.schema.document import Bodies, TooLarge, bodies
 
 LIMIT = 4

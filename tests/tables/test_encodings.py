@@ -100,6 +100,9 @@ def test_json_that_is_none(store: hl.Store, tmp_path: Path) -> None:
     table = Tables(store.directory.path).of(entry, "/a")
     assert table is not None
     assert table.unreadable == 1
+    query = store.topic("/a")
+    assert [json.loads(line)["n"] for some in query.to_json_lines() for line in some] == [1]
+    assert query.counters.unreadable == 1
 
 
 def test_a_field_that_breaks_parquet_costs_only_its_topic(store: hl.Store, tmp_path: Path) -> None:
