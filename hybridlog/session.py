@@ -66,7 +66,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.payload_reader import ArrayTable
-    from hybridlog.columns.tables import Tables, TopicTable
+    from hybridlog.columns.tables import Tables
+    from hybridlog.columns.topic_table import TopicTable
     from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.index.index_version import GuardedIndex, IndexVersion
     from hybridlog.index.index_writer import IndexTarget

@@ -657,7 +657,7 @@ MAINTENANCE = [
         ),
     ),
     *_of(
-        "hybridlog/columns/tables.py",
+        "hybridlog/columns/topic_table.py",
         (
             "row-groups-that-overlap-are-in-order",
             "if run[-1].last < part.first:",

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hybridlog.columns.layout import OWN_COLUMNS, RECIPE
-from hybridlog.columns.parquet_file import DICTIONARY, leaf_paths
+from hybridlog.columns.parquet_file import DICTIONARY, leaves
 from hybridlog.columns.payload_rows import field_of
 
 if TYPE_CHECKING:
@@ -32,7 +32,8 @@ def encodings_of(table: pa.Table) -> dict[str, str]:
     """
     chosen = {f"{RECIPE}.rest": _PLAIN, f"{RECIPE}.padding": _PLAIN}
     rows = table.to_struct_array().combine_chunks()
-    for path, kind in leaf_paths(table.schema):
+    kinds = {leaf.path: leaf.kind for leaf in leaves(table.schema)}
+    for path, kind in kinds.items():
         if path.partition(".")[0] in OWN_COLUMNS or path in chosen:
             continue
         if pa.types.is_binary(kind):
@@ -42,8 +43,7 @@ def encodings_of(table: pa.Table) -> dict[str, str]:
             found = smallest(array.flatten().slice(0, _TRIED))
             if found:
                 chosen[path] = found
-    names = {path for path, _ in leaf_paths(table.schema)}
-    return {path: how for path, how in chosen.items() if path in names}
+    return {path: how for path, how in chosen.items() if path in kinds}
 
 
 def smallest(values: pa.Array[Any]) -> str:

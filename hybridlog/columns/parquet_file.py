@@ -23,7 +23,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from hybridlog.columns.layout import ABOUT, IN_TYPE, About
+from hybridlog.columns.fields import has_summaries, original_name
+from hybridlog.columns.layout import ABOUT, IN_TYPE, OWN, OWN_COLUMNS, About
 from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
@@ -100,15 +101,15 @@ class ParquetFileWriter:
         self.path = path
         self._depth = depth
         self._sink = _Sink(path, depth)
-        leaves = list(leaf_paths(sample.schema))
+        kinds = {leaf.path: leaf.kind for leaf in leaves(sample.schema)}
         chosen = dict(encodings or {})
-        for leaf, kind in leaves:
+        for leaf, kind in kinds.items():
             if _runs(leaf, kind):
                 chosen.setdefault(leaf, "DELTA_BINARY_PACKED")
         for leaf, array in _leaf_values(sample.slice(0, _SAMPLE)):
             if leaf not in chosen and _repeats(array):
                 chosen[leaf] = DICTIONARY
-        ordered = {leaf for leaf, kind in leaves if _is_ordered(kind)}
+        ordered = {leaf for leaf, kind in kinds.items() if _is_ordered(kind)}
         if is_all:
             ordered |= {leaf for leaf, array in _leaf_values(sample) if _has_no_nan(array)}
         try:
@@ -120,7 +121,7 @@ class ParquetFileWriter:
                 compression_level=level,
                 use_dictionary=[leaf for leaf, how in chosen.items() if how == DICTIONARY],
                 column_encoding={leaf: how for leaf, how in chosen.items() if how != DICTIONARY},
-                write_statistics=[leaf for leaf, _ in leaves if leaf in ordered],
+                write_statistics=[leaf for leaf in kinds if leaf in ordered],
             )
             self._behind = kept if in_front else None
             if kept is not None and not in_front:
@@ -348,16 +349,16 @@ class ParquetFileReader:
         Raises:
             StoreError: they are damaged.
         """
-        leaves = range(len(list(leaf_paths(self.schema))))
-        groups = [self.read(group, leaves) for group in range(self.groups)]
+        numbers = range(len(list(leaves(self.schema))))
+        groups = [self.read(group, numbers) for group in range(self.groups)]
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
 
-    def read(self, group: int, leaves: Sequence[int]) -> pa.Table:
+    def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
         """Some columns of a row group.
 
         Args:
-            group: Its number.
+            group: Its number; None for no rows.
             leaves: Column numbers in Parquet's order: single values, depth first.
 
         Raises:
@@ -366,12 +367,14 @@ class ParquetFileReader:
         try:
             with self._lock:
                 reader: Any = self._parquet.reader
-                table: pa.Table = reader.read_row_group(
-                    group, column_indices=list(leaves), use_threads=False
+                table: pa.Table = reader.read_row_groups(
+                    [] if group is None else [group],
+                    column_indices=list(leaves),
+                    use_threads=False,
                 )
         except (OSError, StoreError, pa.ArrowException, ValueError) as error:
             raise self._damaged(error) from error
-        if table.num_rows != self.about.bounds[group][0]:
+        if group is not None and table.num_rows != self.about.bounds[group][0]:
             raise self._damaged(StoreError("a row group has the wrong number of rows"))
         return table
 
@@ -517,32 +520,47 @@ def _has_no_nan(array: pa.Array[Any]) -> bool:
     return pa.types.is_floating(array.type) and not pc.any(pc.is_nan(array)).as_py()
 
 
-def leaves_of(schema: pa.Schema) -> Iterator[tuple[tuple[str, ...], pa.DataType]]:
-    """Columns in Parquet's order, each as the names on its path, without lists."""
+class Leaf(NamedTuple):
+    """A column in Parquet's order.
+
+    Attributes:
+        top: Name of the table's column that contains it.
+        path: Its dotted path in the file.
+        kind: Type of its values.
+        is_own: True for a column of the table itself, not of a field.
+        names: Names of the fields on the path to it, without lists.
+        array: Names of the fields on the path to the array whose summary it is part of.
+    """
+
+    top: str
+    path: str
+    kind: pa.DataType
+    is_own: bool
+    names: tuple[str, ...]
+    array: tuple[str, ...] | None = None
+
+
+def leaves(schema: pa.Schema) -> Iterator[Leaf]:
+    """The columns of a file in Parquet's order."""
     for top in schema:
-        for names, _, kind in _walk(top):
-            yield names, kind
+        is_own = top.name in OWN_COLUMNS or OWN in (top.metadata or {})
+        for path, kind, names, array in _leaves(top, top.name, (), None):
+            yield Leaf(top.name, path, kind, is_own, names, array)
 
 
-def leaf_paths(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
-    """The columns of `leaves_of` by their dotted paths in the file."""
-    for top in schema:
-        for _, path, kind in _walk(top):
-            yield path, kind
-
-
-def _walk(top: pa.Field) -> Iterator[tuple[tuple[str, ...], str, pa.DataType]]:
-    kind = top.type
-    if pa.types.is_struct(kind):
-        for number in range(kind.num_fields):
-            for names, path, leaf in _walk(kind.field(number)):
-                yield (top.name, *names), f"{top.name}.{path}", leaf
-    elif is_list(kind):
-        for names, path, leaf in _walk(kind.value_field.with_name("element")):
-            rest = path.removeprefix("element")
-            yield (top.name, *names[1:]), f"{top.name}.list.element{rest}", leaf
-    else:
-        yield (top.name,), top.name, kind
+def _leaves(
+    field: pa.Field, path: str, above: tuple[str, ...], array: tuple[str, ...] | None
+) -> Iterator[tuple[str, pa.DataType, tuple[str, ...], tuple[str, ...] | None]]:
+    names, kind = (*above, original_name(field)), field.type
+    while is_list(kind):
+        path, kind = f"{path}.list.element", kind.value_type
+    if not pa.types.is_struct(kind):
+        yield path, kind, names, array
+        return
+    for number in range(kind.num_fields):
+        inner = kind.field(number)
+        of_array = names if has_summaries(field) else array
+        yield from _leaves(inner, f"{path}.{inner.name}", names, of_array)
 
 
 def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:

@@ -10,28 +10,29 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.columns.clouds import PointLayout
+from hybridlog.columns.column_file import FIRST, LAST, ColumnFile, TablePart
 from hybridlog.columns.layout import IN_PAYLOADS, TopicCounts
-from hybridlog.columns.parquet_file import leaves_of
-from hybridlog.columns.payload_rows import NEEDED, Rebuilder
-from hybridlog.columns.tables import ColumnFile, TablePart, TopicTable, _Cache
-from hybridlog.columns.zones import Zone, may_hold
+from hybridlog.columns.parquet_file import leaves
+from hybridlog.columns.payload_rows import NEEDED, Rebuilder, rows_of
+from hybridlog.columns.topic_table import TopicTable
+from hybridlog.columns.zones import Zone
 from hybridlog.schema.arrow_types import converted, has_empty
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from hybridlog.columns.column_file import ColumnCache
     from hybridlog.columns.payload_rows import Rebuilt
-    from hybridlog.query.predicate.tree import Node
     from hybridlog.query.question import RecordedChannel
     from hybridlog.sql.counts import ScanCounts
     from hybridlog_storage.journal import PayloadFile
 
-_ANY: Final = ((0, 0), (0, 0))
-_KEPT_GROUPS: Final = 3  # row groups of messages in memory: neighbouring chunks share one
+_MAX_REBUILT: Final = 3  # row groups of messages in memory: neighbouring chunks share one
 _RESTORE = "Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
@@ -49,12 +50,17 @@ class Place(NamedTuple):
     rows: int
 
 
-class PayloadReader:
-    """Reads one file. Thread safe.
+class PayloadReader(ColumnFile):
+    """One file of payloads. Thread safe.
 
     Args:
         folder: Folder that its name counts from.
         listed: The file as the journal lists it.
+
+    Attributes:
+        listed: As above.
+        is_ordered: True if rows are in order of time and arrival.
+        places: Rows of each chunk, by segment and number.
 
     Raises:
         StoreError: It is missing, damaged, or another file than the listed one.
@@ -64,47 +70,52 @@ class PayloadReader:
         self.listed = listed
         path = folder / listed.file
         try:
-            self.file = ColumnFile(path, depth=IN_PAYLOADS)
+            super().__init__(path, depth=IN_PAYLOADS)
         except FileNotFoundError as error:
             raise StoreError(f"The payload file {path} is missing. {_RESTORE}") from error
-        if (self.file.size_bytes, self.file.digest) != (listed.bytes, listed.digest):
+        if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
             raise StoreError(
                 f"The payload file {path} is not the one that the journal lists. {_RESTORE}"
             )
-        about = self.file.about
-        self.parts = list(self.file.parts(0, listed.messages))
         try:
-            values = about.payloads
+            values = self.about.payloads
             layout = values["layout"]
-            self.layout = None if layout is None else PointLayout.from_json(layout)
-            self.order = [str(path) for path in values["order"]]
+            self._order = [str(path) for path in values["order"]]
+            self._rebuilder = Rebuilder(
+                str(values["wire"]),
+                self._order,
+                None if layout is None else PointLayout.from_json(layout),
+            )
             self.is_ordered = bool(values["is_ordered"])
-            self._rebuilder = Rebuilder(str(values["wire"]), self.order, self.layout)
             self.places = self._read_places(values["chunks"])
-            self.zones = [
+            self._zones = [
                 {str(path): Zone.from_json(zone) for path, zone in group.items()}
                 for group in values["zones"]
             ]
-            if len(self.zones) != self.file.groups:
+            if len(self._zones) != self.groups:
                 raise ValueError("its row groups and its zones differ")
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
-        self._table = TopicTable("", self.parts, TopicCounts(listed.messages), _Cache(0))
-        self._groups: OrderedDict[int, Rebuilt] = OrderedDict()
-        self._lock = threading.Lock()
+        self._rebuilt: OrderedDict[int, Rebuilt] = OrderedDict()
+        self._rebuilding = threading.Lock()
 
     def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
         found: dict[tuple[int, int], Place] = {}
-        if len(chunks) != self.file.groups:
+        if len(chunks) != self.groups:
             raise ValueError("its row groups and its chunks differ")
         for group, inside in enumerate(chunks):
             at = 0
             for segment, chunk, rows in inside:
                 found[int(segment), int(chunk)] = Place(group, at, int(rows))
                 at += int(rows)
-            if at != self.file.about.bounds[group][0]:
+            if at != self.about.bounds[group][0]:
                 raise ValueError("its row groups and its chunks differ")
         return found
+
+    @property
+    def zones(self) -> Sequence[Mapping[str, Zone]]:
+        """For each row group the zones of its arrays."""
+        return self._zones
 
     def rebuilt(self, group: int) -> Rebuilt:
         """The message records of a row group.
@@ -112,30 +123,22 @@ class PayloadReader:
         Raises:
             StoreError: It is damaged.
         """
-        with self._lock:
-            found = self._groups.get(group)
+        with self._rebuilding:
+            found = self._rebuilt.get(group)
             if found is not None:
-                self._groups.move_to_end(group)
+                self._rebuilt.move_to_end(group)
                 return found
+        check_wanted()
         try:
-            found = self._rebuilder.records(
-                *self._table.read(self.parts[group], self.order, set(NEEDED))
-            )
+            table = self.read(group, self.choose(self._order, NEEDED))
+            found = self._rebuilder.records(*rows_of(table))
         except (ValueError, pa.ArrowException) as error:
-            raise StoreError(f"The payload file {self.file.path} is invalid: {error}.") from error
-        with self._lock:
-            self._groups[group] = found
-            while len(self._groups) > _KEPT_GROUPS:
-                self._groups.popitem(last=False)
+            raise StoreError(f"The payload file {self.path} is invalid: {error}.") from error
+        with self._rebuilding:
+            self._rebuilt[group] = found
+            while len(self._rebuilt) > _MAX_REBUILT:
+                self._rebuilt.popitem(last=False)
         return found
-
-    def check(self) -> None:
-        """Read every byte and every value.
-
-        Raises:
-            StoreError: A part is damaged.
-        """
-        self.file.check()
 
 
 class ArrayTable(TopicTable):
@@ -148,17 +151,13 @@ class ArrayTable(TopicTable):
     """
 
     def __init__(
-        self, channel: RecordedChannel, readers: Sequence[PayloadReader], cache: _Cache
+        self, channel: RecordedChannel, readers: Sequence[PayloadReader], cache: ColumnCache
     ) -> None:
-        parts = [part for reader in readers for part in reader.parts]
+        parts = [part for reader in readers for part in reader.parts(0, reader.listed.messages)]
         counts = TopicCounts(sum(part.rows for part in parts))
         super().__init__(channel.channel.topic, parts, counts, cache)
         self._channel = channel
-        self._readers = {reader.file.number: reader for reader in readers}
-
-    def may_hold(self, part: TablePart, where: Node | None) -> bool:
-        """False if zones tell that a predicate holds for no row of a row group."""
-        return where is None or may_hold(where, self._readers[part.file.number].zones[part.group])
+        self._readers = readers
 
     def _find_type(self, paths: Collection[str] | None) -> Any:
         return pa.nulls(0, self._channel.arrow_type(paths))
@@ -172,7 +171,7 @@ class ArrayTable(TopicTable):
     def covers(self, paths: Collection[str] | None) -> bool:
         """True if the files have all of some fields; points of clouds are other columns."""
         kind = self.empty(paths).type
-        names = [".".join(names) for names, _ in leaves_of(pa.schema(list(kind)))]
+        names = [".".join(leaf.names) for leaf in leaves(pa.schema(list(kind)))]
         return not has_empty(kind) and all(map(self.has, names))
 
     def at(
@@ -196,12 +195,12 @@ class ArrayTable(TopicTable):
         if not self.covers(paths):
             return None
         kind = self.empty(paths)
-        for reader in self._readers.values():
+        for reader in self._readers:
             found = reader.places.get(place)
             if found is None:
                 continue
-            part = TablePart(reader.file, *found, *_ANY)
-            counts.add_group(reader.file.path, part.group)
+            part = TablePart(reader, *found, FIRST, LAST)
+            counts.add_group(reader.path, part.group)
             try:
                 own, records = self.read(part, paths, {"ref"})
                 fields = self._fitted(records, kind)

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from hybridlog.columns.parquet_file import leaf_paths
+from hybridlog.columns.parquet_file import leaves
 from hybridlog.export.base import FileWriter, Sink, Target
 from hybridlog.export.json_text import (
     PIECE_BYTES,
@@ -183,17 +183,17 @@ class ParquetWriter(TableFileWriter):
     format_name = "parquet"
 
     def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        leaves = list(leaf_paths(schema))
+        kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
         # Arrow holds the dictionary of a long array, and many copies of a long text.
         has_long_rows = self._bytes > _LONG_ROW * max(self._rows, 1)
         writer: _ArrowFile = pa.parquet.ParquetWriter(
             sink,
             schema,
             compression="zstd",
-            use_dictionary=[] if has_long_rows else [path for path, _ in leaves],
+            use_dictionary=[] if has_long_rows else list(kinds),
             write_statistics=[
                 path
-                for path, kind in leaves
+                for path, kind in kinds.items()
                 if not pa.types.is_floating(kind)
                 and not (has_long_rows and not pa.types.is_primitive(kind))
             ],

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.parquet_file import ParquetFileReader
     from hybridlog.columns.table_writer import TableWriter
-    from hybridlog.columns.tables import Tables, TopicTable
+    from hybridlog.columns.tables import Tables
+    from hybridlog.columns.topic_table import TopicTable
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry

@@ -25,8 +25,9 @@ from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
+    from hybridlog.columns.column_file import TablePart
     from hybridlog.columns.payload_reader import ArrayTable
-    from hybridlog.columns.tables import TablePart, TopicTable
+    from hybridlog.columns.topic_table import TopicTable
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.chunk import StoredChunk

@@ -16,7 +16,8 @@ from hybridlog_storage.errors import StoreError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.tables import TableRows, Tables, TopicTable
+    from hybridlog.columns.tables import Tables
+    from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.intervals import Span
     from hybridlog_storage.catalog import RecordingEntry
 

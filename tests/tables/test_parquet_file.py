@@ -20,7 +20,7 @@ from hybridlog.columns.layout import (
     shape_folder,
     type_prefix,
 )
-from hybridlog.columns.parquet_file import ParquetFileReader, ParquetFileWriter, leaves_of
+from hybridlog.columns.parquet_file import ParquetFileReader, ParquetFileWriter, leaves
 from hybridlog_storage.errors import StoreError
 
 ROWS = 20_000
@@ -70,7 +70,7 @@ def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
     reader = ParquetFileReader(path)
     assert reader.about.recordings == said.recordings
     assert reader.groups == 2
-    names = [names for names, _ in leaves_of(reader.schema)]
+    names = [leaf.names for leaf in leaves(reader.schema)]
     assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",)]
     assert reader.read(1, [0, 1, 2, 3, 4]).equals(table)
     some = reader.read(0, [1, 3])

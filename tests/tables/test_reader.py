@@ -18,9 +18,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.columns import tables as reader
+from hybridlog.columns import topic_table as reader
 from hybridlog.columns.fields import FieldShape, UnfitError, alike, joined, records_of
-from hybridlog.columns.tables import Tables, TopicTable, _merged
+from hybridlog.columns.parquet_file import ParquetFileReader
+from hybridlog.columns.tables import Tables
+from hybridlog.columns.topic_table import TopicTable, _merged
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.errors import StoreError
 from tests.tables import ask
@@ -121,14 +123,15 @@ def test_row_groups_out_of_range_are_not_read(
     making.make(recorded.directory, entry, ["/large"])
     table = table_of(recorded)
     assert table.files[0].groups == 12
-    read: list[int] = []
-    real = reader.ParquetFileReader.read
+    read: list[int | None] = []
+    real = ParquetFileReader.read
 
-    def seen(file: reader.ParquetFileReader, group: int, leaves: Any) -> Any:
-        read.append(group)
+    def seen(file: ParquetFileReader, group: int | None, leaves: Any) -> Any:
+        if group is not None:
+            read.append(group)
         return real(file, group, leaves)
 
-    monkeypatch.setattr(reader.ParquetFileReader, "read", seen)
+    monkeypatch.setattr(ParquetFileReader, "read", seen)
     bounds = table.files[0].about.bounds
     assert sum(map(len, table.scan(spans=[(bounds[5][1], bounds[5][1] + 1)]))) >= 1
     assert set(read) <= {4, 5}
@@ -338,7 +341,7 @@ def test_what_is_found_is_remembered(
     assert table is not None
     assert tables.of(entry, "/large") is table
     before = list(table.scan(["i8"]))
-    monkeypatch.setattr(reader.ParquetFileReader, "read", None)  # is not needed
+    monkeypatch.setattr(ParquetFileReader, "read", None)  # is not needed
     assert [b.records.equals(a.records) for a, b in zip(before, table.scan(["i8"]), strict=True)]
     tables.invalidate()
     assert tables.of(entry, "/large") is not table

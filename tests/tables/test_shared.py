@@ -12,10 +12,10 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.columns import folders, parquet_file
+from hybridlog.columns import column_file, folders, parquet_file
 from hybridlog.columns import table_writer as writing
-from hybridlog.columns import tables as reader
 from hybridlog.columns.parquet_file import ParquetFileReader
+from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
 from hybridlog.query.predicate import to_mask as deciding
 from hybridlog_storage.disk import files
@@ -105,7 +105,7 @@ def test_more_files_than_may_be_open(
     monkeypatch.setattr(writing, "LONG_ROWS", 20)
     for number in range(COUNT, COUNT + 6):
         record(several, tmp_path, number, 60)
-    monkeypatch.setattr(reader, "_OPEN_FILES", 4)
+    monkeypatch.setattr(column_file, "_OPEN_FILES", 4)
     several.refresh()
     assert len(files_of(several)) == 13
     query = several.query(["/a", "/b"]).where("i8 > 0")
@@ -216,7 +216,7 @@ def test_folders_are_read_once_for_all_recordings_without_tables(
         return real(fd)
 
     monkeypatch.setattr(files, "names_in", seen)
-    tables = reader.Tables(several.directory.path)
+    tables = Tables(several.directory.path)
     assert all(tables.of(one, topic) is None for one in entries for topic in ("/a", "/b"))
     assert len(read) == 2  # all folders, and this one
 

@@ -19,7 +19,8 @@ from hybridlog.columns import table_writer as writing
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
 from hybridlog.columns.table_writer import TableWriter
-from hybridlog.columns.tables import TableRows, Tables
+from hybridlog.columns.tables import Tables
+from hybridlog.columns.topic_table import TableRows
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk import files

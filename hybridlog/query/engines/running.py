@@ -21,7 +21,7 @@ from hybridlog_storage.catalog import ChannelStats, channel_totals
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.tables import TopicTable
+    from hybridlog.columns.topic_table import TopicTable
     from hybridlog.query.chunk_scan import ChunkKey, ChunkTask
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.payload_reader import ArrayTable
-    from hybridlog.columns.tables import TableRows, TopicTable
+    from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
     from hybridlog.query.predicate.tree import Node

@@ -1,0 +1,227 @@
+"""One file of columns, the columns to read for some fields, and a cache of what was read."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.columns.fields import SUMMARY_FIELDS
+from hybridlog.columns.layout import Section, TopicCounts
+from hybridlog.columns.parquet_file import Leaf, ParquetFileReader, leaves
+from hybridlog_storage.disk import files
+from hybridlog_storage.lazy import lazy
+
+if TYPE_CHECKING:
+    from hybridlog.columns.zones import Zone
+
+_OPEN_FILES: Final = 256
+_MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
+FIRST: Final = -(1 << 63), -(1 << 63)
+"""Lower bound of all keys."""
+LAST: Final = (1 << 63) - 1, (1 << 63) - 1
+"""Upper bound of all keys."""
+
+Key = tuple[int, int]
+"""Log time and arrival number: the order of messages."""
+
+
+class TablePart(NamedTuple):
+    """Rows of one topic in a row group, in order.
+
+    Attributes:
+        file: The file.
+        group: Number of the row group.
+        begin: First row of the topic in it.
+        rows: Number of its rows.
+        first: Key of the first row, or a lower bound of it.
+        last: Key of the last row, or an upper bound of it.
+    """
+
+    file: ColumnFile
+    group: int
+    begin: int
+    rows: int
+    first: Key
+    last: Key
+
+
+class ColumnFile(ParquetFileReader):
+    """A file of tables, and what is known of its columns."""
+
+    @lazy
+    def leaves(self) -> list[Leaf]:
+        """Its columns in Parquet's order."""
+        return list(leaves(self.schema))
+
+    @property
+    def zones(self) -> Sequence[Mapping[str, Zone]]:
+        """For each row group the zones of its arrays; empty where there are none."""
+        return ()
+
+    @lazy
+    def summaries(self) -> dict[tuple[str, ...], int]:
+        """Paths of arrays with summaries, and the number of a column of each."""
+        return {leaf.array: n for n, leaf in enumerate(self.leaves) if leaf.array is not None}
+
+    @lazy
+    def paths(self) -> set[tuple[str, ...]]:
+        """Paths of fields that the messages have."""
+        names = [leaf.array or leaf.names for leaf in self.leaves if not leaf.is_own]
+        return {path[:end] for path in names for end in range(1, len(path) + 1)}
+
+    @lazy
+    def summary_paths(self) -> set[tuple[str, ...]]:
+        """Paths of the numbers of summaries."""
+        return {leaf.names for leaf in self.leaves if leaf.array is not None}
+
+    @lazy
+    def sizes(self) -> dict[tuple[Any, ...], int]:
+        """Stored bytes of columns that were asked about."""
+        return {}
+
+    def stored(self, group: int, paths: Collection[str] | None, own: Collection[str]) -> int:
+        """Stored bytes of some fields in a row group."""
+        key = group, None if paths is None else frozenset(paths), frozenset(own)
+        found = self.sizes.get(key)
+        if found is None:
+            if len(self.sizes) >= _MAX_FIELD_SETS:
+                self.sizes.clear()
+            found = self.sizes[key] = self.size(group, self.choose(paths, own))
+        return found
+
+    @lazy
+    def chosen(self) -> dict[tuple[Any, Any], list[int]]:
+        """Numbers of columns that were chosen, by fields and columns of ours."""
+        return {}
+
+    def choose(self, paths: Collection[str] | None, own: Collection[str]) -> list[int]:
+        """Numbers of the columns for some fields."""
+        key = None if paths is None else frozenset(paths), frozenset(own)
+        found = self.chosen.get(key)
+        if found is None:
+            wanted = None if paths is None else list(map(names_of, paths))
+            found = [
+                number
+                for number, leaf in enumerate(self.leaves)
+                if (leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted))
+            ]
+            # A summary tells whether the array is there.
+            known = {self.leaves[number].array for number in found}
+            for array, number in self.summaries.items():
+                if array not in known and any(p[: len(array)] == array for p in wanted or ()):
+                    found.append(number)
+            found.sort()
+            if len(self.chosen) >= _MAX_FIELD_SETS:
+                self.chosen.clear()
+            self.chosen[key] = found
+        return found
+
+    def by_top(
+        self, paths: Collection[str] | None, own: Collection[str]
+    ) -> dict[str, tuple[int, ...]]:
+        """The numbers of `choose` by the table's column that contains them."""
+        found: dict[str, tuple[int, ...]] = {}
+        for number in self.choose(paths, own):
+            top = self.leaves[number].top
+            found[top] = (*found.get(top, ()), number)
+        return found
+
+    def _is_wanted(self, leaf: Leaf, wanted: Sequence[tuple[str, ...]] | None) -> bool:
+        if wanted is None or any(leaf.names[: len(path)] == path for path in wanted):
+            return True
+        # A summary is worked out from the array where that is there.
+        return any(
+            leaf.names[: len(path) - 1] == path[:-1] and path[:-1] in self.summaries
+            for path in wanted
+            if leaf.array is None and path[-1] in SUMMARY_FIELDS
+        )
+
+    def sections(self) -> Iterator[tuple[int, Section]]:
+        """The recordings in it, each with its first row."""
+        before = 0
+        for section in self.about.recordings:
+            yield before, section
+            before += section.rows
+
+    def parts(self, begin: int, rows: int) -> Iterator[TablePart]:
+        """Row groups with some rows of one topic."""
+        before = 0
+        for group, (count, *keys) in enumerate(self.about.bounds):
+            low, high = max(begin, before), min(begin + rows, before + count)
+            if low < high:
+                is_known = any(keys)
+                first = (keys[0], keys[1]) if is_known else FIRST
+                last = (keys[2], keys[3]) if is_known else LAST
+                yield TablePart(self, group, low - before, high - low, first, last)
+            before += count
+
+    @lazy
+    def counts(self) -> TopicCounts:
+        """Counts of all its rows."""
+        topics = [section.topics.values() for section in self.about.recordings]
+        return TopicCounts(
+            *np.array([*chain(*topics)], np.int64).reshape(-1, 3).sum(axis=0).tolist()
+        )
+
+    def all_parts(self) -> list[TablePart]:
+        """All rows, as if they were of one topic."""
+        return [
+            TablePart(self, group, 0, bound[0], FIRST, LAST)
+            for group, bound in enumerate(self.about.bounds)
+        ]
+
+
+class ColumnCache:
+    """A cache of the most recently used decoded columns. Thread safe."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes = most_bytes
+        self._columns: OrderedDict[tuple[int, int, str, tuple[int, ...]], Any] = OrderedDict()
+        self._open: OrderedDict[int, ColumnFile] = OrderedDict()
+        self._size = 0
+        self._lock = threading.Lock()
+
+    def get(self, file: ColumnFile, group: int, top: str, leaves: tuple[int, ...]) -> Any:
+        """A column of a row group, or the requested parts of it."""
+        key = file.number, group, top, leaves
+        with self._lock:
+            if key in self._columns:
+                self._columns.move_to_end(key)
+                return self._columns[key]
+        self.opened(file)
+        column = file.read(group, leaves).column(0).combine_chunks()
+        if isinstance(column, pa.ChunkedArray):
+            column = pa.concat_arrays(column.chunks)
+        with self._lock:
+            if key not in self._columns and column.nbytes <= self.most_bytes:
+                self._columns[key] = column
+                self._size += column.nbytes
+                while self._size > self.most_bytes:
+                    self._size -= self._columns.popitem(last=False)[1].nbytes
+        return column
+
+    def opened(self, file: ColumnFile) -> None:
+        """Close files that were not read lately, if too many are open."""
+        with self._lock:
+            self._open[file.number] = file
+            self._open.move_to_end(file.number)
+            while len(self._open) > files.most_open(_OPEN_FILES):
+                self._open.popitem(last=False)[1].release()
+
+    def clear(self) -> None:
+        """Forget all columns and files."""
+        with self._lock:
+            self._columns.clear()
+            self._open.clear()
+            self._size = 0
+
+
+def names_of(path: str) -> tuple[str, ...]:
+    """Names on a dotted path of a field, without brackets."""
+    return tuple(path.replace("[]", "").split("."))

@@ -1,0 +1,374 @@
+"""The rows of one topic in one or several files, in order of log time and arrival."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hybridlog.columns.column_file import FIRST, names_of
+from hybridlog.columns.fields import alike, records_of
+from hybridlog.columns.zones import may_hold
+from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.arrow_types import is_list
+from hybridlog.schema.column import ranges
+from hybridlog_storage.lazy import lazy
+from hybridlog_storage.ordering import order_of
+from hybridlog_storage.stopping import check_wanted
+from hybridlog_storage.times import placed, span_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.columns.column_file import ColumnCache, ColumnFile, Key, TablePart
+    from hybridlog.columns.layout import TopicCounts
+    from hybridlog.query.intervals import Span
+    from hybridlog.query.predicate.tree import Node
+
+_MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableRows:
+    """Some messages of a topic, in order.
+
+    Attributes:
+        t: int64[n], log times, ns.
+        seq: int64[n], arrival numbers.
+        own: Columns of the table itself, by name: `pub`, `stamp`, `channel`, `state`,
+            `error`, `ref`.
+        records: Fields of the messages, a struct each, under their own names. If one array of
+            a field is over the limit, all of its arrays are `{n, min, max, mean}`.
+    """
+
+    t: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    own: Mapping[str, Any]
+    records: Any
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self.t)
+
+    def take(self, rows: NDArray[np.intp]) -> TableRows:
+        """The selected rows, in the order given."""
+        places = pa.array(rows)
+        own = {name: column.take(places) for name, column in self.own.items()}
+        return TableRows(self.t[rows], self.seq[rows], own, self.records.take(places))
+
+    def slice(self, begin: int, end: int) -> TableRows:
+        """Rows from one index to another."""
+        if begin == 0 and end == len(self):
+            return self
+        own = {name: column.slice(begin, end - begin) for name, column in self.own.items()}
+        records = self.records.slice(begin, end - begin)
+        return TableRows(self.t[begin:end], self.seq[begin:end], own, records)
+
+    def is_unreadable(self) -> NDArray[np.bool_]:
+        """bool[n], True for messages without fields; none if `state` was not read."""
+        state = self.own.get("state")
+        if state is None:
+            return np.zeros(len(self), np.bool_)
+        return np.asarray(pc.equal(state, "unreadable").to_numpy(zero_copy_only=False))
+
+    def behind(self, key: Key) -> int:
+        """Index of the first row after a log time and arrival number."""
+        first, end = (int(np.searchsorted(self.t, key[0], side)) for side in _SIDES)
+        return first + int(np.searchsorted(self.seq[first:end], key[1], "right"))
+
+
+_SIDES: Final[tuple[Any, Any]] = ("left", "right")
+
+
+class TopicTable:
+    """All messages of a topic in a recording.
+
+    Args:
+        topic: Full name.
+        parts: Its rows.
+        counts: Numbers of its rows.
+        cache: Cache of decoded columns.
+
+    Attributes:
+        topic: Full name.
+        rows: Number of messages.
+        unreadable: Messages without fields, because they do not fit their definition.
+        reduced: Messages without fields, because they were reduced under pressure.
+        files: The files with its rows.
+    """
+
+    def __init__(
+        self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, cache: ColumnCache
+    ) -> None:
+        self.topic = topic
+        self.rows, self.unreadable, self.reduced = counts
+        self.files = list({part.file.number: part.file for part in parts}.values())
+        self._cache = cache
+        self._parts = parts
+        self._types: dict[frozenset[str] | None, Any] = {}
+        self._summarised: dict[tuple[str, ...], bool] = {}
+
+    @lazy
+    def _runs(self) -> list[list[TablePart]]:
+        return list(_runs(self._parts))
+
+    def fields(self, paths: Collection[str] | None = None) -> Any:
+        """Type of `TableRows.records`.
+
+        Args:
+            paths: Dotted paths of fields, with or without empty brackets; None for all.
+
+        Raises:
+            UnfitError: the files have no common type.
+        """
+        return self.empty(paths).type
+
+    @property
+    def has_fields(self) -> bool:
+        """True if the messages have any field."""
+        return any(not leaf.is_own for file in self.files for leaf in file.leaves)
+
+    def has(self, path: str) -> bool:
+        """True if every file has the field: an array is a summary in some, a list in others."""
+        names = names_of(path)
+        return all(
+            names in file.paths or (names in file.summary_paths and self._is_summarised(names[:-1]))
+            for file in self.files
+        )
+
+    def size(
+        self,
+        paths: Collection[str] | None = None,
+        own: Collection[str] = (),
+        where: Node | None = None,
+    ) -> int:
+        """Stored bytes to read for some fields.
+
+        Args:
+            paths: As for `fields`.
+            own: Columns of the table itself.
+            where: As for `scan`.
+        """
+        own = {"t", "seq", *own}
+        return sum(
+            part.file.stored(part.group, paths, own)
+            for part in self._parts
+            if self.may_hold(part, where)
+        )
+
+    def scan(
+        self,
+        paths: Collection[str] | None = (),
+        *,
+        own: Collection[str] = (),
+        spans: Sequence[Span] | None = None,
+        where: Node | None = None,
+        every: bool = True,
+    ) -> Iterator[TableRows]:
+        """Messages by log time and arrival, one row group at a time.
+
+        Args:
+            paths: Dotted paths of fields, including all fields below them; None for all.
+            own: Columns of the table itself besides log time and arrival number.
+            spans: Ranges of log time, ns, disjoint, in order; None for all times.
+            where: A predicate. Row groups in which it holds for no row have null fields.
+            every: False to leave such row groups out.
+
+        Raises:
+            StoreError: the data read is damaged.
+        """
+        kind = self.empty(paths)
+        runs = [[p for p in run if every or self.may_hold(p, where)] for run in self._runs]
+
+        def read(part: TablePart) -> TableRows:
+            return self._read(part, paths, own, kind, where)
+
+        streams = [self._read_run(run, spans, read) for run in runs]
+        return streams[0] if len(streams) == 1 else _merged(streams)
+
+    def _read_run(
+        self,
+        run: Sequence[TablePart],
+        spans: Sequence[Span] | None,
+        read: Callable[[TablePart], TableRows],
+    ) -> Iterator[TableRows]:
+        for part in run:
+            if spans is None:
+                yield read(part)
+                continue
+            low, high = span_of(part.first[0], part.last[0])
+            near = [span for span in spans if span[0] < high and span[1] > low]
+            if not near:
+                continue
+            rows = read(part)
+            bounds = np.searchsorted(placed(rows.t), np.array(near, np.int64).reshape(-1, 2))
+            begins, counts = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
+            if len(near) == 1:
+                rows = rows.slice(int(bounds[0, 0]), int(bounds[0, 1]))
+            else:
+                rows = rows.take(ranges(begins, counts))
+            if len(rows):
+                yield rows
+
+    def _read(
+        self,
+        part: TablePart,
+        paths: Collection[str] | None,
+        own: Collection[str],
+        kind: Any,
+        where: Node | None,
+    ) -> TableRows:
+        is_excluded = not self.may_hold(part, where)
+        ours, records = self.read(part, () if is_excluded else paths, {"t", "seq", *own})
+        t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
+        if is_excluded:
+            nulls = {field.name: pa.nulls(len(t), field.type) for field in kind.type}
+            return TableRows(t, seq, ours, structs(nulls, len(t)))
+        return TableRows(t, seq, ours, self._fitted(records, kind))
+
+    def _fitted(self, records: Any, kind: Any) -> Any:
+        """Fields of a row group in the type of all."""
+        return alike([kind, records], by_type=True)[1]
+
+    @property
+    def parts(self) -> list[TablePart]:
+        """Its row groups, by the log time of their first rows."""
+        return sorted((part for run in self._runs for part in run), key=lambda part: part.first)
+
+    def read(
+        self, part: TablePart, paths: Collection[str] | None, own: Collection[str]
+    ) -> tuple[dict[str, Any], Any]:
+        """Columns of one row group.
+
+        Args:
+            part: One of `parts`.
+            paths: As for `fields`.
+            own: Columns of the table itself.
+
+        Returns:
+            The table's own columns by name, and the fields as for `TableRows.records`, in
+            the types of the file.
+
+        Raises:
+            StoreError: the data read is damaged.
+        """
+        check_wanted()
+        by_top = part.file.by_top(paths, own)
+        columns = {top: self._column(part, top, numbers) for top, numbers in by_top.items()}
+        ours = {name: columns.pop(name) for name in own if name in columns}
+        return ours, self._records(part.file, columns, part.rows)
+
+    def _column(self, part: TablePart, top: str, leaves: tuple[int, ...]) -> Any:
+        column = self._cache.get(part.file, part.group, top, leaves)
+        return column.slice(part.begin, part.rows)
+
+    def _records(self, file: ColumnFile, columns: Mapping[str, Any], rows: int) -> Any:
+        """Columns as fields of messages, under their own names."""
+        if not columns:
+            return structs({}, rows)
+        fields = [file.schema.field(top).with_type(one.type) for top, one in columns.items()]
+        array = pa.StructArray.from_arrays(list(columns.values()), fields=fields)
+        return records_of(array, self._is_summarised)
+
+    def _is_summarised(self, array: tuple[str, ...]) -> bool:
+        """True if an array is over the limit in some row."""
+        if array not in self._summarised:
+            self._summarised[array] = any(self._has_summary(part, array) for part in self._parts)
+        return self._summarised[array]
+
+    def _has_summary(self, part: TablePart, array: tuple[str, ...]) -> bool:
+        leaf = part.file.summaries.get(array)
+        if leaf is None:
+            return False
+        nulls = part.file.nulls(part.group, leaf)
+        if nulls is not None and nulls == part.file.values(part.group, leaf):
+            return False
+        top = part.file.leaves[leaf].top
+        column = self._column(part, top, (leaf,))
+        return _has_values(column)
+
+    def empty(self, paths: Collection[str] | None) -> Any:
+        """An empty array with the common type of the rows of all files.
+
+        Raises:
+            UnfitError: the files have no common type.
+        """
+        key = None if paths is None else frozenset(paths)
+        if key not in self._types:
+            if len(self._types) >= _MAX_TYPES:
+                self._types.clear()
+            self._types[key] = self._find_type(paths)
+        return self._types[key]
+
+    def _find_type(self, paths: Collection[str] | None) -> Any:
+        found = []
+        for file in self.files:
+            table = file.read(None, file.choose(paths, ()))
+            columns = [(field.name, pa.nulls(0, field.type)) for field in table.schema]
+            found.append(self._records(file, dict(columns), 0))
+        return alike(found, by_type=True)[0].slice(0, 0)
+
+    def may_hold(self, part: TablePart, where: Node | None) -> bool:
+        """False if zones tell that a predicate holds for no row of a row group."""
+        zones = part.file.zones
+        return where is None or not zones or may_hold(where, zones[part.group])
+
+
+def _has_values(column: Any) -> bool:
+    """True if a value inside a column is not null."""
+    if pa.types.is_struct(column.type):
+        return any(map(_has_values, column.flatten()))
+    if is_list(column.type):
+        return _has_values(column.flatten())
+    return bool(column.null_count < len(column))
+
+
+def _runs(parts: Sequence[TablePart]) -> Iterator[list[TablePart]]:
+    """Row groups in as few ordered sequences as possible."""
+    if all(part.first == FIRST for part in parts):
+        yield list(parts)  # of a file in which the topic's rows are in order
+        return
+    runs: list[list[TablePart]] = []
+    for part in sorted(parts, key=lambda part: part.first):
+        for run in runs:
+            if run[-1].last < part.first:
+                run.append(part)
+                break
+        else:
+            runs.append([part])
+    yield from runs
+
+
+def _merged(streams: Sequence[Iterator[TableRows]]) -> Iterator[TableRows]:
+    """Rows of several ordered sequences, merged in order."""
+    heads: list[tuple[TableRows, Iterator[TableRows]]] = []
+    for stream in streams:
+        head = next(stream, None)
+        if head is not None:
+            heads.append((head, stream))
+    while heads:
+        key = min((int(rows.t[-1]), int(rows.seq[-1])) for rows, _ in heads)
+        ready, left = [], []
+        for rows, stream in heads:
+            end = rows.behind(key)
+            if end:
+                ready.append(rows.slice(0, end))
+            rest = rows.slice(end, len(rows)) if end < len(rows) else next(stream, None)
+            if rest is not None:
+                left.append((rest, stream))
+        heads = left
+        yield _in_order(ready)
+
+
+def _in_order(parts: Sequence[TableRows]) -> TableRows:
+    if len(parts) == 1:
+        return parts[0]
+    own = {name: pa.concat_arrays([part.own[name] for part in parts]) for name in parts[0].own}
+    t, seq = np.concatenate([p.t for p in parts]), np.concatenate([p.seq for p in parts])
+    rows = TableRows(t, seq, own, pa.concat_arrays([part.records for part in parts]))
+    order = order_of(t, seq)
+    return rows if order is None else rows.take(order)
