@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Reader
 
-from hybridlog.cli.write_answer import write_answer
+from hybridlog.cli.answers import write_answer
 from hybridlog.query.query import Query
 from tests.ros_values import Duration, Time
 

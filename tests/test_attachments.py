@@ -19,7 +19,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 
 import hybridlog as hl
 from hybridlog.attachments import StoredAttachment, file_names
-from hybridlog.cli.write_answer import write_answer
+from hybridlog.cli.answers import write_answer
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_check import SegmentCheck

@@ -22,7 +22,7 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog.cli.write_answer import write_answer
+from hybridlog.cli.answers import write_answer
 from hybridlog_storage.errors import PayloadError, TopicError
 from hybridlog_storage.messages import Channel, Schema
 

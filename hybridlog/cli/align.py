@@ -12,11 +12,11 @@ import click
 
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost
+from hybridlog.cli.answers import Destination, answer_tables, table_options
 from hybridlog.cli.completion import complete_recording, complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output import notes
 from hybridlog.cli.query_options import parse_fields, query_of
-from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -81,7 +81,7 @@ if TYPE_CHECKING:
 )
 @table_options
 @options.verbose
-def command(
+def align_command(
     *,
     base: str,
     topic: tuple[str, ...],
@@ -94,10 +94,7 @@ def command(
     choice: Choice,
     beside: tuple[str, ...],
     fields: tuple[str, ...],
-    form: str | None,
-    output: Path | None,
-    force: bool,
-    limit: int | None,
+    to: Destination,
     strict: bool,
     mongo: str | None,
     quiet: bool,
@@ -108,9 +105,6 @@ def command(
     named by topic and field; `distance` is the time of a topic's message minus that of the
     row. What is not near enough is empty; lines on standard error say why.
     """
-    choices = TableChoices(
-        form=form, output=output, force=force, limit=limit, quiet=quiet
-    ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         queries = _queries(opened, [base, *topic], choice, beside)
@@ -130,7 +124,7 @@ def command(
             clock=clock,
             across_recordings=bool(beside),
         )
-        write_tables(aligned.to_tables(), aligned.schema, choices)
+        answer_tables(aligned.to_tables(), aligned.schema, to)
         sys.stdout.flush()
         if not quiet:
             print_cost(aligned.counters, time.monotonic() - started, count=False)

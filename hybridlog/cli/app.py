@@ -12,50 +12,50 @@ from hybridlog import __version__
 from hybridlog.cli.completion import install_completion, show_completion
 from hybridlog.cli.exit_codes import as_text
 
-COMMANDS: Final = (
-    "record",
-    "ls",
-    "info",
-    "du",
-    "losses",
-    "top",
-    "mark",
-    "rename",
-    "tag",
-    "untag",
-    "note",
-    "import",
-    "trigger",
-    "schema",
-    "tables",
-    "fetch",
-    "intervals",
-    "changes",
-    "align",
-    "resample",
-    "rate",
-    "gaps",
-    "stats",
-    "plot",
-    "sql",
-    "view",
-    "export",
-    "serve",
-    "open",
-    "attachments",
-    "index",
-    "verify",
-    "repair",
-    "compact",
-    "rm",
-    "trust",
-    "demo",
-)
-"""Names of the commands, in the order of the help text."""
+COMMANDS: Final = {
+    "record": "record",
+    "ls": "ls",
+    "info": "info",
+    "du": "du",
+    "losses": "losses",
+    "top": "top",
+    "mark": "mark",
+    "rename": "rename",
+    "tag": "tag",
+    "untag": "untag",
+    "note": "note",
+    "import": "import_",
+    "trigger": "trigger",
+    "schema": "schema",
+    "tables": "tables",
+    "fetch": "fetch",
+    "intervals": "intervals",
+    "changes": "intervals",
+    "align": "align",
+    "resample": "resample",
+    "rate": "rate",
+    "gaps": "intervals",
+    "stats": "stats",
+    "plot": "plot",
+    "sql": "sql",
+    "view": "view",
+    "export": "export",
+    "serve": "serve",
+    "open": "open",
+    "attachments": "attachments",
+    "index": "index",
+    "verify": "verify",
+    "repair": "repair",
+    "compact": "compact",
+    "rm": "rm",
+    "trust": "trust",
+    "demo": "demo",
+}
+"""Names of the commands, in the order of the help text, and their modules."""
 
 
 class _LazyGroup(click.Group):
-    """A group whose command `name` is `command` in the module `hybridlog.cli.name`."""
+    """A group whose command `name` is the function `name_command` in the module of its name."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -63,9 +63,8 @@ class _LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        # `import` is a keyword of Python, so its module is called `import_`.
-        module = "import_" if cmd_name == "import" else cmd_name
-        command: click.Command = import_module(f"hybridlog.cli.{module}").command
+        module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
+        command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
 

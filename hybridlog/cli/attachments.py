@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
-def command(
+def attachments_command(
     *,
     recording: str,
     name: str | None,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
-def command(
+def compact_command(
     *,
     choice: Choice,
     topic: tuple[str, ...],

@@ -27,7 +27,7 @@ from hybridlog.cli import options
 @click.option(
     "--seed", type=int, default=1, metavar="N", help="Another number gives another drive."
 )
-def command(*, directory: Path, duration: float, seed: int) -> int:
+def demo_command(*, directory: Path, duration: float, seed: int) -> int:
     """Take a tour: simulate a robot, record it, query it."""
     from hybridlog.demo import tour
 

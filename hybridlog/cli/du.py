@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @options.store
 @options.mongo
 @options.as_json
-def command(
+def du_command(
     *, choice: Choice, by: str, store: Path | None, mongo: str | None, as_json: bool
 ) -> None:
     """Show what recordings and topics take on the disk.

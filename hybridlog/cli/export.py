@@ -11,11 +11,12 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answer_notes import latched, print_remarks
+from hybridlog.cli.answers import write_answer
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.write_answer import write_answer
+from hybridlog.export import FORMATS, formats_of, suffixes_of
 from hybridlog.export.slices import Front
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
     from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
 
-_EXACT = {"mcap", "bag"}
+_LOGS = formats_of("log")
+_TABLES = formats_of("table", "lines")
 
 
 @click.command()
@@ -34,14 +36,14 @@ _EXACT = {"mcap", "bag"}
     "target",
     type=options.PATH,
     metavar="OUTPUT",
-    help="File (mcap, bag) or directory (parquet, csv).",
+    help=f"File ({', '.join(_LOGS)}) or directory (tables).",
 )
 @click.option(
     "--format",
     "-F",
     "form",
-    type=click.Choice(["parquet", "csv", "mcap", "bag"]),
-    help="Format; without, by the suffix (.mcap, .bag).",
+    type=click.Choice([*_LOGS, *_TABLES]),
+    help=f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
 )
 @options.store
 @options.choice
@@ -56,7 +58,7 @@ _EXACT = {"mcap", "bag"}
 @options.force
 @options.mongo
 @options.quiet
-def command(
+def export_command(
     *,
     target: Path,
     form: str | None,
@@ -76,9 +78,8 @@ def command(
     form = form or _form(target)
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
-    if tags is not None and form in _EXACT:
-        raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
-    if form in _EXACT:
+    options.check_tags(tags, form)
+    if form in _LOGS:
         check_room(target, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = query_of(opened, topic, choice)
@@ -88,7 +89,7 @@ def command(
             query = query.between(*between)
         if tags is not None:
             query = query.tags(*parse_fields(tags, "--tags"))
-        if form in _EXACT:
+        if form in _LOGS:
             extras = query.extras()
             if no_attachments:
                 extras = extras._replace(attachments=[], left_out=0)
@@ -96,17 +97,17 @@ def command(
         else:
             _write_directory(query, form, target, force=force, quiet=quiet)
         if not quiet:
-            print_remarks(query, topic, is_empty=None if form in _EXACT else False)
+            print_remarks(query, topic, is_empty=None if form in _LOGS else False)
 
 
 def _form(target: Path) -> str:
-    form = target.suffix.lower().lstrip(".")
-    if form not in _EXACT:
+    suffixes = suffixes_of(_LOGS)
+    if target.suffix.lower() not in suffixes:
         raise UsageError(
-            f"{target} does not give the format: end it in .mcap or .bag, or name a directory "
-            "for tables and add --format parquet or csv."
+            f"{target} does not give the format: end it in {' or '.join(suffixes)}, or name a "
+            "directory for tables and add --format parquet or csv."
         )
-    return form
+    return suffixes[target.suffix.lower()]
 
 
 def _write_file(
@@ -151,7 +152,8 @@ def _remove_empty(directory: Path) -> None:
 
 
 def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    paths = {topic: directory / f"{collection_of(topic)}.{form}" for topic in query.topics}
+    suffix = FORMATS[form].suffixes[0]
+    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in query.topics}
     for path in paths.values():
         check_room(path, force=force)
     left_out: list[HybridlogError] = []

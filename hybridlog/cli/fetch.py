@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +12,18 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answer_notes import print_cost, print_lost, print_remarks
+from hybridlog.cli.answers import (
+    Destination,
+    answer_query,
+    format_of,
+    format_option,
+    output_option,
+    write_following,
+)
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
-from hybridlog.cli.signals import Stopped, if_stopped
-from hybridlog.cli.write_answer import write_answer, write_following
-from hybridlog.export import PICTURES
+from hybridlog.cli.signals import Stopped
+from hybridlog.export import FORMATS, formats_of
 from hybridlog.export.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -28,23 +33,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
-_FORMATS = ("table", "jsonl", "csv", "parquet", "arrow", "npz", "mcap", "bag", "raw", "png", "jpg")
-_SUFFIXES = {
-    ".jsonl": "jsonl",
-    ".ndjson": "jsonl",
-    ".csv": "csv",
-    ".parquet": "parquet",
-    ".arrow": "arrow",
-    ".feather": "arrow",
-    ".npz": "npz",
-    ".mcap": "mcap",
-    ".bag": "bag",
-    ".png": "png",
-    ".jpg": "jpg",
-    ".jpeg": "jpg",
-}
-_TEXT = {"jsonl", "csv"}
-_WITHOUT_COLUMNS = {"mcap", "bag", "raw", *PICTURES}
+_FORMATS = formats_of()
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,43 +111,29 @@ class _Choices:
 @click.option("--after", metavar="DURATION", help="Instead: end this long after each of these.")
 @options.strict
 @options.count
-@click.option(
-    "--format",
-    "-F",
-    "form",
-    type=click.Choice(_FORMATS),
-    help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
-)
-@click.option(
-    "--output",
-    "-o",
-    type=options.PATH,
-    metavar="FILE",
-    help="Write to this file (raw: a directory; png and jpg: a directory, or one picture); - is "
-    "standard output.",
-)
+@format_option(_FORMATS)
+@output_option("Write to this file (raw: a directory; png and jpg: a directory, or one picture)")
 @options.no_latched
 @options.original_times
 @options.force
 @options.mongo
 @options.quiet
 @options.verbose
-def command(**parameters: Any) -> None:
+def fetch_command(**parameters: Any) -> None:
     """Fetch messages by topic, time and content.
 
     Without --format and -o: a table on a terminal, JSON lines elsewhere. The cost of the
     answer, and what it may lack, is printed on standard error.
     """
     choices = _Choices(**parameters)
-    form = _form(choices)
-    path = _path(choices, form)
+    to = _destination(choices)
     started = time.monotonic()
     with opened_store(
         choices.store, choices.mongo, quiet=choices.quiet, is_lasting=choices.follow
     ) as store:
         query = _query(store, choices)
         if choices.follow:
-            _follow(query, choices, form)
+            _follow(query, choices, to.form)
             return
         if choices.at is not None:
             try:
@@ -174,7 +149,12 @@ def command(**parameters: Any) -> None:
             count = query.count()
             output.say(str(count))
         else:
-            query = _answer(query, form, path, choices)
+            front = Front(
+                # With --at, the answer is one message.
+                latched=not choices.no_latched and choices.at is None,
+                original_times=choices.original_times,
+            )
+            query = answer_query(query, to, front=front)
         sys.stdout.flush()
         if not choices.quiet:
             cost = query.counters.copy()
@@ -192,7 +172,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
     stopped: Stopped | None = None
     try:
         with at_safe_points():
-            write_following(following, form, sys.stdout.buffer)
+            write_following(following, form)
     except Stopped as error:
         stopped = error
     if not choices.quiet:
@@ -208,28 +188,6 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
                 output.note(f"{one.label} has ended: {status(one)}.")
     if stopped is not None:
         raise stopped
-
-
-def _answer(query: Query, form: str, path: Path | None, choices: _Choices) -> Query:
-    """Print or write the messages; returns the query with its counters."""
-    if form == "table":
-        from hybridlog.cli.screen import print_answer
-
-        return print_answer(query)
-    # With --at, the answer is one message.
-    front = Front(
-        latched=not choices.no_latched and choices.at is None,
-        original_times=choices.original_times,
-    )
-    if path is None:
-        write_answer(query, form, sys.stdout.buffer, front=front, quiet=True)
-    else:
-        with (
-            if_stopped(partial(not_written, path)),
-            replacing(path, force=choices.force, is_directory=_is_directory(path, form)),
-        ):
-            write_answer(query, form, path, front=front, quiet=choices.quiet)
-    return query
 
 
 def _query(store: Store, choices: _Choices) -> Query:
@@ -253,23 +211,20 @@ def _query(store: Store, choices: _Choices) -> Query:
     return query
 
 
-def _form(choices: _Choices) -> str:
+def _destination(choices: _Choices) -> Destination:
+    """Format and place of the answer; refuses what makes no sense before a store is opened."""
     _check_near(choices)
     _check_together(choices)
-    if choices.form is not None or choices.follow:
-        form = choices.form or "jsonl"
-    elif choices.output is None or str(choices.output) == "-":
-        form = "table" if sys.stdout.isatty() else "jsonl"
-    else:
-        form = _form_of(choices.output)
+    usual = "jsonl" if choices.follow else None
+    form = format_of(choices.form or usual, choices.output, _FORMATS)
     options.check_latched(
         no_latched=choices.no_latched, original_times=choices.original_times, form=form
     )
-    if choices.tags is not None and form in _WITHOUT_COLUMNS:
-        raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
-    if form == "table" and choices.output is not None:
-        raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
-    return form
+    options.check_tags(choices.tags, form)
+    to = Destination(form=form, path=choices.output, force=choices.force, quiet=choices.quiet)
+    if not choices.count:
+        to.check()
+    return to
 
 
 def _check_together(choices: _Choices) -> None:
@@ -287,7 +242,7 @@ def _check_together(choices: _Choices) -> None:
         ]
     if choices.follow:
         alone["--follow prints messages as they come, in lines (jsonl, csv)"] = [
-            (choices.form not in {None, *_TEXT}, f"--format {choices.form}"),
+            (not _is_text(choices.form), f"--format {choices.form}"),
             (choices.output is not None, "--output"),
             (choices.reverse, "--reverse"),
             (choices.count, "--count"),
@@ -299,6 +254,10 @@ def _check_together(choices: _Choices) -> None:
         for given, option in others:
             if given:
                 raise UsageError(f"{reason}: leave out {option}.")
+
+
+def _is_text(form: str | None) -> bool:
+    return form is None or (form in FORMATS and FORMATS[form].is_text)
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:
@@ -330,41 +289,3 @@ def _check_near(choices: _Choices) -> None:
         raise UsageError(
             "--where with another topic needs a length of time: add --within, --before or --after."
         )
-
-
-def _form_of(path: Path) -> str:
-    """The format that a suffix names.
-
-    Raises:
-        UsageError: It names none.
-    """
-    form = _SUFFIXES.get(path.suffix.lower())
-    if form is None:
-        raise UsageError(
-            f"The name {path} does not give the format: add --format, or end it in "
-            f"{', '.join(_SUFFIXES)}."
-        )
-    return form
-
-
-def _path(choices: _Choices, form: str) -> Path | None:
-    """The file to write; None for standard output. Errors come before the store is opened."""
-    if choices.count:
-        return None
-    if choices.output is None or str(choices.output) == "-":
-        if form not in {*_TEXT, "table"} and sys.stdout.isatty():
-            what = "a directory" if form in PICTURES else "a file"
-            raise UsageError(f"{form} is no text for a terminal: name {what} with -o.")
-        return None
-    is_directory = _is_directory(choices.output, form)
-    check_room(choices.output, force=choices.force, is_directory=is_directory)
-    return choices.output
-
-
-def _is_directory(path: Path, form: str) -> bool:
-    """True if the output is a directory with a file a message."""
-    if form not in PICTURES:
-        return form == "raw"
-    from hybridlog.export.pictures import suffix_of
-
-    return suffix_of(path) is None

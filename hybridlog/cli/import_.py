@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 @options.store
 @options.as_json
 @options.quiet
-def command(*, other: Path, choice: Choice, store: Path | None, as_json: bool, quiet: bool) -> None:
+def import_command(
+    *, other: Path, choice: Choice, store: Path | None, as_json: bool, quiet: bool
+) -> None:
     """Copy recordings from another store.
 
     Every byte is checked. After an interruption, run it again: copied recordings stay.

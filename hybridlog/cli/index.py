@@ -40,11 +40,11 @@ def _options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.group()
-def command() -> None:
+def index_command() -> None:
     """Index fields in MongoDB, for questions and other programs."""
 
 
-@command.command("list")
+@index_command.command("list")
 @click.argument(
     "topic",
     required=False,
@@ -62,7 +62,7 @@ def list_(
     _print(found, as_json=as_json, quiet=quiet)
 
 
-@command.command()
+@index_command.command()
 @_TOPIC
 @_FIELDS
 @_options
@@ -81,7 +81,7 @@ def add(
     _print(found, as_json=as_json, quiet=quiet)
 
 
-@command.command()
+@index_command.command()
 @_TOPIC
 @_FIELDS
 @_options
@@ -103,7 +103,7 @@ def remove(
     _print(found, as_json=as_json, quiet=quiet)
 
 
-@command.command()
+@index_command.command()
 @_options
 def address(*, store: Path | None, mongo: str | None, as_json: bool, quiet: bool) -> None:
     """Print the address of the index for other programs, and what is in it.
@@ -132,7 +132,7 @@ def address(*, store: Path | None, mongo: str | None, as_json: bool, quiet: bool
         output.say(f"database {found.database}, {output.counted(recordings, 'recording')}")
 
 
-@command.command()
+@index_command.command()
 @options.choice
 @options.store
 @options.mongo

@@ -50,7 +50,7 @@ _OVER_TIME = "over time"
 @options.store
 @options.mongo
 @options.as_json
-def command(
+def info_command(
     *,
     what: str | None,
     choice: Choice,

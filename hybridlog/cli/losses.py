@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @options.only_topics
 @options.mongo
 @options.as_json
-def command(
+def losses_command(
     *,
     choice: Choice,
     store: Path | None,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @options.store
 @options.mongo
 @options.as_json
-def command(*, choice: Choice, store: Path | None, mongo: str | None, as_json: bool) -> None:
+def ls_command(*, choice: Choice, store: Path | None, mongo: str | None, as_json: bool) -> None:
     """List the recordings."""
     with opened_store(store, mongo, quiet=as_json) as opened:
         recordings = recordings_of(opened, choice).summaries

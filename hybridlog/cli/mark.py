@@ -23,7 +23,7 @@ from hybridlog_storage.errors import UsageError
 )
 @options.store
 @options.quiet
-def command(
+def mark_command(
     *,
     text: str,
     tag: tuple[str, ...],

@@ -16,7 +16,7 @@ from hybridlog_storage.errors import UsageError
 @click.argument("text", metavar="TEXT", help="Text of the note.")
 @options.store
 @options.quiet
-def command(*, recording: str, text: str, store: Path | None, quiet: bool) -> None:
+def note_command(*, recording: str, text: str, store: Path | None, quiet: bool) -> None:
     """Write a note about a recording; `info` shows it."""
     if not text.strip():
         raise UsageError("A note needs a text: give one that is not empty.")

@@ -71,7 +71,7 @@ _VIEWERS: Final = {
 @options.force
 @options.mongo
 @options.quiet
-def command(
+def open_command(
     *,
     viewer: str,
     choice: Choice,
@@ -92,7 +92,7 @@ def command(
     """
     import subprocess
 
-    from hybridlog.cli.write_answer import write_answer
+    from hybridlog.cli.answers import write_answer
     from hybridlog.export.slice_cache import SliceCache
 
     program = _find(viewer)

@@ -17,6 +17,7 @@ from hybridlog.cli.completion import (
     complete_topic,
     complete_type,
 )
+from hybridlog.export import formats_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 
@@ -249,11 +250,23 @@ def check_latched(*, no_latched: bool, original_times: bool, form: str | None) -
     """
     if no_latched and original_times:
         raise UsageError("--no-latched leaves no messages for --original-times: give one of them.")
-    if original_times and form not in {None, "mcap", "bag"}:
+    logs = formats_of("log")
+    if original_times and form not in {None, *logs}:
         raise UsageError(
-            f"Latched messages from before the time range are in mcap and bag, not in {form}: "
+            f"Latched messages from before the time range are in {' and '.join(logs)}, not in "
+            f"{form}: "
             "leave out --original-times."
         )
+
+
+def check_tags(tags: str | None, form: str) -> None:
+    """Refuse --tags where the format has no columns.
+
+    Raises:
+        UsageError: It has none.
+    """
+    if tags is not None and form in formats_of("log", "payloads", "pictures"):
+        raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
 
 
 def parse_tags(pairs: Iterable[str]) -> dict[str, str]:

@@ -67,7 +67,7 @@ _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 @options.mongo
 @options.quiet
 @options.verbose
-def command(
+def plot_command(
     *,
     topic: tuple[str, ...],
     fields: str | None,

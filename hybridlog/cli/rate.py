@@ -11,9 +11,9 @@ import click
 
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost, print_remarks
+from hybridlog.cli.answers import Destination, answer_tables, table_options
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked
-from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 
 if TYPE_CHECKING:
     from hybridlog.query.choice import Choice
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @options.choice
 @table_options
 @options.verbose
-def command(
+def rate_command(
     *,
     topic: tuple[str, ...],
     window: str | None,
@@ -36,22 +36,16 @@ def command(
     between: tuple[str, str] | None,
     where: tuple[str, ...],
     choice: Choice,
-    form: str | None,
-    output: Path | None,
-    force: bool,
-    limit: int | None,
+    to: Destination,
     strict: bool,
     mongo: str | None,
     quiet: bool,
 ) -> None:
     """Show how many messages came in a second."""
-    choices = TableChoices(
-        form=form, output=output, force=force, limit=limit, quiet=quiet
-    ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
-        write_tables([query.rate(window)], lambda: None, choices)
+        answer_tables([query.rate(window)], lambda: None, to)
         sys.stdout.flush()
         if not quiet:
             print_cost(query.counters, time.monotonic() - started, count=True)

@@ -248,7 +248,7 @@ def _is_file(word: str) -> bool:
 @options.as_json
 @options.quiet
 @click.pass_context
-def command(context: click.Context, /, **parameters: Any) -> None:
+def record_command(context: click.Context, /, **parameters: Any) -> None:
     """Record logs, or a running robot, into the store.
 
     Each path becomes a recording: a ROS 1 bag, a ROS 2 bag (its directory or one file), an

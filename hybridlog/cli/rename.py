@@ -16,7 +16,7 @@ from hybridlog_storage.errors import UsageError
 @click.argument("name", metavar="NAME", help="Its new name.")
 @options.store
 @options.quiet
-def command(*, recording: str, name: str, store: Path | None, quiet: bool) -> None:
+def rename_command(*, recording: str, name: str, store: Path | None, quiet: bool) -> None:
     """Give a recording another name.
 
     Its directory is renamed as well; nothing else of the recording changes.

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
-def command(
+def repair_command(
     *,
     choice: Choice,
     store: Path | None,

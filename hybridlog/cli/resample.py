@@ -11,10 +11,10 @@ import click
 
 from hybridlog.cli import options
 from hybridlog.cli.answer_notes import print_cost
+from hybridlog.cli.answers import Destination, answer_tables, table_options
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output import notes
 from hybridlog.cli.query_options import asked
-from hybridlog.cli.table_output import TableChoices, table_options, write_tables
 
 if TYPE_CHECKING:
     from hybridlog.query.choice import Choice
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
 @table_options
 @options.verbose
-def command(
+def resample_command(
     *,
     topic: tuple[str, ...],
     step: str,
@@ -52,10 +52,7 @@ def command(
     where: tuple[str, ...],
     choice: Choice,
     fields: str | None,
-    form: str | None,
-    output: Path | None,
-    force: bool,
-    limit: int | None,
+    to: Destination,
     strict: bool,
     mongo: str | None,
     quiet: bool,
@@ -64,16 +61,13 @@ def command(
 
     The times begin with each recording, or with the range of --between.
     """
-    choices = TableChoices(
-        form=form, output=output, force=force, limit=limit, quiet=quiet
-    ).checked()
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = asked(
             opened, topic, choice, between=between, where=where, fields=fields, strict=strict
         )
         rows = query.resample(step, how, tolerance)
-        write_tables(rows.to_tables(), rows.schema, choices)
+        answer_tables(rows.to_tables(), rows.schema, to)
         sys.stdout.flush()
         if not quiet:
             print_cost(rows.counters, time.monotonic() - started, count=False)

@@ -31,7 +31,7 @@ _MOST_ROWS = 20
 @options.store
 @click.option("--yes", "-y", is_flag=True, help="Do not ask.")
 @options.mongo
-def command(*, choice: Choice, store: Path | None, yes: bool, mongo: str | None) -> None:
+def rm_command(*, choice: Choice, store: Path | None, yes: bool, mongo: str | None) -> None:
     """Delete recordings, payloads and index."""
     if choice.is_everything:
         raise UsageError(

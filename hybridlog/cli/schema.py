@@ -28,7 +28,7 @@ _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 @options.choice
 @options.mongo
 @options.as_json
-def command(
+def schema_command(
     *, topic: str, store: Path | None, choice: Choice, mongo: str | None, as_json: bool
 ) -> None:
     """Show a topic's message definition and its fields."""

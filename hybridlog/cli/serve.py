@@ -58,7 +58,7 @@ _MAX_SHOWN = 5  # topics
 @options.strict
 @options.mongo
 @options.quiet
-def command(
+def serve_command(
     *,
     choice: Choice,
     topic: tuple[str, ...],

@@ -8,11 +8,10 @@ from pathlib import Path
 import click
 
 from hybridlog.cli import options
+from hybridlog.cli.answers import Destination, answer_sql, table_options
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output import parse_size
+from hybridlog.cli.output import notes, parse_size
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.sql_answer import print_remarks, write_answer
-from hybridlog.cli.table_output import TableChoices, table_options
 
 
 @click.command()
@@ -31,16 +30,13 @@ from hybridlog.cli.table_output import TableChoices, table_options
 )
 @click.option("--timeout", metavar="DURATION", help="Stop a query that takes longer.")
 @table_options
-def command(
+def sql_command(
     *,
     query: str | None,
     store: Path | None,
     memory: str | None,
     timeout: str | None,
-    form: str | None,
-    output: Path | None,
-    force: bool,
-    limit: int | None,
+    to: Destination,
     strict: bool,
     mongo: str | None,
     quiet: bool,
@@ -53,9 +49,6 @@ def command(
     from hybridlog.query.times import parse_duration
     from hybridlog.sql.memory_limit import limited_memory
 
-    choices = TableChoices(
-        form=form, output=output, force=force, limit=limit, quiet=quiet
-    ).checked()
     most = None if memory is None else parse_size(memory)
     seconds = None if timeout is None else parse_duration(timeout) / 1e9
     is_prompt = query is None and sys.stdin.isatty()
@@ -74,12 +67,12 @@ def command(
         if is_prompt:
             from hybridlog.cli.sql_prompt import run_prompt
 
-            run_prompt(connection, choices, seconds, check)
+            run_prompt(connection, to, seconds, check)
             return
         with if_stopped("The query was stopped."), limited_memory(connection.memory):
             check(query or "")
             answer = connection.query(query or "", timeout=seconds)
-            write_answer(answer, choices)
+            answer_sql(answer, to)
         sys.stdout.flush()
         if not quiet:
-            print_remarks(answer)
+            notes(answer.told())

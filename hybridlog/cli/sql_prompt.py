@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.cli.output import note, say
-from hybridlog.cli.sql_answer import print_remarks, write_answer
+from hybridlog.cli.answers import Destination, answer_sql
+from hybridlog.cli.output import note, notes, say
 from hybridlog.index.consent import state_directory
 from hybridlog.sql.completion import DELIMITERS, candidates
 from hybridlog.sql.memory_limit import limited_memory
@@ -18,7 +18,6 @@ from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    from hybridlog.cli.table_output import TableChoices
     from hybridlog.sql.engine import SqlConnection
 
 _PROMPT: Final = "sql> "
@@ -30,7 +29,7 @@ _MAX_HISTORY: Final = 1000
 
 def run_prompt(
     connection: SqlConnection,
-    choices: TableChoices,
+    to: Destination,
     timeout: float | None,
     check: Callable[[str], None],
 ) -> None:
@@ -40,7 +39,7 @@ def run_prompt(
 
     Args:
         connection: Runs the statements.
-        choices: How answers are printed.
+        to: Format and place of the answers.
         timeout: Seconds that one may take; None for no limit.
         check: Refuses a statement whose answer would not be complete.
     """
@@ -54,9 +53,9 @@ def run_prompt(
                 with at_safe_points(), limited_memory(connection.memory):
                     check(text)
                     answer = connection.query(text, timeout=timeout)
-                    write_answer(answer, choices)
+                    answer_sql(answer, to)
                     sys.stdout.flush()
-                    print_remarks(answer)
+                    notes(answer.told())
             except HybridlogError as error:
                 for line in str(error).splitlines():
                     note(line)

@@ -40,7 +40,7 @@ _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 @options.as_json
 @options.quiet
 @options.verbose
-def command(
+def stats_command(
     *,
     topic: tuple[str, ...],
     fields: str | None,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @options.choice
 @options.mongo
 @options.as_json
-def command(
+def tables_command(
     *, topic: str, store: Path | None, choice: Choice, mongo: str | None, as_json: bool
 ) -> None:
     """Show a topic's Parquet files, and SQL for DuckDB."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 @options.store
 @options.as_json
 @options.quiet
-def command(
+def tag_command(
     *, words: tuple[str, ...], choice: Choice, store: Path | None, as_json: bool, quiet: bool
 ) -> None:
     """Set or show the tags of recordings."""

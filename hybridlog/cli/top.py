@@ -60,7 +60,7 @@ class _Field:
 @click.option("--once", is_flag=True, help="Show it once and end.")
 @options.mongo
 @click.option("--json", "as_json", is_flag=True, help="A line of JSON a second, for scripts.")
-def command(
+def top_command(
     *,
     recording: str | None,
     store: Path | None,

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 @options.as_json
 @options.quiet
 @options.verbose
-def command(
+def trigger_command(
     *,
     name: str | None,
     recording: tuple[str, ...],

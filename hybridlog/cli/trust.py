@@ -12,7 +12,7 @@ from hybridlog.cli import options, output
 @click.command()
 @options.store
 @click.option("--forget", is_flag=True, help="Do not trust this store's server any more.")
-def command(*, store: Path | None, forget: bool) -> None:
+def trust_command(*, store: Path | None, forget: bool) -> None:
     """Trust the MongoDB server that another user's store names.
 
     Until then, commands do not connect to it: a user's own stores only are trusted. The store

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 @options.choice
 @options.store
 @options.quiet
-def command(*, words: tuple[str, ...], choice: Choice, store: Path | None, quiet: bool) -> None:
+def untag_command(
+    *, words: tuple[str, ...], choice: Choice, store: Path | None, quiet: bool
+) -> None:
     """Remove tags of recordings."""
     with opened_store(store, None, quiet=quiet) as opened:
         chosen, keys, is_one = named_or_chosen(opened, choice, words)

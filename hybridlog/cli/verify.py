@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @options.mongo
 @options.as_json
 @options.quiet
-def command(
+def verify_command(
     *,
     choice: Choice,
     store: Path | None,

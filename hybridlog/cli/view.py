@@ -49,7 +49,7 @@ _MAX_FOLDERS = 1000
 )
 @options.mongo
 @options.as_json
-def command(
+def view_command(
     *,
     recording: str | None,
     store: Path | None,

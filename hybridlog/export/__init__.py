@@ -1,22 +1,18 @@
-"""Writers of files for other tools.
-
-`FORMATS` lists the formats; `open_batch_writer`, `open_log_writer`, `open_table_writer` and
-`open_row_writer` open a writer by name, and import its module then.
-"""
+"""Writers of files for other tools. `FORMATS` lists them; a writer is imported when it is used."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
-
-from hybridlog_storage.errors import UsageError
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    from collections.abc import Iterable
+    from pathlib import Path
 
-    from hybridlog.export.base import BatchWriter, LogWriter, RowWriter, TableWriter, Target
+    from hybridlog.export.base import Target
 
-Kind = Literal["exact", "table", "rows"]
+Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,111 +20,61 @@ class Format:
     """An output format.
 
     Attributes:
-        kind: `exact` formats hold unchanged payloads and take batches; `table` formats hold
-            columns and take Arrow tables; `rows` formats hold one object for each message.
-        suffix: Usual suffix of the file; empty for a directory.
-        help: One line for help texts.
+        content: What its writer takes: `lines` of JSON, one a message; Arrow tables (`table`);
+            batches of messages for a `log`, or for a file a payload (`payloads`); `pictures`.
+        writer: The writer, as `module:name`. Called with a path or a binary stream, and with
+            the `schema` of tables.
+        suffixes: Suffixes of file names, the usual one first; none if it writes a directory.
+        is_text: It can be read on a terminal, and written a message at a time.
+        has_profile: The writer takes the MCAP `profile` of the messages, too.
     """
 
-    kind: Kind
-    suffix: str
-    help: str
+    content: Content
+    writer: str
+    suffixes: tuple[str, ...]
+    is_text: bool = False
+    has_profile: bool = False
+
+    def open(self, target: Target, **options: Any) -> Any:
+        """Open a writer of `hybridlog.export.base`, according to `content`.
+
+        Raises:
+            UsageError: The target cannot be written.
+        """
+        return resolve_name(self.writer)(target, **options)
 
 
-FORMATS: dict[str, Format] = {
-    "jsonl": Format("rows", ".jsonl", "one JSON object a message"),
-    "csv": Format("table", ".csv", "a table as text; arrays and structures as JSON"),
-    "parquet": Format("table", ".parquet", "a table in zstd row groups"),
-    "arrow": Format("table", ".arrow", "a table as an Arrow IPC file (Feather)"),
-    "npz": Format("table", ".npz", "numpy arrays, one a column"),
-    "mcap": Format("exact", ".mcap", "an MCAP file: every message as it came"),
-    "bag": Format("exact", ".bag", "a ROS 1 bag: every ROS 1 message as it came"),
-    "raw": Format("exact", "", "a directory with one file a payload"),
+FORMATS: Final[dict[str, Format]] = {
+    "jsonl": Format(
+        "lines", "hybridlog.export.jsonl:JsonlWriter", (".jsonl", ".ndjson"), is_text=True
+    ),
+    "csv": Format("table", "hybridlog.export.tables:CsvWriter", (".csv",), is_text=True),
+    "parquet": Format("table", "hybridlog.export.tables:ParquetWriter", (".parquet",)),
+    "arrow": Format("table", "hybridlog.export.tables:ArrowWriter", (".arrow", ".feather")),
+    "npz": Format("table", "hybridlog.export.npz:NpzWriter", (".npz",)),
+    "mcap": Format("log", "hybridlog.export.mcap:McapWriter", (".mcap",), has_profile=True),
+    "bag": Format("log", "hybridlog.export.bag:BagWriter", (".bag",)),
+    "raw": Format("payloads", "hybridlog.export.raw:open_raw_writer", ()),
+    "png": Format("pictures", "hybridlog.export.pictures:open_pictures_writer", (".png",)),
+    "jpg": Format("pictures", "hybridlog.export.pictures:open_pictures_writer", (".jpg", ".jpeg")),
 }
-"""Every format by its name for `--format`."""
-PICTURES = ("png", "jpg")
-"""Formats for messages that are images: a directory with one file a message, or one file."""
+"""Every output format by its name for `--format`; pictures are for messages that are images."""
 
 
-def open_batch_writer(name: str, target: Target, *, profile: str = "") -> BatchWriter:
-    """Open a writer of an `exact` format.
-
-    Args:
-        name: `mcap`, `bag` or `raw`.
-        target: Path, or a binary stream such as standard output.
-        profile: MCAP profile (`ros1`, `ros2` or empty); other formats have none.
-
-    Raises:
-        UsageError: No such format, or the target cannot be written.
-    """
-    if name == "raw":
-        from hybridlog.export.raw import open_raw_writer
-
-        return open_raw_writer(target)
-    if name in {"mcap", "bag"}:
-        return open_log_writer(name, target, profile=profile)
-    raise _no_such_format(name, "exact")
+def formats_of(*contents: Content) -> list[str]:
+    """Names of the formats with some kinds of content; without any, of all."""
+    return [name for name, each in FORMATS.items() if not contents or each.content in contents]
 
 
-def open_log_writer(name: str, target: Target, *, profile: str = "") -> LogWriter:
-    """Open a writer of logs.
-
-    Args:
-        name: `mcap` or `bag`.
-        target: Path, or a binary stream such as standard output.
-        profile: MCAP profile (`ros1`, `ros2` or empty); bags have none.
-
-    Raises:
-        UsageError: The target cannot be written.
-    """
-    if name == "bag":
-        from hybridlog.export.bag import BagWriter
-
-        return BagWriter(target)
-    from hybridlog.export.mcap import McapWriter
-
-    return McapWriter(target, profile=profile)
+def suffixes_of(names: Iterable[str]) -> dict[str, str]:
+    """Some formats by the suffixes of their files."""
+    return {suffix: name for name in names for suffix in FORMATS[name].suffixes}
 
 
-def open_table_writer(name: str, target: Target, *, schema: pa.Schema | None = None) -> TableWriter:
-    """A writer of a `table` format.
+def is_directory(name: str, path: Path) -> bool:
+    """True if a format writes a directory with a file a message to this path."""
+    if FORMATS[name].content == "pictures":
+        from hybridlog.export.pictures import suffix_of
 
-    Args:
-        name: `csv`, `parquet`, `arrow` or `npz`.
-        target: Path, or a binary stream such as standard output.
-        schema: The columns, when they are known before; else they are learnt.
-
-    Raises:
-        UsageError: No such format, or the target cannot be written.
-    """
-    if name == "npz":
-        from hybridlog.export.npz import NpzWriter
-
-        return NpzWriter(target, schema=schema)
-    from hybridlog.export.tables import ArrowWriter, CsvWriter, ParquetWriter
-
-    if name == "csv":
-        return CsvWriter(target, schema=schema)
-    if name == "parquet":
-        return ParquetWriter(target, schema=schema)
-    if name == "arrow":
-        return ArrowWriter(target, schema=schema)
-    raise _no_such_format(name, "table")
-
-
-def open_row_writer(name: str, target: Target) -> RowWriter:
-    """Open a writer of a `rows` format: `jsonl`.
-
-    Raises:
-        UsageError: No such format, or the target cannot be written.
-    """
-    if name == "jsonl":
-        from hybridlog.export.jsonl import JsonlWriter
-
-        return JsonlWriter(target)
-    raise _no_such_format(name, "rows")
-
-
-def _no_such_format(name: str, kind: Kind) -> UsageError:
-    names = ", ".join(key for key, value in FORMATS.items() if value.kind == kind)
-    return UsageError(f"{name!r} is not a format for this command; use {names}")
+        return suffix_of(path) is None
+    return not FORMATS[name].suffixes

@@ -22,9 +22,13 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
+    from hybridlog.drawing.images import Picture
+    from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.attachments import Attachment
 
+Line: TypeAlias = "str | Iterator[str]"
+"""A line of JSON, or its pieces."""
 Target: TypeAlias = "str | os.PathLike[str] | BinaryIO"
 """Target of a writer: a path, or a binary stream, which stays open."""
 
@@ -98,12 +102,25 @@ class TableWriter(Writer, Protocol):
     def write(self, table: pa.Table) -> None:
         """Append rows."""
 
+    def flush(self) -> None:
+        """Write the rows so far, if the format can."""
 
-class RowWriter(Writer, Protocol):
-    """A writer of one object for each message."""
 
-    def write(self, rows: Iterable[Mapping[str, object]]) -> None:
-        """Append objects."""
+class LineWriter(Writer, Protocol):
+    """A writer of one JSON object for each message."""
+
+    def write(self, lines: Iterable[Line]) -> None:
+        """Append objects as lines without their ends."""
+
+    def flush(self) -> None:
+        """Write the lines so far."""
+
+
+class PictureWriter(Writer, Protocol):
+    """A writer of images."""
+
+    def write(self, message: Message, picture: Picture) -> None:
+        """Append the image of a message."""
 
 
 class FileWriter:
@@ -136,6 +153,9 @@ class FileWriter:
         if not self._over:
             self._over = True
             self._discard()
+
+    def flush(self) -> None:
+        """Do nothing: most formats are written at their end."""
 
     def __enter__(self) -> Self:
         """Return this writer."""

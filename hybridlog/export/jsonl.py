@@ -14,37 +14,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from datetime import date, timedelta
 from itertools import chain
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.export.base import FileWriter, Sink, Target
+from hybridlog.export.base import FileWriter, Line, Sink, Target
 from hybridlog.schema.plain import without_nan
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Line: TypeAlias = "str | Iterator[str]"
-"""A line, or its pieces."""
 _MAX_DEPTH = 200
 _BLOCK = 1 << 20
 _ROWS = 4096
-
-
-def message_row(log_time: int, topic: str, fields: Mapping[str, object]) -> dict[str, object]:
-    """The object of one message: `log_time_ns`, `topic`, then its fields.
-
-    Args:
-        log_time: Nanoseconds since the epoch.
-        topic: Name of the topic.
-        fields: Message fields; one with the name of one of these two gets a trailing
-            underscore.
-    """
-    row: dict[str, object] = {"log_time_ns": log_time, "topic": topic}
-    for name, value in fields.items():
-        row[f"{name}_" if name in {"log_time_ns", "topic"} else name] = value
-    return row
 
 
 class JsonlWriter(FileWriter):
@@ -58,27 +41,8 @@ class JsonlWriter(FileWriter):
         super().__init__()
         self._sink = Sink(target)
 
-    def write(self, rows: Iterable[Mapping[str, object]]) -> None:
-        """Append objects. Values may be numpy scalars and arrays, times, bytes.
-
-        Raises:
-            UsageError: A value that has no JSON form.
-            DiskFullError: No space left.
-        """
-        block: list[bytes] = []
-        size = 0
-        for row in rows:
-            # A lone surrogate becomes the escape that JSON has for it.
-            line = f"{json_line(row)}\n".encode("utf-8", "backslashreplace")
-            block.append(line)
-            size += len(line)
-            if size >= _BLOCK:
-                self._sink.write(b"".join(block))
-                block, size = [], 0
-        self._sink.write(b"".join(block))
-
-    def write_lines(self, lines: Iterable[Line]) -> None:
-        """Append lines that are made already, without their ends.
+    def write(self, lines: Iterable[Line]) -> None:
+        """Append lines, without their ends.
 
         Raises:
             DiskFullError: No space left.
@@ -93,7 +57,12 @@ class JsonlWriter(FileWriter):
             if size >= _BLOCK:
                 self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
                 block, size = [], 0
+        # A lone surrogate becomes the escape that JSON has for it.
         self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
+
+    def flush(self) -> None:
+        """Pass on the lines so far."""
+        self._sink.flush()
 
     def _finish(self) -> None:
         self._sink.commit()

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.cli.write_answer import write_answer
+from hybridlog.cli.answers import write_answer
 from hybridlog.export.slices import Front
 from hybridlog.query import latched_front
 from hybridlog.query.latched_front import LatchedFront

@@ -1,0 +1,484 @@
+"""Prints an answer on the terminal, or writes it to a file or a stream."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import partial, wraps
+from itertools import chain, groupby, islice
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.output_path import check_room, not_written, replacing
+from hybridlog.cli.progress import Bar, progress_bar
+from hybridlog.cli.signals import if_stopped
+from hybridlog.export import FORMATS, formats_of, is_directory, suffixes_of
+from hybridlog.export.slices import IN_FORCE, Front, add_extras, batches_of, profile_of
+from hybridlog_storage.errors import DefinitionError, HybridlogError, PayloadError, UsageError
+from hybridlog_storage.stopping import anywhere
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from hybridlog.attachments import Extras
+    from hybridlog.export.base import (
+        Line,
+        LineWriter,
+        LogWriter,
+        PictureWriter,
+        TableWriter,
+        Target,
+    )
+    from hybridlog.query.answers.follow import Following
+    from hybridlog.query.query import Query
+    from hybridlog.sql.engine import SqlAnswer
+
+SCREEN: Final = "table"
+"""The format for people, on the screen."""
+SCREEN_ROWS: Final = 20
+"""Rows shown without --limit."""
+_LINES_AT_ONCE: Final = 4096
+TABLE_FORMATS: Final = formats_of("lines", "table")
+"""Formats of tables that are no messages."""
+
+Progress = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rows:
+    """The rows of an answer in the forms that formats take.
+
+    Attributes:
+        lines: Gives a JSON object a row, some at a time.
+        tables: Gives the rows as tables.
+        schema: Gives the columns; None where only the rows tell them.
+    """
+
+    lines: Callable[[], Iterable[Sequence[Line]]]
+    tables: Callable[[], Iterable[pa.Table]]
+    schema: Callable[[], pa.Schema | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Destination:
+    """Format and place of an answer.
+
+    Attributes:
+        form: A name of `FORMATS`, or `SCREEN`.
+        path: The file or directory; None for standard output.
+        force: Overwrite it.
+        limit: Maximum number of rows of a table; None for all.
+        quiet: No progress bar.
+    """
+
+    form: str
+    path: Path | None
+    force: bool
+    limit: int | None = None
+    quiet: bool = False
+
+    @contextmanager
+    def opened(self) -> Iterator[Target]:
+        """The target for a writer; what was there stays if the block fails."""
+        if self.path is None:
+            yield sys.stdout.buffer
+            return
+        with (
+            if_stopped(partial(not_written, self.path)),
+            replacing(self.path, force=self.force, is_directory=is_directory(self.form, self.path)),
+        ):
+            yield self.path
+
+    def check(self) -> None:
+        """Refuse what cannot be written, before a store is opened.
+
+        Raises:
+            UsageError: The file exists, or the format does not fit the place.
+        """
+        if self.path is None:
+            if self.form != SCREEN and not FORMATS[self.form].is_text and sys.stdout.isatty():
+                what = "a file" if FORMATS[self.form].content != "pictures" else "a directory"
+                raise UsageError(f"{self.form} is no text for a terminal: name {what} with -o.")
+        elif self.form == SCREEN:
+            raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
+        else:
+            folder = is_directory(self.form, self.path)
+            check_room(self.path, force=self.force, is_directory=folder)
+
+
+def format_option(names: Sequence[str]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The option `--format` of commands that answer."""
+    return click.option(
+        "--format",
+        "-F",
+        "form",
+        type=click.Choice([SCREEN, *names]),
+        help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
+    )
+
+
+def output_option(what: str = "Write to this file") -> Callable[..., Any]:
+    """The option `--output`; `-` is as good as none."""
+    return click.option(
+        "--output",
+        "-o",
+        type=options.PATH,
+        metavar="FILE",
+        callback=lambda _, __, path: None if str(path) == "-" else path,
+        help=f"{what}; - is standard output.",
+    )
+
+
+def format_of(form: str | None, path: Path | None, names: Sequence[str]) -> str:
+    """The format of an answer: as given, by the suffix, or the usual one for standard output.
+
+    Args:
+        form: As given.
+        path: The output.
+        names: Formats that the command has.
+
+    Raises:
+        UsageError: The suffix names none of them.
+    """
+    if form is not None:
+        return form
+    if path is None:
+        return SCREEN if sys.stdout.isatty() else "jsonl"
+    suffixes = suffixes_of(names)
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(
+            f"The name {path} does not give the format: add --format, or end it in "
+            f"{', '.join(suffixes)}."
+        )
+    return suffixes[path.suffix.lower()]
+
+
+def table_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of a command that answers with a table; it gets them as `to`."""
+
+    @wraps(command)
+    def with_destination(
+        *, form: str | None, output: Path | None, force: bool, limit: int | None, **others: Any
+    ) -> Any:
+        to = Destination(
+            form=format_of(form, output, TABLE_FORMATS),
+            path=output,
+            force=force,
+            limit=limit,
+            quiet=others["quiet"],
+        )
+        to.check()
+        return command(to=to, **others)
+
+    decorated: Callable[..., Any] = with_destination
+    for add in (
+        options.quiet,
+        options.mongo,
+        options.force,
+        options.strict,
+        output_option(),
+        format_option(TABLE_FORMATS),
+        click.option(
+            "--limit", "-n", type=click.IntRange(min=0), metavar="N", help="At most so many rows."
+        ),
+    ):
+        decorated = add(decorated)
+    return decorated
+
+
+def answer_query(query: Query, to: Destination, *, front: Front) -> Query:
+    """Print or write the messages of a query.
+
+    Args:
+        query: The query; on the screen and without a limit, its first messages are shown.
+        to: Format and place.
+        front: The latched messages in front of the answer.
+
+    Returns:
+        The query that was answered, with its counters.
+    """
+    if to.form != SCREEN:
+        with to.opened() as target:
+            write_answer(query, to.form, target, front=front, quiet=to.quiet or to.path is None)
+        return query
+    limit = query.question.limit
+    answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
+    _print_rows(answered.to_tables(), limit, answered.topics)
+    counters = answered.counters
+    counters.messages = _shown(counters.messages, limit, "message")
+    return answered
+
+
+def answer_tables(
+    tables: Iterable[pa.Table], schema: Callable[[], pa.Schema | None], to: Destination
+) -> None:
+    """Print or write tables that are no messages, all rows or nothing.
+
+    Args:
+        tables: The rows, at least one table.
+        schema: Gives the columns; None where only the rows tell them.
+        to: Format and place.
+    """
+    if to.form == SCREEN:
+        # One more than is shown tells whether there is more.
+        some = _limited(tables, SCREEN_ROWS + 1 if to.limit is None else to.limit)
+        _shown(_print_rows(some, to.limit), to.limit, "row")
+        return
+    limited = tables if to.limit is None else _limited(tables, to.limit)
+    quiet = to.quiet or to.path is None
+    with to.opened() as target, progress_bar(to.form, None, quiet=quiet) as bar:
+        counted = _with_progress(limited, bar)
+        rows = Rows(
+            lines=lambda: chain.from_iterable(map(_lines_of, counted)),
+            tables=lambda: counted,
+            schema=schema,
+        )
+        _write_rows(rows, to.form, target, lambda: None)
+
+
+def answer_sql(answer: SqlAnswer, to: Destination) -> None:
+    """Print or write the answer of a statement; nothing for those that return nothing."""
+    import pyarrow as pa
+
+    if answer.columns:
+        tables = (pa.Table.from_batches([batch]) for batch in answer.to_batches())
+        answer_tables(tables, lambda: None, to)
+
+
+def write_answer(
+    query: Query,
+    form: str,
+    target: Target,
+    *,
+    front: Front = IN_FORCE,
+    extras: Extras | None = None,
+    quiet: bool = False,
+) -> int:
+    """Write the answer of a query, all of it or nothing.
+
+    Args:
+        query: The query.
+        form: A format of `hybridlog.export.FORMATS`.
+        target: Path or binary stream.
+        front: The latched messages in front of the answer, in logs.
+        extras: What a log has beside messages; None for nothing.
+        quiet: No progress bar.
+
+    Returns:
+        Messages that are missing, because they do not fit their definition.
+    """
+    from hybridlog.frames.answer import json_columns
+    from hybridlog.frames.lines import lines
+    from hybridlog.query.planner import Planner
+
+    def objects() -> Iterator[list[Line]]:
+        query.session.renew()
+        query.counters.reset()
+        yield from lines(Planner(query.session, query.question, query.counters))
+
+    content = FORMATS[form].content
+    total = 0 if quiet else query.size_hint()
+    with progress_bar(form, total, quiet=quiet) as bar:
+        counters = query.counters
+
+        def progress() -> None:
+            bar(counters.payload_bytes, output.counted(counters.messages, "message"))
+
+        if content == "pictures":
+            _write_pictures(query, form, target, progress)
+            return 0
+        if content in {"log", "payloads"}:
+            before = front if content == "log" else Front(latched=False)
+            _write_messages(query, form, target, progress, front=before, extras=extras)
+            return 0
+        columns = query.schema() if content == "table" else None
+        rows = Rows(lines=objects, tables=query.to_tables, schema=lambda: columns)
+        written = _write_rows(rows, form, target, progress)
+    for name in json_columns(columns):
+        output.note(f"{name} has values of several types: it is written as JSON text.")
+    return counters.messages - counters.reduced - written
+
+
+def write_following(following: Following, form: str) -> None:
+    """Print messages as they come in a text format, and flush those that come together."""
+    from hybridlog.frames.answer import stream
+    from hybridlog.frames.lines import lines
+
+    rows = Rows(
+        lines=lambda: lines(following),
+        tables=lambda: stream(following, at_once=True),
+        schema=lambda: None,
+    )
+    _write_rows(rows, form, sys.stdout.buffer, lambda: None, is_live=True)
+
+
+def _write_rows(
+    rows: Rows, form: str, target: Target, progress: Progress, *, is_live: bool = False
+) -> int:
+    """Write rows as lines or tables; returns how many."""
+    found, written = FORMATS[form], 0
+    writer: LineWriter | TableWriter
+    pieces: Iterable[Any]
+    if found.content == "lines":
+        writer, pieces = found.open(target), rows.lines()
+    else:
+        writer, pieces = found.open(target, schema=rows.schema()), rows.tables()
+    with writer:
+        for piece in pieces:
+            with anywhere() if is_live else nullcontext():
+                writer.write(piece)
+                if is_live:
+                    writer.flush()
+            written += len(piece)
+            progress()
+    return written
+
+
+def _write_messages(
+    query: Query,
+    form: str,
+    target: Target,
+    progress: Progress,
+    *,
+    front: Front,
+    extras: Extras | None,
+) -> None:
+    found = FORMATS[form]
+    profile = {"profile": profile_of(query)} if found.has_profile else {}
+    log: LogWriter
+    with found.open(target, **profile) as log:
+        if extras is not None:
+            output.notes(add_extras(log, extras))
+        for batch, channels in batches_of(query, front):
+            log.write(batch, channels)
+            progress()
+
+
+def _write_pictures(query: Query, form: str, target: Target, progress: Progress) -> None:
+    """Write the images; messages that are unreadable are left out and told.
+
+    Raises:
+        UsageError: a message is no image by its type.
+        PayloadError: no image is readable.
+        DefinitionError: the same.
+    """
+    from hybridlog.arrays.message_arrays import IMAGES
+    from hybridlog.drawing.images import picture
+
+    written = left_out = 0
+    refused: HybridlogError | None = None
+    images: PictureWriter
+    with FORMATS[form].open(target) as images:
+        for message in query:
+            if message.type.replace("/msg/", "/") not in IMAGES:
+                raise UsageError(
+                    f"{message.topic} has {message.type or 'no type'}, which is no image: {form} "
+                    "is for Image and CompressedImage, those of ROS and of Foxglove."
+                )
+            if message.is_reduced:
+                query.counters.reduced += 1
+                continue
+            try:
+                found = picture(message, form="jpg" if form == "jpg" else "png")
+            except (PayloadError, DefinitionError) as error:
+                refused = refused or error
+                left_out += 1
+                continue
+            images.write(message, found)
+            written += 1
+            progress()
+        if refused is not None and not written:
+            raise refused
+    if refused is not None:
+        are = "is" if left_out == 1 else "are"
+        output.note(f"{output.counted(left_out, 'message')} {are} left out; the first: {refused}.")
+
+
+def _with_progress(tables: Iterable[pa.Table], bar: Bar) -> Iterator[pa.Table]:
+    """The same tables, while the bar counts their rows."""
+    done = rows = 0
+    for table in tables:
+        yield table
+        done += table.nbytes
+        rows += table.num_rows
+        bar(done, output.counted(rows, "row"))
+
+
+def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
+    """Rows as JSON objects: the log time as `log_time_ns`, as in all JSON lines."""
+    import pyarrow as pa
+
+    from hybridlog.export.jsonl import json_rows
+
+    names = ["log_time_ns" if name == "log_time" else name for name in table.column_names]
+    for batch in table.combine_chunks().to_batches(max_chunksize=_LINES_AT_ONCE):
+        yield list(json_rows(pa.StructArray.from_arrays(batch.columns, names)))
+
+
+def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
+    left = limit
+    for table in tables:
+        yield table.slice(0, left)
+        left -= min(left, table.num_rows)
+        if not left:
+            return
+
+
+def _shown(found: int, limit: int | None, noun: str) -> int:
+    """Say whether there is nothing, or more than was shown; returns the number shown."""
+    if not found:
+        output.note(f"No {noun}.")
+    if limit is not None or found <= SCREEN_ROWS:
+        return found
+    output.note(
+        f"The first {SCREEN_ROWS} {noun}s. --limit shows more, --format jsonl or -o FILE gives all."
+    )
+    return SCREEN_ROWS
+
+
+def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[str] = ()) -> int:
+    """Print rows for people to read: a table if the first of them fit, else a block for each.
+
+    Memory does not grow with the number of rows.
+
+    Args:
+        tables: The rows.
+        limit: Number of rows to print; None for `SCREEN_ROWS`.
+        topics: Topics of messages, which are in the titles of blocks.
+
+    Returns:
+        Number of rows of the tables.
+    """
+    from hybridlog.frames.cells import cells
+
+    most = SCREEN_ROWS if limit is None else limit
+    read = 0
+
+    def rows() -> Iterator[tuple[list[str], list[str]]]:
+        nonlocal read
+        for table in tables:
+            names, wanted = table.column_names, table.slice(0, max(most - read, 0))
+            read += table.num_rows
+            for row in cells(wanted):
+                yield names, row
+
+    # Headings are printed again only where the columns change.
+    for names, alike in groupby(rows(), itemgetter(0)):
+        lines = (row for _, row in alike)
+        first = list(islice(lines, output.ROWS_AT_ONCE))
+        if output.fits(names, first):
+            output.print_table([(name, "left") for name in names], chain(first, lines))
+            continue
+        begin = 2 if len(topics) > 1 else 1  # the first column is the time, the second the topic
+        for row in chain(first, lines):
+            title = "  ".join([*row[:begin], *(topics if len(topics) == 1 else ())])
+            # A column without a value is another topic's.
+            fields = zip(names[begin:], row[begin:], strict=True)
+            output.print_record(title, [(name, cell) for name, cell in fields if cell])
+    return read
