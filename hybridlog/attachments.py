@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from hybridlog.export.base import Sink
+from hybridlog.formats.writing import Sink
 from hybridlog.query.ranges import RangeResolver
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import REDUCED

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.attachments import StoredAttachment, StoredMetadata
+    from hybridlog.formats.reading import Source
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.imports import ImportReport
@@ -60,7 +61,6 @@ if TYPE_CHECKING:
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.recordings import Recordings
-    from hybridlog.sources.base import Source
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
@@ -612,9 +612,9 @@ class Store:
             SourceError: Nothing could be read.
             AlreadyRecordedError: Its content is in the store already.
         """
+        from hybridlog.formats.detect import open_source
+        from hybridlog.formats.fingerprint import fingerprint
         from hybridlog.record.recorder import RecordOptions, record
-        from hybridlog.sources.detect import open_source
-        from hybridlog.sources.fingerprint import fingerprint
 
         with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
             report = record(

@@ -115,7 +115,7 @@ MUTANTS = [
             "nothing-behind-the-last-message",
             "        self._copy_extras()\n        for channel in",
             "        for channel in",
-            "tests/sources/test_mcap.py::test_what_stands_behind_the_last_message_is_recorded",
+            "tests/formats/test_mcap.py::test_what_stands_behind_the_last_message_is_recorded",
         ),
     ),
     *_of(

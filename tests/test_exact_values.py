@@ -218,7 +218,7 @@ def test_values_of_several_types_are_json_text(store: hl.Store) -> None:
 
 
 def test_a_late_key_and_a_late_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hybridlog.export import tables
+    from hybridlog.formats import tables
     from hybridlog.frames import answer
 
     monkeypatch.setattr(tables, "HELD_BYTES", 0)

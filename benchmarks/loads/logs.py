@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.loads.spool import Spool
-from hybridlog.sources.detect import open_source
+from hybridlog.formats.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from benchmarks.loads.base import Load
-    from hybridlog.sources.base import Damage, Source
+    from hybridlog.formats.reading import Damage, Source
 
 
 def from_log(path: Path, directory: Path, *, seconds: float | None = None) -> Load:

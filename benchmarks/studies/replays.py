@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.loads.base import Load
 from benchmarks.loads.logs import from_log, log_name
 from hybridlog.cli.output import note
-from hybridlog.sources.detect import open_source
+from hybridlog.formats.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:

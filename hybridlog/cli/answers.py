@@ -18,8 +18,8 @@ from hybridlog.cli import options, output
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
-from hybridlog.export import FORMATS, formats_of, is_directory, suffixes_of
-from hybridlog.export.slices import IN_FORCE, Front, add_extras, batches_of, profile_of
+from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
+from hybridlog.formats.slices import IN_FORCE, Front, add_extras, batches_of, profile_of
 from hybridlog_storage.errors import DefinitionError, HybridlogError, PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.export.base import (
+    from hybridlog.formats.writing import (
         Line,
         LineWriter,
         LogWriter,
@@ -70,7 +70,7 @@ class Destination:
     """Format and place of an answer.
 
     Attributes:
-        form: A name of `FORMATS`, or `SCREEN`.
+        form: A name of `OUTPUTS`, or `SCREEN`.
         path: The file or directory; None for standard output.
         force: Overwrite it.
         limit: Maximum number of rows of a table; None for all.
@@ -102,8 +102,8 @@ class Destination:
             UsageError: The file exists, or the format does not fit the place.
         """
         if self.path is None:
-            if self.form != SCREEN and not FORMATS[self.form].is_text and sys.stdout.isatty():
-                what = "a file" if FORMATS[self.form].content != "pictures" else "a directory"
+            if self.form != SCREEN and not OUTPUTS[self.form].is_text and sys.stdout.isatty():
+                what = "a file" if OUTPUTS[self.form].content != "pictures" else "a directory"
                 raise UsageError(f"{self.form} is no text for a terminal: name {what} with -o.")
         elif self.form == SCREEN:
             raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
@@ -264,7 +264,7 @@ def write_answer(
 
     Args:
         query: The query.
-        form: A format of `hybridlog.export.FORMATS`.
+        form: A format of `hybridlog.formats.OUTPUTS`.
         target: Path or binary stream.
         front: The latched messages in front of the answer, in logs.
         extras: What a log has beside messages; None for nothing.
@@ -282,7 +282,7 @@ def write_answer(
         query.counters.reset()
         yield from lines(Planner(query.session, query.question, query.counters))
 
-    content = FORMATS[form].content
+    content = OUTPUTS[form].content
     total = 0 if quiet else query.size_hint()
     with progress_bar(form, total, quiet=quiet) as bar:
         counters = query.counters
@@ -322,7 +322,7 @@ def _write_rows(
     rows: Rows, form: str, target: Target, progress: Progress, *, is_live: bool = False
 ) -> int:
     """Write rows as lines or tables; returns how many."""
-    found, written = FORMATS[form], 0
+    found, written = OUTPUTS[form], 0
     writer: LineWriter | TableWriter
     pieces: Iterable[Any]
     if found.content == "lines":
@@ -349,7 +349,7 @@ def _write_messages(
     front: Front,
     extras: Extras | None,
 ) -> None:
-    found = FORMATS[form]
+    found = OUTPUTS[form]
     profile = {"profile": profile_of(query)} if found.has_profile else {}
     log: LogWriter
     with found.open(target, **profile) as log:
@@ -374,7 +374,7 @@ def _write_pictures(query: Query, form: str, target: Target, progress: Progress)
     written = left_out = 0
     refused: HybridlogError | None = None
     images: PictureWriter
-    with FORMATS[form].open(target) as images:
+    with OUTPUTS[form].open(target) as images:
         for message in query:
             if message.type.replace("/msg/", "/") not in IMAGES:
                 raise UsageError(
@@ -414,7 +414,7 @@ def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
     """Rows as JSON objects: the log time as `log_time_ns`, as in all JSON lines."""
     import pyarrow as pa
 
-    from hybridlog.export.jsonl import json_rows
+    from hybridlog.formats.jsonl import json_rows
 
     names = ["log_time_ns" if name == "log_time" else name for name in table.column_names]
     for batch in table.combine_chunks().to_batches(max_chunksize=_LINES_AT_ONCE):

@@ -16,8 +16,8 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
-from hybridlog.export import FORMATS, formats_of, suffixes_of
-from hybridlog.export.slices import Front
+from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
+from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
 from hybridlog_storage.mongo.collection_names import collection_of
@@ -152,7 +152,7 @@ def _remove_empty(directory: Path) -> None:
 
 
 def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    suffix = FORMATS[form].suffixes[0]
+    suffix = OUTPUTS[form].suffixes[0]
     paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in query.topics}
     for path in paths.values():
         check_room(path, force=force)

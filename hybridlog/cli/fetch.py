@@ -23,8 +23,8 @@ from hybridlog.cli.answers import (
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import Stopped
-from hybridlog.export import FORMATS, formats_of
-from hybridlog.export.slices import Front
+from hybridlog.formats import OUTPUTS, formats_of
+from hybridlog.formats.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
@@ -257,7 +257,7 @@ def _check_together(choices: _Choices) -> None:
 
 
 def _is_text(form: str | None) -> bool:
-    return form is None or (form in FORMATS and FORMATS[form].is_text)
+    return form is None or (form in OUTPUTS and OUTPUTS[form].is_text)
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:

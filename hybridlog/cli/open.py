@@ -93,7 +93,7 @@ def open_command(
     import subprocess
 
     from hybridlog.cli.answers import write_answer
-    from hybridlog.export.slice_cache import SliceCache
+    from hybridlog.formats.slices import SliceCache
 
     program = _find(viewer)
     if path is not None:

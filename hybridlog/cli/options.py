@@ -17,7 +17,7 @@ from hybridlog.cli.completion import (
     complete_topic,
     complete_type,
 )
-from hybridlog.export import formats_of
+from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 

@@ -77,7 +77,7 @@ def not_written(path: Path) -> str:
 
 
 def _holds_messages(path: Path) -> bool:
-    from hybridlog.export.raw import holds_messages
+    from hybridlog.formats.raw import holds_messages
 
     try:
         return holds_messages(path)

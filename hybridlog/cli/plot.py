@@ -136,7 +136,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _write(found: Sequence[Line], form: str, size: tuple[int, int], path: Path | None) -> None:
-    from hybridlog.export.base import Sink
+    from hybridlog.formats.writing import Sink
 
     if form == "html":
         from hybridlog.drawing.page import page

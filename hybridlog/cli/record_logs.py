@@ -32,10 +32,10 @@ from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from hybridlog.cli.progress import Bar
+    from hybridlog.formats.find import Found, Log
+    from hybridlog.formats.reading import Source
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordOptions, RecordReport
-    from hybridlog.sources.base import Source
-    from hybridlog.sources.find import Found, Log
     from hybridlog.store import Store
 
 _MOST_FAILED = 20  # errors that are repeated at the end
@@ -74,7 +74,7 @@ def record_logs(choices: RecordChoices) -> None:
 
 def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
     """The logs to record, and what was met in directories; None if each path is one log."""
-    from hybridlog.sources.find import Found, Log, find_logs
+    from hybridlog.formats.find import Found, Log, find_logs
 
     logs: list[Log] = []
     walked: Found | None = None
@@ -151,8 +151,8 @@ class LogRecorder:
 
     def _pieces(self, store: Store, log: Log) -> Iterator[Log]:
         """The log; the missing parts of it if others were recorded on their own."""
-        from hybridlog.sources.find import Log
-        from hybridlog.sources.fingerprint import fingerprint
+        from hybridlog.formats.find import Log
+        from hybridlog.formats.fingerprint import fingerprint
 
         if self._choices.again or len(log.files) == 1:
             yield log
@@ -201,7 +201,7 @@ class LogRecorder:
 
 
 def _opened(log: Log) -> Source:
-    from hybridlog.sources.detect import open_parts, open_source
+    from hybridlog.formats.detect import open_parts, open_source
 
     is_split = len(log.files) > 1 and log.path == log.files[0]
     return open_parts(log.files) if is_split else open_source(log.path)
@@ -215,7 +215,7 @@ def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
 
     if os.path.lexists(store_path(choices.store) / NAME):
         return
-    from hybridlog.sources.detect import open_source
+    from hybridlog.formats.detect import open_source
 
     first: SourceError | None = None
     for path in paths:
@@ -252,8 +252,8 @@ def _check_not_empty(
 
 
 def _between(source: Source, choices: RecordChoices) -> tuple[int, int] | None:
+    from hybridlog.formats.detect import read_time_range
     from hybridlog.query.times import is_relative, parse_range
-    from hybridlog.sources.detect import read_time_range
 
     if choices.between is None:
         return None

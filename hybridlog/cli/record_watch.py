@@ -14,7 +14,7 @@ from hybridlog_storage.stopping import at_safe_points, pause, safe_point
 
 if TYPE_CHECKING:
     from hybridlog.cli.record_choices import RecordChoices
-    from hybridlog.sources.find import Log, Watch
+    from hybridlog.formats.find import Log, Watch
     from hybridlog.store import Store
 
 _INTERVAL_S = 2.0
@@ -24,8 +24,8 @@ _MOST_UNFINISHED = 10
 
 def record_watched(choices: RecordChoices) -> None:
     """Record what lies in directories, and what comes into them, until a signal ends it."""
+    from hybridlog.formats.find import Watch
     from hybridlog.query.times import parse_duration
-    from hybridlog.sources.find import Watch
 
     settle_s = parse_duration(choices.settle) / 1e9
     recorder = LogRecorder(choices)

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.sources.yaml_values import YamlError, parse_yaml
+from hybridlog.formats.yaml_values import YamlError, parse_yaml
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel

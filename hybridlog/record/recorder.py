@@ -38,10 +38,10 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.formats.fingerprint import Fingerprint
+    from hybridlog.formats.reading import Damage, Source
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
-    from hybridlog.sources.base import Damage, Source
-    from hybridlog.sources.fingerprint import Fingerprint
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
 

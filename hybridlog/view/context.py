@@ -18,7 +18,7 @@ from starlette.routing import Route
 
 from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.match_cache import MatchCache
-from hybridlog.export.slice_cache import SliceCache
+from hybridlog.formats.slices import SliceCache
 from hybridlog.record.losses import extent_of
 from hybridlog.view.asked import Asked
 from hybridlog.view.sql_process import SqlProcess

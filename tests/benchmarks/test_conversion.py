@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.backends.conversion import converter_for, iso_text, without_nul
+from hybridlog.formats.detect import open_source
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.index_bodies import index_fields
-from hybridlog.sources.detect import open_source
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
 

@@ -27,7 +27,7 @@ from benchmarks.loads.made import received, steady
 from benchmarks.loads.mit_like import mit_like
 from benchmarks.loads.spool import Spool
 from benchmarks.loads.truth import NAME, Truth
-from hybridlog.sources.detect import open_source
+from hybridlog.formats.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 from hybridlog_storage.messages import Channel
 from tests import independent

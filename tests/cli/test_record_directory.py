@@ -16,7 +16,7 @@ from hybridlog.cli import record_watch
 from hybridlog.cli.app import app
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import HybridlogError
-from tests.sources.test_find import METADATA, mcap
+from tests.formats.test_find import METADATA, mcap
 
 from .running import COMMAND, environment
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hybridlog.export.pictures import suffix_of
+from hybridlog.formats.pictures import suffix_of
 from hybridlog_storage.errors import PayloadError, UsageError
 from tests.cli.within import Answer, answer
 

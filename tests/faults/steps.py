@@ -471,13 +471,13 @@ def _serve() -> NoReturn:
     import pymongo
 
     import hybridlog.columns.tables
+    import hybridlog.formats.mcap.reader
     import hybridlog.maintenance.edit
     import hybridlog.maintenance.imports
     import hybridlog.maintenance.index
     import hybridlog.maintenance.removal
     import hybridlog.maintenance.repair
     import hybridlog.record.recorder
-    import hybridlog.sources.mcap
     import hybridlog.store
     import tests.faults.logs
 

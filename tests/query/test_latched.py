@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
-from hybridlog.export.slices import Front
+from hybridlog.formats.slices import Front
 from hybridlog.query import latched_front
 from hybridlog.query.latched_front import LatchedFront
 from hybridlog.query.latching import KEEP_ALL, depth_of

@@ -16,8 +16,7 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.export.slice_cache import SliceCache
-from hybridlog.export.slices import write_mcap
+from hybridlog.formats.slices import SliceCache, write_mcap
 from hybridlog.view.app import make_app
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel

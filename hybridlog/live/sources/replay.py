@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
+from hybridlog.formats.detect import open_source
 from hybridlog.live.sources.base import Cause, LiveSource, Sink
 from hybridlog.live.sources.replay_order import Lookahead, Rows
-from hybridlog.sources.detect import open_source
 from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.sources.base import Damage, Source
+    from hybridlog.formats.reading import Damage, Source
     from hybridlog_storage.messages import Channel
 
 _MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together

@@ -131,8 +131,8 @@ class _Pieces:
 
 def pieces_of(query: Query) -> Pieces:
     """An MCAP file in pieces; a piece is made when it is asked for."""
-    from hybridlog.export.mcap import McapWriter
-    from hybridlog.export.slices import IN_FORCE, batches_of, profile_of
+    from hybridlog.formats.mcap.writer import McapWriter
+    from hybridlog.formats.slices import IN_FORCE, batches_of, profile_of
 
     written = _Pieces()
     with McapWriter(cast("BinaryIO", written), profile=profile_of(query)) as writer:

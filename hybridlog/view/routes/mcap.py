@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 
 from starlette.responses import FileResponse
 
-from hybridlog.export.slices import write_mcap
+from hybridlog.formats.slices import write_mcap
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time

@@ -13,8 +13,8 @@ from __future__ import annotations
 import reprlib
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
-from hybridlog.sources.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -1,0 +1,157 @@
+"""Formats of logs that are read, and of files that are written for other tools.
+
+`LOGS` and `OUTPUTS` list them; a reader or writer is imported when it is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from hybridlog.formats.reading import Source
+    from hybridlog.formats.writing import Target
+
+Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures"]
+
+
+@dataclass(frozen=True, slots=True)
+class LogFormat:
+    """A format of logs.
+
+    Attributes:
+        name: Its name in messages.
+        files: Such files, for messages.
+        reader: The `Source`, as `module:name`; called with the path of a file.
+        beginnings: First bytes of a file, one of these.
+        suffixes: Suffixes of file names in a directory that is searched for logs.
+        profile: MCAP profile of the messages, if the format tells.
+        rosbag2: Name in messages of a file of a ROS 2 bag; empty if it cannot be one.
+        needs_suffix: Files without its suffix are no logs in such a directory.
+        has_end: A complete file shows at its end that it is complete.
+    """
+
+    name: str
+    files: str
+    reader: str
+    beginnings: tuple[bytes, ...]
+    suffixes: tuple[str, ...]
+    profile: str = ""
+    rosbag2: str = ""
+    needs_suffix: bool = False
+    has_end: bool = False
+
+    def open(self, path: Path) -> Source:
+        """Open an uncompressed file.
+
+        Raises:
+            SourceError: Nothing of it can be read.
+        """
+        source: Source = resolve_name(self.reader)(path)
+        return source
+
+
+LOGS: Final = (
+    LogFormat(
+        "ROS 1 bag",
+        "ROS 1 bags (.bag, .bag.active)",
+        "hybridlog.formats.rosbag1.reader:Rosbag1Source",
+        (b"#ROSBAG V", b"#ROSRECORD V"),
+        (".bag", ".active"),
+        profile="ros1",
+        has_end=True,
+    ),
+    LogFormat(
+        "ROS 2 bag (sqlite3)",
+        "ROS 2 bags (directories, .db3, .mcap, also with .zstd)",
+        "hybridlog.formats.rosbag2.sqlite:SqliteSource",
+        (b"SQLite format 3\0",),
+        (".db3",),
+        profile="ros2",
+        rosbag2="ROS 2 bag (sqlite3)",
+        needs_suffix=True,
+    ),
+    LogFormat(
+        "MCAP",
+        "MCAP files",
+        "hybridlog.formats.mcap.reader:McapSource",
+        (b"\x89MCAP",),
+        (".mcap",),
+        rosbag2="ROS 2 bag (mcap)",
+        has_end=True,
+    ),
+)
+"""Every format of logs."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputFormat:
+    """An output format.
+
+    Attributes:
+        content: What its writer takes: `lines` of JSON, one a message; Arrow tables (`table`);
+            batches of messages for a `log`, or for a file a payload (`payloads`); `pictures`.
+        writer: The writer, as `module:name`. Called with a path or a binary stream, and with
+            the `schema` of tables.
+        suffixes: Suffixes of file names, the usual one first; none if it writes a directory.
+        is_text: It can be read on a terminal, and written a message at a time.
+        has_profile: The writer takes the MCAP `profile` of the messages, too.
+    """
+
+    content: Content
+    writer: str
+    suffixes: tuple[str, ...]
+    is_text: bool = False
+    has_profile: bool = False
+
+    def open(self, target: Target, **options: Any) -> Any:
+        """Open a writer of `hybridlog.formats.writing`, according to `content`.
+
+        Raises:
+            UsageError: The target cannot be written.
+        """
+        return resolve_name(self.writer)(target, **options)
+
+
+OUTPUTS: Final[dict[str, OutputFormat]] = {
+    "jsonl": OutputFormat(
+        "lines", "hybridlog.formats.jsonl:JsonlWriter", (".jsonl", ".ndjson"), is_text=True
+    ),
+    "csv": OutputFormat("table", "hybridlog.formats.tables:CsvWriter", (".csv",), is_text=True),
+    "parquet": OutputFormat("table", "hybridlog.formats.tables:ParquetWriter", (".parquet",)),
+    "arrow": OutputFormat("table", "hybridlog.formats.tables:ArrowWriter", (".arrow", ".feather")),
+    "npz": OutputFormat("table", "hybridlog.formats.npz:NpzWriter", (".npz",)),
+    "mcap": OutputFormat(
+        "log", "hybridlog.formats.mcap.writer:McapWriter", (".mcap",), has_profile=True
+    ),
+    "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:BagWriter", (".bag",)),
+    "raw": OutputFormat("payloads", "hybridlog.formats.raw:open_raw_writer", ()),
+    "png": OutputFormat("pictures", "hybridlog.formats.pictures:open_pictures_writer", (".png",)),
+    "jpg": OutputFormat(
+        "pictures", "hybridlog.formats.pictures:open_pictures_writer", (".jpg", ".jpeg")
+    ),
+}
+"""Every output format by its name for `--format`; pictures are for messages that are images."""
+
+
+def formats_of(*contents: Content) -> list[str]:
+    """Names of the formats with some kinds of content; without any, of all."""
+    return [name for name, each in OUTPUTS.items() if not contents or each.content in contents]
+
+
+def suffixes_of(names: Iterable[str]) -> dict[str, str]:
+    """Some formats by the suffixes of their files."""
+    return {suffix: name for name in names for suffix in OUTPUTS[name].suffixes}
+
+
+def is_directory(name: str, path: Path) -> bool:
+    """True if a format writes a directory with a file a message to this path."""
+    if OUTPUTS[name].content == "pictures":
+        from hybridlog.formats.pictures import suffix_of
+
+        return suffix_of(path) is None
+    return not OUTPUTS[name].suffixes

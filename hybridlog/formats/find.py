@@ -1,0 +1,275 @@
+"""Finds logs below a directory, once or as they become complete."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from stat import S_ISDIR, S_ISREG
+from typing import NamedTuple
+
+from hybridlog.formats import LOGS, LogFormat
+from hybridlog.formats.detect import UNKNOWN, grouped_parts, sniff
+from hybridlog.formats.reading import cannot_open
+from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, read_metadata
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.settings import NAME as STORE
+
+SETTLE_S = 60.0
+"""Seconds without a change after which a file counts as complete, if it does not say so."""
+_SUFFIXES = tuple(suffix for log in LOGS for suffix in log.suffixes)
+_MCAP_END = b"\x89MCAP0\r\n"
+_BAG_INDEX = b"index_pos="
+_BAG_HEAD = 8192  # bytes; the header record of a bag has 4 KiB
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """A log that was found.
+
+    Attributes:
+        path: The file, the first of several, or the directory of a ROS 2 bag.
+        files: The file, the parts of a split log in order, or the logs in the directory.
+        size: Their bytes.
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    size: int
+
+    @property
+    def name(self) -> str | None:
+        """The name that the parts of a split log share; None for the name of `path`."""
+        is_split = len(self.files) > 1 and self.path == self.files[0]
+        return self.path.name.rpartition("_")[0] or None if is_split else None
+
+
+@dataclass(slots=True)
+class Found:
+    """Logs and stores below a directory.
+
+    Attributes:
+        logs: The logs, by path.
+        stores: Stores, which are not searched.
+        problems: Directories and files that cannot be read.
+    """
+
+    logs: list[Log] = field(default_factory=list)
+    stores: list[Path] = field(default_factory=list)
+    problems: list[SourceError] = field(default_factory=list)
+
+
+class _File(NamedTuple):
+    """A file, with what changes when it is written."""
+
+    path: Path
+    size: int
+    changed: int  # ns since the epoch
+    inode: int
+
+
+def find_logs(top: Path) -> Found:
+    """All logs below a directory.
+
+    A ROS 2 bag is one log, and so are the parts of a split one, whose numbers begin with 0.
+    Symlinks are followed, but no directory is searched twice. Hidden files, stores, and
+    databases that are not called `.db3` are left out.
+
+    Raises:
+        SourceError: The directory cannot be read.
+    """
+    found = Found()
+    for folder, files in _folders(top, found):
+        sizes = {file.path: file.size for file in files if _format(file, found.problems)}
+        metadata = _metadata(folder, files)
+        listed = set() if metadata is None else {Path(name).name for name in metadata.files}
+        for parts in grouped_parts([*sizes]):
+            size = sum(sizes[path] for path in parts)
+            is_bag = any(path.name in listed for path in parts)
+            found.logs.append(Log(folder if is_bag else parts[0], tuple(parts), size))
+    return found
+
+
+class Watch:
+    """Finds logs below a directory as they become complete, by looking again and again.
+
+    A file that was written since the last look is not complete. An MCAP file or a bag says
+    itself when it ends; one that does not, and any other file, is complete when a later part of
+    the same log exists or `metadata.yaml` lists it. Databases and compressed files are complete,
+    too, when they have not changed for some time. Each file is a log of its own, but for ROS 2
+    bags that are complete when they are met.
+
+    Args:
+        top: The directory.
+        settle_s: That time, seconds.
+    """
+
+    def __init__(self, top: Path, settle_s: float = SETTLE_S) -> None:
+        self._top = top
+        self._settle_ns = round(settle_s * 1e9)
+        self._seen: set[_File] = set()  # at the last look
+        self._done: set[_File] = set()  # taken, or no log
+        self._formats: dict[_File, LogFormat | None] = {}
+
+    def check(self) -> None:
+        """Check that the directory can be read.
+
+        Raises:
+            SourceError: It cannot.
+        """
+        next(_folders(self._top, Found()), None)
+
+    def look(self) -> Found:
+        """The logs that have become complete since the last look.
+
+        It lists the directories, and reads the beginnings and ends of files that have changed.
+
+        Raises:
+            SourceError: The directory cannot be read.
+        """
+        found = Found()
+        seen: set[_File] = set()
+        now = time.time_ns()
+        for folder, files in _folders(self._top, found):
+            seen.update(files)
+            if not self._done.issuperset(files):
+                found.logs += self._complete_in(folder, files, now, found.problems)
+        self._seen = seen
+        self._done &= seen
+        self._formats = {file: kind for file, kind in self._formats.items() if file in seen}
+        return found
+
+    def put_back(self, log: Log) -> None:
+        """Find a log again at the next look."""
+        self._done = {file for file in self._done if file.path not in log.files}
+
+    def unfinished(self) -> list[Path]:
+        """Logs that were not complete at the last look, by path."""
+        return sorted(file.path for file, kind in self._formats.items() if kind)
+
+    def _complete_in(
+        self, folder: Path, files: Sequence[_File], now: int, problems: list[SourceError]
+    ) -> Iterator[Log]:
+        for file in files:
+            if file not in self._done and file not in self._formats and file.size:
+                self._formats[file] = _format(file, problems)
+        known = {file.path: file for file in files if self._formats.get(file)}
+        others = [file for file in files if file.size and not self._formats.get(file)]
+        self._done.update(others)
+        metadata = _metadata(folder, files)
+        listed = set() if metadata is None else {Path(name).name for name in metadata.files}
+        names = {file.path.name for file in files}
+        for parts in grouped_parts([*known, *(f.path for f in files if f in self._done)]):
+            ready = [
+                known[path]
+                for number, path in enumerate(parts)
+                if path in known
+                and self._is_complete(
+                    known[path], now, names, is_closed=path is not parts[-1] or path.name in listed
+                )
+            ]
+            self._done.update(ready)
+            for file in ready:
+                del self._formats[file]
+            is_bag = listed.issubset(file.path.name for file in ready) and bool(listed)
+            if is_bag and len(ready) == len(parts):
+                yield Log(folder, tuple(parts), sum(file.size for file in ready))
+            else:
+                yield from (Log(file.path, (file.path,), file.size) for file in ready)
+
+    def _is_complete(self, file: _File, now: int, names: set[str], *, is_closed: bool) -> bool:
+        """True if nobody writes a file any more.
+
+        Args:
+            file: The file.
+            now: The present time, ns.
+            names: Names of the files beside it.
+            is_closed: Whether a later part exists, or metadata lists it.
+        """
+        has_settled = now - file.changed >= self._settle_ns
+        if not has_settled and file not in self._seen:
+            return False
+        if is_closed or _has_end(file):
+            return True
+        kind = self._formats[file]
+        if (kind is None or kind.has_end) and not file.path.name.endswith(".zstd"):
+            return False
+        beside = {f"{file.path.name}{suffix}" for suffix in ("-wal", "-journal")}
+        return has_settled and not beside & names
+
+
+def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:
+    """Directories below one, itself included, and the regular files in each, by name."""
+    pending, visited = [top], set()
+    while pending:
+        folder = pending.pop()
+        try:
+            about = folder.stat()
+            if (about.st_dev, about.st_ino) in visited:
+                continue
+            visited.add((about.st_dev, about.st_ino))
+            with os.scandir(folder) as listing:
+                entries = sorted(listing, key=lambda entry: entry.name)
+        except OSError as error:
+            if folder == top:
+                raise cannot_open(folder, error) from error
+            found.problems.append(cannot_open(folder, error))
+            continue
+        if any(entry.name == STORE for entry in entries):
+            found.stores.append(folder)
+            continue
+        files, below = [], []
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            try:
+                about = entry.stat()
+            except OSError:
+                continue  # a symlink to nowhere, or a file that has just gone
+            if S_ISDIR(about.st_mode):
+                below.append(folder / entry.name)
+            elif S_ISREG(about.st_mode):
+                path = folder / entry.name
+                files.append(_File(path, about.st_size, about.st_mtime_ns, about.st_ino))
+        yield folder, files
+        pending += reversed(below)
+
+
+def _format(file: _File, problems: list[SourceError]) -> LogFormat | None:
+    """The format of a log; None for other files. A wrong file with the name of a log is one."""
+    is_called = file.path.name.removesuffix(".zstd").endswith(_SUFFIXES)
+    if not file.size:
+        return UNKNOWN if is_called else None
+    try:
+        found, _ = sniff(file.path)
+    except SourceError as error:
+        if is_called:
+            problems.append(error)
+        return None
+    return found if is_called or not (found is UNKNOWN or found.needs_suffix) else None
+
+
+def _metadata(folder: Path, files: Sequence[_File]) -> BagMetadata | None:
+    """The metadata of the ROS 2 bag in a directory; None without any that lists files."""
+    if not any(file.path.name == NAME for file in files):
+        return None
+    found = read_metadata(folder)
+    return found if isinstance(found, BagMetadata) and found.files else None
+
+
+def _has_end(file: _File) -> bool:
+    """True if an MCAP file or a bag has the end that its writer gives it."""
+    try:
+        with file.path.open("rb") as opened:
+            head = opened.read(_BAG_HEAD)
+            opened.seek(max(0, file.size - len(_MCAP_END)))
+            if head.startswith(_MCAP_END):
+                return file.size > len(_MCAP_END) and opened.read() == _MCAP_END
+    except OSError:
+        return False
+    place = head.find(_BAG_INDEX) + len(_BAG_INDEX)
+    index = int.from_bytes(head[place : place + 8], "little")
+    is_bag = head.startswith(b"#ROSBAG V2.0") and place >= len(_BAG_INDEX)
+    return is_bag and 0 < index <= file.size

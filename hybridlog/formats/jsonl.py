@@ -1,0 +1,173 @@
+"""Writes JSON lines: one object for each message, in UTF-8.
+
+JSON has no NaN and no infinities: they are the strings `"NaN"`, `"Infinity"` and
+`"-Infinity"`, as in the JSON form of protobuf. Integers keep all their digits, also those
+past 2**53, which some readers round. Binary values are base64. A field that a message
+lacks is not there, and one that is null is null.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from datetime import date, timedelta
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hybridlog.formats.writing import FileWriter, Line, Sink, Target
+from hybridlog.schema.plain import without_nan
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_MAX_DEPTH = 200
+_BLOCK = 1 << 20
+_ROWS = 4096
+
+
+class JsonlWriter(FileWriter):
+    """Writes JSON lines.
+
+    Args:
+        target: Path or binary stream.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        self._sink = Sink(target)
+
+    def write(self, lines: Iterable[Line]) -> None:
+        """Append lines, without their ends.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        block: list[str] = []
+        size = 0
+        for piece in chain.from_iterable(
+            (f"{line}\n",) if isinstance(line, str) else chain(line, "\n") for line in lines
+        ):
+            block.append(piece)
+            size += len(piece)
+            if size >= _BLOCK:
+                self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
+                block, size = [], 0
+        # A lone surrogate becomes the escape that JSON has for it.
+        self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
+
+    def flush(self) -> None:
+        """Pass on the lines so far."""
+        self._sink.flush()
+
+    def _finish(self) -> None:
+        self._sink.commit()
+
+    def _discard(self) -> None:
+        self._sink.abort()
+
+
+def rows_within(size: int, rows: int, *, limit: int = 16 << 20) -> int:
+    """Rows that are about `limit` bytes, from 1 to 4096, when so many have a size together."""
+    per_row = max(1, size // max(1, rows))
+    return int(min(_ROWS, max(1, limit // per_row)))
+
+
+def json_rows(records: pa.StructArray) -> Iterator[Line]:
+    """Rows of columns as lines, long ones in pieces."""
+    from hybridlog.formats.json_text import PIECE_BYTES, json_column, json_pieces
+
+    rows = rows_within(records.nbytes, len(records))
+    for begin in range(0, len(records), rows):
+        part = records.slice(begin, rows)
+        if part.nbytes > PIECE_BYTES * rows:
+            yield from (json_pieces(part.slice(row, 1)) for row in range(len(part)))
+        else:
+            yield from json_column(part).to_pylist()
+
+
+def object_line(row: Mapping[str, object]) -> Line:
+    """An object as one line of JSON, without its end; in pieces if it has a long list.
+
+    Raises:
+        UsageError: A value that has no JSON form.
+    """
+    if any(isinstance(value, list) and len(value) > _ROWS for value in row.values()):
+        return _pieces(row)
+    return json_line(row)
+
+
+def _pieces(row: Mapping[str, object]) -> Iterator[str]:
+    for number, (name, value) in enumerate(row.items()):
+        yield f"{', ' if number else '{'}{json_line(name)}: "
+        if not isinstance(value, list):
+            yield json_line(value)
+            continue
+        for begin in range(0, max(len(value), 1), _ROWS):
+            yield ", " if begin else "["
+            yield json_line(value[begin : begin + _ROWS])[1:-1]
+        yield "]"
+    yield "}"
+
+
+def json_line(row: object) -> str:
+    """A value as one line of JSON, without its end.
+
+    Raises:
+        UsageError: A value that has no JSON form.
+    """
+    try:
+        return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_plain)
+    except ValueError:  # NaN or an infinity; rare, so it is looked for only then
+        return json.dumps(_clean(row, 0), ensure_ascii=False, default=_plain)
+    except RecursionError:
+        raise UsageError("a message is nested too deep for JSON") from None
+
+
+def _plain(value: object) -> object:
+    """Convert a value of a type unknown to `json`."""
+    for kind, make in _KINDS:
+        if isinstance(value, kind):
+            return make(value)
+    raise UsageError(f"a value of type {type(value).__name__} has no JSON form")
+
+
+def _numbers(value: np.ndarray[tuple[int, ...], np.dtype[np.generic]] | np.generic) -> object:
+    if value.dtype.kind in "mM":
+        unit = "datetime64[ns]" if value.dtype.kind == "M" else "timedelta64[ns]"
+        value = value.astype(unit).astype(np.int64)
+    plain: object = value.tolist()
+    return plain
+
+
+_KINDS: tuple[tuple[type, Callable[[Any], object]], ...] = (
+    (np.ndarray, _numbers),
+    (np.generic, _numbers),
+    (bytes, lambda value: base64.b64encode(value).decode()),
+    (bytearray, lambda value: base64.b64encode(value).decode()),
+    (memoryview, lambda value: base64.b64encode(value).decode()),
+    (date, lambda value: value.isoformat()),
+    (timedelta, timedelta.total_seconds),
+    (Mapping, dict),
+    (Sequence, list),
+    (AbstractSet, list),
+)
+
+
+def _clean(value: object, depth: int) -> object:
+    """A copy with a string for each number that JSON does not have."""
+    if depth > _MAX_DEPTH:
+        raise UsageError("a message is nested too deep for JSON")
+    if isinstance(value, float):
+        return without_nan(value)
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, Mapping):
+        return {key: _clean(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(item, depth + 1) for item in value]
+    return _clean(_plain(value), depth + 1)

@@ -1,0 +1,464 @@
+"""Reads foreign MCAP files, from ROS 2 (rosbag2), ROS 1 or anything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+
+from hybridlog.formats.reading import (
+    BATCH_BYTES,
+    BATCH_MESSAGES,
+    MAX_CHUNK,
+    TOO_MANY_CHANNELS,
+    TOO_MANY_SILENT,
+    Damage,
+    Source,
+    cannot_open,
+)
+from hybridlog.wording import listed
+from hybridlog_storage.errors import SegmentError, SourceError
+from hybridlog_storage.mcap.mcap_scan import (
+    MAGIC,
+    ChunkContent,
+    End,
+    Item,
+    Loose,
+    ScanDamage,
+    ScannedChunk,
+    read_summary,
+    scan,
+)
+from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
+from hybridlog_storage.ordering import distinct
+from hybridlog_storage.segments.attachments import Attachment, FileHandle
+from hybridlog_storage.times import END, span_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from mcap.summary import Summary
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Batch
+
+_UNDEFINED = -1
+_TOO_MANY = -2  # one more than a recording can hold
+_IDS = 1 << 16
+
+
+@dataclass(slots=True)
+class _Open:
+    """Damage whose message count may still be found behind it.
+
+    Attributes:
+        offset: Byte where it starts.
+        length: Bytes of it, None if unknown.
+        reason: Description of the damage.
+        chunk: A whole chunk is lost, so the message indexes behind it list its messages.
+        counted: Messages listed by the message indexes behind it, None before the first.
+        got: Messages of the chunk that were read.
+    """
+
+    offset: int
+    length: int | None
+    reason: str
+    chunk: bool
+    counted: int | None = None
+    got: int = 0
+
+
+class McapSource(Source):
+    """One MCAP file, read forward.
+
+    Definitions come from the data; those of the summary replace definitions lost with a
+    damaged chunk. A channel id that is redefined with other content is another channel from
+    there on. Messages on a channel with an undefined schema are read without a schema, and
+    `damage` notes it.
+
+    Args:
+        path: The file.
+
+    Raises:
+        SourceError: It cannot be opened, or is not an MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, kind="MCAP", profile="", files=[path])
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise cannot_open(path, error) from error
+        try:
+            self._summary = self._open()
+        except OSError as error:
+            self._file.close()
+            raise cannot_open(path, error) from error
+        except BaseException:
+            self._file.close()
+            raise
+        self._handle: FileHandle | None = None  # for attachments, which outlive this reader
+        self._definitions = _Definitions(self.channels, self._summary)
+        self._given = 0
+        self._lost = 0
+        self._pending: _Open | None = None
+        self._uncounted: list[_Open] = []
+        self._end_is_noted = False
+        self._too_many = 0
+        self._unpublished = 0
+        # Channels of the message indexes since the last chunk, None before the first.
+        self._indexed: set[int] | None = None
+
+    def _open(self) -> Summary | None:
+        if self._file.read(len(MAGIC)) != MAGIC:
+            raise SourceError(
+                f"{self.path}: not an MCAP file, it does not start with the bytes of one; "
+                "check that the file was copied whole"
+            )
+        summary = read_summary(self._file, self.size_bytes)
+        # With the summary known, this reads only the first record.
+        first = next(scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=summary), None)
+        if first is not None and isinstance(first[1], records.Header):
+            self.profile = first[1].profile
+            if self.profile == "ros2":
+                self.kind = "ROS 2 bag (mcap)"
+        if summary is not None and summary.statistics is not None:
+            self.message_count = summary.statistics.message_count
+            self.time_range = _time_range(summary)
+        return summary
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        self._handle = None
+
+    def batches(self) -> Iterator[Batch]:
+        """Yield all readable messages once, in file order.
+
+        Raises:
+            SourceError: The file cannot be read any more.
+        """
+        scanned = scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=self._summary)
+        try:
+            for offset, item in scanned:
+                self.bytes_read = max(self.bytes_read, offset)
+                yield from self._take(offset, item)
+        except OSError as error:
+            raise cannot_open(self.path, error) from error
+
+    def _take(self, offset: int, item: Item) -> Iterator[Batch]:
+        if isinstance(item, records.MessageIndex):
+            self._index(offset, item)
+            return
+        self._settle()
+        if isinstance(item, ScannedChunk):
+            self._indexed = set()
+        if isinstance(item, ScannedChunk):
+            yield from self._chunk(item)
+        elif isinstance(item, Loose):
+            yield from self._content(item.content, offset, relative=True)
+        elif isinstance(item, ScanDamage):
+            yield from self._damaged(item)
+        elif isinstance(item, records.Schema | records.Channel):
+            self._define(offset, item)
+        elif isinstance(item, records.Metadata):
+            self.extras.append(item)
+        elif isinstance(item, Attachment):
+            self._handle = self._handle or FileHandle(self._file.fileno())
+            self.extras.append(replace(item, data=item.data.through(self._handle)))
+        elif isinstance(item, End):
+            self._end(item)
+
+    def _index(self, offset: int, item: records.MessageIndex) -> None:
+        """Process a message index: count messages of a lost chunk, or find a missed one."""
+        if self._pending is not None and self._pending.chunk:
+            self._pending.counted = (self._pending.counted or 0) + len(item.records)
+            return
+        # A chunk has one index for each channel. Totals, if they exist, count better.
+        foreign = self._indexed is None or item.channel_id in self._indexed
+        if foreign and item.records and self.message_count is None:
+            self._settle()
+            reason = "the chunk of these message indexes is missing"
+            self._pending = _Open(offset, 0, reason, chunk=True, counted=len(item.records))
+        elif self._indexed is not None:
+            self._indexed.add(item.channel_id)
+
+    def _chunk(self, chunk: ScannedChunk) -> Iterator[Batch]:
+        before = self._given
+        try:
+            for content in chunk.contents():
+                yield from self._content(content, chunk.offset)
+        except SegmentError as error:
+            reason = f"a chunk is damaged: {error}"
+            got = self._given - before
+            if got:
+                reason += f"; {got} messages before that were read"
+            self._pending = _Open(chunk.offset, chunk.length, reason, chunk=True, got=got)
+
+    def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
+        reason = item.reason
+        if item.opcode == Opcode.DATA_END and (self.damage or self._uncounted):
+            return  # the checksum of all data adds nothing to known damage
+        if item.torn is not None:
+            before = self._given
+            for content in item.torn.contents():
+                yield from self._content(content, item.offset)
+            reason += f"; {self._given - before} messages of its beginning were read"
+        if item.length is not None and item.offset + item.length >= self.size_bytes:
+            self._end_is_noted = True
+        if item.messages is None:
+            self._pending = _Open(
+                item.offset, item.length, reason, chunk=item.opcode == Opcode.CHUNK
+            )
+        else:
+            self._note(item.offset, item.length, reason, item.messages)
+
+    def _content(
+        self, content: ChunkContent, offset: int, *, relative: bool = False
+    ) -> Iterator[Batch]:
+        """Yield the messages of one chunk or run, split where a definition changes."""
+        self._unpublished += content.unpublished
+        for damage in content.damage:
+            self._note(offset, None, damage.reason, damage.messages)
+        if len(content.invalid):
+            first = int(content.invalid[0])
+            self._note(
+                offset + first if relative else offset,
+                None,
+                f"{len(content.invalid)} messages have a log time beyond 2^63 - 1 ns or no head "
+                f"(the first at byte {first} of the content)",
+                len(content.invalid),
+            )
+        batch = content.batch
+        found = np.empty(len(batch), np.int32)
+        row = 0
+        for definition in content.definitions:
+            if definition.row > row and self._definitions.changes(definition.record):
+                self._resolve(batch.channel, found, slice(row, definition.row), offset)
+                row = definition.row
+            self._definitions.add(definition.record)
+        self._resolve(batch.channel, found, slice(row, len(batch)), offset)
+        yield from self._rows(batch, found, offset)
+
+    def _resolve(
+        self, ids: NDArray[np.int32], found: NDArray[np.int32], rows: slice, offset: int
+    ) -> None:
+        """Set the channels of some rows by the definitions so far."""
+        wanted = ids[rows]
+        # Sorting takes longer than a few rows.
+        numbers = set(wanted.tolist()) if len(wanted) < 10 else distinct(wanted).tolist()
+        for number in numbers:
+            reason = self._definitions.use(number)
+            if reason:
+                self._note(offset, None, reason, 0)
+        found[rows] = self._definitions.table[wanted]
+
+    def _rows(self, rows: Batch, found: NDArray[np.int32], offset: int) -> Iterator[Batch]:
+        """Yield rows on the channels `found` in batches of bounded size."""
+        known = found >= 0
+        if not known.all():
+            many = found == _TOO_MANY
+            self._too_many += int(many.sum())
+            lost = int((found == _UNDEFINED).sum())
+            if lost:
+                undefined = distinct(rows.channel[found == _UNDEFINED]).tolist()
+                names = listed(map(str, undefined), 5)
+                reason = f"{lost} messages on channels that are not defined ({names})"
+                self._note(offset, None, reason, lost)
+            rows, found = rows.take(known), found[known]
+        if not len(rows):
+            return
+        self._given += len(rows)
+        for part in _parts(rows.length):
+            piece = rows.take(part)
+            piece.channel = found[part]
+            yield piece
+
+    def _define(self, offset: int, record: records.Schema | records.Channel) -> None:
+        self._definitions.add(record)
+        self.bytes_read = max(self.bytes_read, offset)
+
+    def _note(self, offset: int | None, length: int | None, reason: str, lost: int | None) -> None:
+        self.note(Damage(self.path, offset, length, reason, lost))
+        self._lost += lost or 0
+
+    def _settle(self) -> None:
+        """Note pending damage, or defer it, since no message index follows."""
+        pending, self._pending = self._pending, None
+        if pending is None:
+            return
+        if pending.counted is None and self.message_count is not None:
+            self._uncounted.append(pending)  # the totals at the end may show it
+        else:
+            counted = pending.counted
+            self._note_open(pending, None if counted is None else max(counted - pending.got, 0))
+
+    def _note_open(self, pending: _Open, lost: int | None) -> None:
+        self._note(pending.offset, pending.length, pending.reason, lost)
+
+    def _end(self, end: End) -> None:
+        self.bytes_read = self.size_bytes
+        if left_out := self._definitions.use_rest():
+            self._note(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
+        if self._too_many:
+            self._note(None, None, TOO_MANY_CHANNELS, self._too_many)
+        if self._unpublished:
+            reason = (
+                f"{self._unpublished} messages have a publish time beyond 2^63 - 1 ns; their log "
+                "time is stored in its place"
+            )
+            self._note(None, None, reason, 0)
+        missing = None
+        if self.message_count is not None:
+            missing = max(self.message_count - self._given - self._lost, 0)
+        if len(self._uncounted) == 1:
+            self._note_open(self._uncounted[0], missing)
+            missing = 0
+        else:
+            for pending in self._uncounted:
+                self._note_open(pending, None)
+        self._uncounted.clear()
+        if missing:
+            self._note(
+                None,
+                None,
+                f"{missing} more messages are counted in the summary than found",
+                missing,
+            )
+        if not end.clean and not self._end_is_noted:
+            reason = "the file was not closed: its end is missing; all before it was read"
+            self._note(end.offset, 0, reason, 0)
+
+
+def _time_range(summary: Summary) -> tuple[int, int] | None:
+    """The log time by the summary, if its parts agree."""
+    statistics = summary.statistics
+    if statistics is None or not statistics.message_count:
+        return None
+    start, last = statistics.message_start_time, statistics.message_end_time
+    indexes = [i for i in summary.chunk_indexes if i.message_start_time or i.message_end_time]
+    if indexes:
+        by_chunks = (
+            min(index.message_start_time for index in indexes),
+            max(index.message_end_time for index in indexes),
+        )
+        if by_chunks != (start, last):
+            return None
+    return span_of(start, last) if start <= last <= END else None
+
+
+def _parts(length: NDArray[np.int64]) -> Iterator[slice]:
+    """Runs of at most `BATCH_MESSAGES` rows, closed once they hold `BATCH_BYTES`."""
+    count = len(length)
+    total = np.cumsum(length)
+    start, before = 0, 0
+    while start < count:
+        full = int(np.searchsorted(total, before + BATCH_BYTES)) + 1
+        end = min(full, start + BATCH_MESSAGES, count)
+        yield slice(start, end)
+        start, before = end, int(total[end - 1])
+
+
+class _Definitions:
+    """The present meaning of each MCAP channel id.
+
+    Attributes:
+        table: int32[65536], index in the source's channels by channel id, negative if the id
+            is undefined or unused, or one too many.
+    """
+
+    def __init__(self, channels: list[Channel], summary: Summary | None) -> None:
+        self.table = np.full(_IDS, _UNDEFINED, np.int32)
+        self._channels = channels
+        # The summary repeats all definitions, also those in unreadable chunks.
+        self._schemas: dict[int, records.Schema] = dict(summary.schemas) if summary else {}
+        self._records: dict[int, records.Channel] = dict(summary.channels) if summary else {}
+        self._schema_ids = np.zeros(_IDS, np.int32)  # by channel id
+        self._used: set[int] = set()  # schemas that channels have named
+        for record in self._records.values():
+            self._names(record)
+        self._made: dict[tuple[object, ...], int] = {}  # indexes of channels by what they say
+        self._shared: dict[tuple[str, str, bytes], Schema] = {}
+
+    def _names(self, record: records.Channel) -> None:
+        self._schema_ids[record.id] = record.schema_id
+        self._used.add(record.schema_id)
+
+    def changes(self, record: records.Schema | records.Channel) -> bool:
+        """True if this definition changes the meaning of an id."""
+        known = self._known(record)
+        return known is not None and known != record
+
+    def add(self, record: records.Schema | records.Channel) -> None:
+        """Apply this definition from now on."""
+        known = self._known(record)
+        if known is not None and known == record:
+            return
+        if isinstance(record, records.Channel):
+            self._records[record.id] = record
+            self._names(record)
+            self.table[record.id] = _UNDEFINED
+        elif record.id:  # MCAP: a schema with id 0 is to be ignored
+            self._schemas[record.id] = record
+            if record.id in self._used:
+                self.table[self._schema_ids == record.id] = _UNDEFINED
+
+    def _known(
+        self, record: records.Schema | records.Channel
+    ) -> records.Schema | records.Channel | None:
+        if isinstance(record, records.Schema):
+            return self._schemas.get(record.id)
+        return self._records.get(record.id)
+
+    def use(self, channel_id: int) -> str:
+        """Enter this id into the table, if it is defined.
+
+        Returns:
+            The problem of its definition, empty if none or if it was reported before.
+        """
+        record = self._records.get(channel_id)
+        if record is None or self.table[channel_id] != _UNDEFINED:
+            return ""
+        schema = self._share(self._schemas.get(record.schema_id))
+        metadata = tuple(sorted(record.metadata.items()))
+        key = (channel_id, record.topic, record.message_encoding, metadata, id(schema))
+        index = self._made.get(key)
+        if index is not None:
+            self.table[channel_id] = index
+            return ""
+        if len(self._channels) >= MAX_CHANNELS:
+            self.table[channel_id] = _TOO_MANY
+            return ""
+        self.table[channel_id] = self._made[key] = len(self._channels)
+        self._channels.append(
+            Channel(
+                topic=record.topic,
+                message_encoding=record.message_encoding,
+                schema=schema,
+                metadata=record.metadata,
+            )
+        )
+        if schema is None and record.schema_id:
+            return (
+                f"schema {record.schema_id} of channel {channel_id} ({record.topic}) is not "
+                "defined; its messages are kept without one"
+            )
+        return ""
+
+    def use_rest(self) -> int:
+        """Enter the channels without messages; returns how many there is no room for."""
+        rest = [number for number in self._records if self.table[number] == _UNDEFINED]
+        for number in rest:
+            self.use(number)
+        return int((self.table[rest] == _TOO_MANY).sum())
+
+    def _share(self, record: records.Schema | None) -> Schema | None:
+        if record is None:
+            return None
+        key = (record.name, record.encoding, record.data)
+        return self._shared.setdefault(key, Schema(*key))

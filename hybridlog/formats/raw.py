@@ -1,0 +1,190 @@
+"""Writes one file a message: unchanged payloads here, pictures in `pictures`.
+
+The directory holds `index.jsonl`, with a line for each message (file, topic, type, times,
+sequence, length). Each topic has a directory with files `<log time in ns>.bin`. A second
+message of the same nanosecond is `<log time>-1.bin`. Topic directories are named like the
+index's collections, so no topic leads outside and no two share a directory. On a stream the
+payloads follow each other without separators.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybridlog.formats.writing import BatchWriter, FileWriter, Sink, Target, failures
+from hybridlog_storage.disk.unfinished import beside
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.mongo.collection_names import collection_of
+
+if TYPE_CHECKING:
+    from hybridlog_storage.messages import Batch, Buffer, Channel
+
+INDEX = "index.jsonl"
+"""The file that describes each file. No topic's directory has a dot."""
+PICTURE_SUFFIXES = (".jpg", ".png", ".webp", ".gif", ".avif", ".bmp", ".tif", ".jp2", ".jxl")
+
+_LONGEST_LINE = 1 << 20
+_FILE = re.compile(rf"[0-9]+(-[0-9]+)?({'|'.join(map(re.escape, ('.bin', *PICTURE_SUFFIXES)))})")
+
+
+def holds_messages(directory: Path) -> bool:
+    """True if this module wrote a directory, and no file was added since.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    index = directory / INDEX
+    if not index.is_file() or not _is_index(index):
+        return False
+    for entry in directory.iterdir():
+        if entry.name == INDEX:
+            continue
+        if entry.is_symlink() or not entry.is_dir():
+            return False
+        if not all(_FILE.fullmatch(file.name) for file in entry.iterdir()):
+            return False
+    return True
+
+
+def _is_index(path: Path) -> bool:
+    with path.open("rb") as file:
+        first = file.readline(_LONGEST_LINE)
+    try:
+        line = json.loads(first or b"{}")
+    except ValueError:
+        return False
+    return isinstance(line, dict) and (not first or {"file", "log_time_ns"} <= line.keys())
+
+
+def open_raw_writer(target: Target) -> BatchWriter:
+    """Open a writer: of a directory for a path, of consecutive payloads for a stream."""
+    if isinstance(target, str | os.PathLike):
+        return RawWriter(target)
+    return RawStreamWriter(target)
+
+
+class DirectoryWriter(FileWriter):
+    """Writes a directory with a file a message.
+
+    Args:
+        target: The directory; it must be missing or empty.
+
+    Raises:
+        UsageError: It is not empty, or cannot be written.
+    """
+
+    def __init__(self, target: str | os.PathLike[str]) -> None:
+        super().__init__()
+        self._name = os.fspath(target)
+        with failures(self._name):
+            self._final = Path(os.path.realpath(target))
+            if self._final.exists() and not self._final.is_dir():
+                raise UsageError(f"{target} is a file; messages go into a directory")
+            if self._final.is_dir() and next(self._final.iterdir(), None) is not None:
+                raise UsageError(f"{target} is not empty; name a directory that does not exist")
+            self._unfinished = beside(self._final)
+            self._temporary = self._unfinished.path
+            self._temporary.mkdir()
+            self._index = (self._temporary / INDEX).open("x", encoding="ascii")
+        self._last: dict[str, tuple[int, int]] = {}
+
+    def add(self, data: Buffer, suffix: str, about: Mapping[str, object]) -> None:
+        """Write a file.
+
+        Args:
+            data: Its content.
+            suffix: Its suffix, with the dot.
+            about: The line of the index; its `topic` and `log_time_ns` give the name.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        with failures(self._name):
+            name = self._write(str(about["topic"]), int(str(about["log_time_ns"])), suffix, data)
+            self._index.write(json.dumps({"file": name, **about}) + "\n")
+
+    def _write(self, topic: str, log_time: int, suffix: str, data: Buffer) -> str:
+        folder = collection_of(topic)
+        last, number = self._last.get(folder, (-1, 0))
+        if folder not in self._last:
+            (self._temporary / folder).mkdir()
+        number = number + 1 if last == log_time else 0
+        while True:
+            name = f"{folder}/{log_time}{f'-{number}' if number else ''}{suffix}"
+            try:
+                file = (self._temporary / name).open("xb")
+            except FileExistsError:  # the same time again, after other times
+                number += 1
+                continue
+            with file:
+                file.write(data)
+            self._last[folder] = (log_time, number)
+            return name
+
+    def _finish(self) -> None:
+        with failures(self._name):
+            self._index.close()
+            # One sync for all: thousands of separate ones take minutes on a slow disk.
+            os.sync()
+            self._unfinished.publish(self._final)
+
+    def _discard(self) -> None:
+        with suppress(OSError):
+            self._index.close()
+        self._unfinished.remove()
+
+
+class RawWriter(DirectoryWriter):
+    """Writes a directory of payload files."""
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        for row in range(len(batch)):
+            channel = channels[int(batch.channel[row])]
+            about = {
+                "topic": channel.topic,
+                "type": channel.schema.name if channel.schema else "",
+                "encoding": channel.message_encoding,
+                "log_time_ns": int(batch.log_time[row]),
+                "publish_time_ns": int(batch.publish_time[row]),
+                "sequence": int(batch.sequence[row]),
+                "length": int(batch.length[row]),
+            }
+            self.add(batch.payload(row), ".bin", about)
+
+
+class RawStreamWriter(FileWriter):
+    """Writes payloads one after the other, for a pipe.
+
+    Args:
+        target: Binary stream, or the path of a file.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        self._sink = Sink(target)
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append payloads.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        for row in range(len(batch)):
+            self._sink.write(batch.payload(row))
+
+    def _finish(self) -> None:
+        self._sink.commit()
+
+    def _discard(self) -> None:
+        self._sink.abort()

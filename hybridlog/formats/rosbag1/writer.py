@@ -1,0 +1,224 @@
+"""Writes ROS 1 bags with unchanged messages and the connection headers of the source."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Literal, cast
+
+from rosbags.rosbag1.reader import RecordType
+from rosbags.rosbag1.writer import Header, WriteChunk
+from rosbags.rosbag1.writer import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from hybridlog.formats.mcap.writer import source_metadata
+from hybridlog.formats.writing import FileWriter, Target, destination, failures
+from hybridlog.schema.completion import with_nested
+from hybridlog_storage.disk.unfinished import beside, scratch_directory
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+    from hybridlog_storage.messages import Batch, Channel, Schema
+    from hybridlog_storage.segments.attachments import Attachment
+
+_TIME_LIMIT = 2**32 * 10**9
+_LARGEST_DEFINITION = 256 << 10
+_ConnectionKey = tuple[str, str, bytes, str, str | None, str | None]
+
+
+class BagWriter(FileWriter):
+    """Writes one ROS 1 bag, version 2.0, with its index.
+
+    Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag.
+
+    Args:
+        target: Path or binary stream. A bag's header is written last, so for a stream the bag
+            is written to a temporary file first.
+        compression: Compression of chunks.
+    """
+
+    def __init__(
+        self, target: Target, *, compression: Literal["none", "bz2", "lz4"] = "none"
+    ) -> None:
+        super().__init__()
+        self._stream: BinaryIO | None = None
+        self._final: Path | None = None
+        self._connections: dict[_ConnectionKey, Connection] = {}
+        self._known: dict[Channel, Connection] = {}
+        if isinstance(target, str | os.PathLike):
+            self._name = os.fspath(target)
+            with failures(self._name):
+                self._final, self._atomic = destination(target)
+        else:
+            self._name = str(getattr(target, "name", "the output"))
+            self._stream, self._atomic = target, False
+        with failures(self._name):
+            if self._atomic and self._final is not None:
+                self._unfinished = beside(self._final)
+                self._temporary = self._unfinished.path
+            else:
+                self._unfinished = scratch_directory()
+                self._temporary = self._unfinished.path / "output.bag"
+            self._writer = _ExactWriter(self._temporary)
+            if compression != "none":
+                self._writer.set_compression(RosbagsWriter.CompressionFormat[compression.upper()])
+            try:
+                self._writer.open()
+            except BaseException:
+                self._discard()
+                raise
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages in the order of the rows.
+
+        Raises:
+            UsageError: A channel has another encoding than ROS 1, or a time is outside the range
+                of a bag (1970 to 2106).
+            DiskFullError: No space left.
+        """
+        if len(batch) == 0:
+            return
+        if int(batch.log_time.max()) >= _TIME_LIMIT or int(batch.log_time.min()) < 0:
+            raise UsageError(
+                "a ROS 1 bag holds times from 1970 to 2106 only, and a message lies outside; "
+                "write --format mcap"
+            )
+        view = memoryview(batch.buffer)
+        with failures(self._name):
+            connections = {
+                number: self._connection(channels[number]) for number in set(batch.channel.tolist())
+            }
+            write = self._writer.write
+            for channel, start, length, log_time in zip(
+                batch.channel.tolist(),
+                batch.offset.tolist(),
+                batch.length.tolist(),
+                batch.log_time.tolist(),
+                strict=True,
+            ):
+                write(connections[channel], log_time, view[start : start + length])
+
+    def declare(self, channels: Sequence[Channel]) -> None:
+        """Add channels, which need have no messages; those that fit into no bag are left out."""
+        with failures(self._name):
+            for channel in channels:
+                if channel.message_encoding == "ros1" and channel.schema is not None:
+                    self._connection(channel)
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Do nothing: a bag has no metadata records."""
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Do nothing: a bag has no attachments."""
+
+    def _connection(self, channel: Channel) -> Connection:
+        connection = self._known.get(channel)
+        if connection is None:
+            connection = self._known[channel] = self._register(channel)
+        return connection
+
+    def _register(self, channel: Channel) -> Connection:
+        if channel.message_encoding != "ros1" or channel.schema is None:
+            raise UsageError(
+                f"{channel.topic} has {channel.message_encoding or 'unknown'} messages"
+                f"{'' if channel.schema else ' without a definition'}, and a ROS 1 bag holds "
+                "ROS 1 messages only; nothing is converted, so that every byte stays as it "
+                "came: write --format mcap"
+            )
+        metadata = source_metadata(channel)
+        schema = with_nested(channel.schema)
+        md5sum = metadata.get("md5sum") or _md5sum(schema)
+        callerid, latching = metadata.get("callerid"), metadata.get("latching")
+        key = (channel.topic, schema.name, schema.data, md5sum, callerid, latching)
+        if key not in self._connections:
+            self._connections[key] = self._writer.add(channel.topic, schema, md5sum, metadata)
+        return self._connections[key]
+
+    def _finish(self) -> None:
+        with failures(self._name):
+            self._writer.close()
+            if self._atomic and self._final is not None:
+                with self._temporary.open("rb") as file:
+                    os.fsync(file.fileno())
+                self._unfinished.publish(self._final)
+                return
+            with self._temporary.open("rb") as file:
+                if self._stream is not None:
+                    shutil.copyfileobj(file, self._stream, 1 << 20)
+                    self._stream.flush()
+                elif self._final is not None:
+                    with self._final.open("wb") as device:
+                        shutil.copyfileobj(file, device, 1 << 20)
+        self._discard()
+
+    def _discard(self) -> None:
+        with suppress(OSError):
+            self._writer.abort()
+        self._unfinished.remove()
+
+
+class _ExactWriter(RosbagsWriter):
+    """The rosbags writer with unchanged connection headers and bounded memory."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._headers: list[tuple[str, Header]] = []
+
+    def add(self, topic: str, schema: Schema, md5sum: str, metadata: dict[str, str]) -> Connection:
+        """Add a connection with the unchanged bytes of its definition."""
+        header = Header()
+        header.set_string("topic", topic)
+        header.set_string("type", schema.name)
+        header.set_string("md5sum", md5sum)
+        header["message_definition"] = schema.data
+        for key, value in metadata.items():
+            # A field of a bag header is `key=value`.
+            if key and "=" not in key and key not in header:
+                header.set_string(key, value)
+        self._headers.append((topic, header))
+        latching = metadata.get("latching", "")
+        return self.add_connection(
+            topic,
+            schema.name,
+            msgdef=schema.data.decode(errors="replace"),
+            md5sum=md5sum,
+            callerid=metadata.get("callerid"),
+            # Only distinguishes connections; the header has the unchanged text.
+            latching=int.from_bytes(latching.encode()) if latching else None,
+        )
+
+    # In rosbags this static method builds the header from the connection's fields.
+    def write_connection(self, connection: Connection, bio: BinaryIO) -> None:  # type: ignore[override]
+        """Write a connection record with the unchanged header."""
+        topic, fields = self._headers[connection.id]
+        header = Header()
+        header.set_uint32("conn", connection.id)
+        header.set_string("topic", topic)
+        header.write(bio, RecordType.CONNECTION)
+        fields.write(bio)
+
+    def write_chunk(self, chunk: WriteChunk) -> None:
+        """Write a chunk; store only the counts of its index, for the end of the bag."""
+        super().write_chunk(chunk)
+        for number, entries in chunk.connections.items():
+            counted = cast("list[tuple[int, int]]", range(len(entries)))
+            chunk.connections[number] = counted
+
+
+def _md5sum(schema: Schema) -> str:
+    """The ROS 1 hash of a definition; `*`, which matches any, if it cannot be computed."""
+    if len(schema.data) > _LARGEST_DEFINITION or "/" not in schema.name:
+        return "*"
+    package, _, name = schema.name.replace("/msg/", "/").partition("/")
+    kind = f"{package}/msg/{name}"
+    try:
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(schema.data.decode(), kind))
+        return store.generate_msgdef(kind)[1]
+    except Exception:  # any error of the parser for a hostile definition
+        return "*"

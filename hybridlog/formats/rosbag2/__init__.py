@@ -1,0 +1,1 @@
+"""ROS 2 bags: directories with their metadata, and SQLite files."""

@@ -1,0 +1,427 @@
+"""Reads a `.db3` file of a ROS 2 bag.
+
+Rows are queried in the order of row ids. In a damaged database, reading continues behind
+the damage.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections import Counter
+from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from hybridlog.formats.reading import (
+    BATCH_BYTES,
+    BATCH_MESSAGES,
+    Damage,
+    Source,
+    cannot_open,
+)
+from hybridlog.formats.rosbag2.directory import parse_metadata
+from hybridlog.formats.spool import copy_start
+from hybridlog.formats.yaml_values import YamlError
+from hybridlog.schema.definition_text import interface_of
+from hybridlog.wording import listed
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import Any, Literal
+
+MAGIC = b"SQLite format 3\x00"
+
+# Without an index on time, counting reads the whole file, so only small ones are counted.
+_COUNT_BYTES = 64 << 20
+
+_MIN_ROWID = -(2**63)
+_MAX_ROWID = 2**63 - 1
+
+
+class _Row(NamedTuple):
+    """A message as read from the database."""
+
+    rowid: int
+    topic: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class SqliteSource(Source):
+    """A `.db3` file of rosbag2.
+
+    Raises:
+        SourceError: It does not exist, is not a ROS 2 bag, or has no readable messages.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, kind="ROS 2 bag (sqlite3)", profile="ros2", files=[path])
+        self._channel_of: dict[int, int] = {}
+        self._undefined: Counter[int | None] = Counter()
+        self._early = 0
+        self._select = ""
+        self._got = 0
+        header = _read_header(path)
+        self._missing = header.pages * header.page - self.size_bytes
+        try:
+            self._db, log_unread = _connect_whole_pages(path, header, self.size_bytes)
+        except sqlite3.Error as error:
+            raise _unreadable(path, error) from error
+        if log_unread is not None:
+            reason = "its messages are left out: SQLite cannot read this write-ahead log here"
+            self.damage.append(Damage(log_unread, 0, None, reason, None))
+        try:
+            self._open()
+        except (sqlite3.Error, OverflowError, ValueError) as error:
+            self.close()
+            raise _unreadable(path, error) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the database."""
+        self._db.close()
+
+    # Opening.
+
+    def _open(self) -> None:
+        tables = self._tables()
+        messages = self._columns("messages") if "messages" in tables else set()
+        topics = self._columns("topics") if "topics" in tables else set()
+        if not {"topic_id", "data"} <= messages or not {"id", "name", "type"} <= topics:
+            raise SourceError(
+                f"{self.path}: an SQLite database, but no ROS 2 bag (it has no messages and "
+                "topics tables as rosbag2 writes them); give the .db3 file of a bag"
+            )
+        log_time = next((name for name in _LOG_TIMES if name in messages), None)
+        if log_time is None:
+            raise SourceError(f"{self.path}: its messages have no time; record it again")
+        has_publish_time = "send_timestamp" in messages
+        # SQLite has types for each value only, so all are cast; names come from here.
+        sent = f"ifnull(CAST(send_timestamp AS INTEGER), {log_time})"
+        columns = (
+            "rowid",
+            "CAST(topic_id AS INTEGER)",
+            f"ifnull(CAST({log_time} AS INTEGER), 0)",
+            sent if has_publish_time else "0",
+            "ifnull(CAST(data AS BLOB), x'')",
+        )
+        chosen = ", ".join(columns)
+        self._select = f"SELECT {chosen} FROM messages WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
+        self._db.execute(f"{self._select} LIMIT 0", (0,)).fetchall()
+        self._has_publish_time = has_publish_time
+        self._read_metadata(tables)
+        self._read_topics(topics, tables)
+        self._read_totals(tables, log_time)
+
+    def _tables(self) -> set[str]:
+        """Names of real tables, without views, whose cost is unlimited."""
+        query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE%'"
+        try:
+            rows = self._db.execute(query).fetchall()
+        except sqlite3.DatabaseError:
+            # Without this, SQLite refuses a file shorter than its header states.
+            self._db.execute("PRAGMA writable_schema = ON")
+            rows = self._db.execute(query).fetchall()
+        return {name for (name,) in rows}
+
+    def _columns(self, table: str) -> set[str]:
+        return {row[1] for row in self._db.execute(f"PRAGMA table_info({table})")}
+
+    def _read_metadata(self, tables: set[str]) -> None:
+        """Read the bag's own metadata if it exists."""
+        if "metadata" in tables:
+            query = "SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1"
+            for (text,) in self._optional(query):
+                try:
+                    found = parse_metadata(text if isinstance(text, str) else "")
+                except YamlError:
+                    continue  # the recorder's copy of what the tables say
+                self.packed_messages = found.packed_messages
+
+    def _read_topics(self, columns: set[str], tables: set[str]) -> None:
+        definitions: dict[str, tuple[str, bytes]] = {}
+        if "message_definitions" in tables:
+            query = (
+                "SELECT topic_type, encoding, CAST(encoded_message_definition AS BLOB) "
+                "FROM message_definitions"
+            )
+            for name, encoding, data in self._optional(query):
+                if data and encoding and str(encoding) != "unknown":
+                    definitions.setdefault(str(name), (str(encoding), data))
+        optional = [
+            name if name in columns else "''"
+            for name in ("serialization_format", "offered_qos_profiles", "type_description_hash")
+        ]
+        # Without an id, a topic has no messages.
+        query = (
+            f"SELECT CAST(id AS INTEGER), name, type, {', '.join(optional)} FROM topics "  # noqa: S608
+            "WHERE id IS NOT NULL ORDER BY id"
+        )
+        for number, name, kind, encoding, qos, type_hash in self._db.execute(query):
+            type_name = str(kind or "")
+            # Services and actions are recorded by their events, and defined by themselves.
+            found = definitions.get(type_name) or definitions.get(interface_of(type_name))
+            metadata = {}
+            if "offered_qos_profiles" in columns:
+                metadata["offered_qos_profiles"] = str(qos or "")
+            if type_hash:
+                metadata["topic_type_hash"] = str(type_hash)
+            self._channel_of[number] = len(self.channels)
+            self.channels.append(
+                Channel(
+                    topic=str(name),
+                    message_encoding=str(encoding or ""),
+                    schema=Schema(type_name, *(found or ("", b""))),
+                    metadata=metadata,
+                    has_publish_time=self._has_publish_time,
+                )
+            )
+
+    def _read_totals(self, tables: set[str], log_time: str) -> None:
+        indexed = any(
+            row[0] == log_time
+            for name in self._indexes()
+            for row in self._optional("SELECT name FROM pragma_index_info(?) LIMIT 1", name)
+        )
+        if "messages" not in tables or (not indexed and self.size_bytes > _COUNT_BYTES):
+            return
+        rows = self._optional("SELECT count(*) FROM messages")
+        if not rows:
+            return
+        self.message_count = int(rows[0][0])
+        # Two queries: SQLite answers each from one end of the index.
+        first = self._optional(f"SELECT min({log_time}) FROM messages")  # noqa: S608
+        last = self._optional(f"SELECT max({log_time}) FROM messages")  # noqa: S608
+        if not (first and last and isinstance(first[0][0], int) and isinstance(last[0][0], int)):
+            return
+        if first[0][0] >= 0:  # earlier ones are not read
+            self.time_range = (first[0][0], last[0][0] + 1)
+
+    def _indexes(self) -> list[str]:
+        return [row[1] for row in self._optional("PRAGMA index_list(messages)")]
+
+    def _optional(self, query: str, *values: str) -> list[tuple[Any, ...]]:
+        """Rows of an optional query; empty if it fails."""
+        try:
+            return self._db.execute(query, values).fetchall()
+        except (sqlite3.Error, OverflowError):
+            return []
+
+    # Reading.
+
+    def batches(self) -> Iterator[Batch]:
+        """Yield all messages that SQLite returns, in the order of row ids."""
+        start = _MIN_ROWID
+        regions = 0
+        while start <= _MAX_ROWID:
+            rows: list[_Row] = []
+            size = 0
+            problem = ""
+            try:
+                for row in self._db.execute(self._select, (start,)):
+                    if row[0] < start:
+                        problem = "rows out of order"
+                        break
+                    rows.append(row)
+                    start = row[0] + 1
+                    size += len(row[4])
+                    if size >= BATCH_BYTES or len(rows) >= BATCH_MESSAGES:
+                        yield from self._batch(rows, size)
+                        rows, size = [], 0
+            except (sqlite3.Error, OverflowError) as error:
+                problem = str(error)
+            yield from self._batch(rows, size)
+            if not problem:
+                break
+            # The driver reads one row ahead, so the last valid row was lost with the error.
+            row = self._one(start)
+            if row:
+                yield from self._batch([row], len(row[4]))
+                start = row[0] + 1
+                continue
+            regions += 1
+            found = self._next_sound(start) if regions <= _MAX_REGIONS else None
+            self._report_gap(start, found, problem)
+            if found is None:
+                break
+            start = found
+        self.bytes_read = self.size_bytes
+        if self._missing > 0 and not regions:
+            reason = "the file is cut short, but only behind its messages"
+            self.damage.append(Damage(self.path, self.size_bytes, self._missing, reason, 0))
+        self._report_undefined()
+        if self._early:
+            reason = "messages with a time before 1970, which no log can keep"
+            self.damage.append(Damage(self.path, None, None, reason, self._early))
+
+    def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
+        if not rows:
+            return
+        self._got += len(rows)
+        self.bytes_read = min(self.bytes_read + size, self.size_bytes)
+        _, topics, log_times, publish_times, payloads = zip(*rows, strict=True)
+        length = np.fromiter(map(len, payloads), np.int64, len(rows))
+        log_time = np.array(log_times, np.int64)
+        channel = np.array([self._channel_of.get(topic, -1) for topic in topics], np.int32)
+        batch = Batch(
+            buffer=b"".join(payloads),
+            offset=np.cumsum(length) - length,
+            length=length,
+            channel=channel,
+            log_time=log_time,
+            publish_time=np.array(publish_times, np.int64) if self._has_publish_time else log_time,
+            sequence=np.zeros(len(rows), np.uint32),
+        )
+        if len(channel) and int(channel.min()) < 0:
+            self._undefined.update(topic for topic in topics if topic not in self._channel_of)
+        early = (batch.log_time < 0) | (batch.publish_time < 0)
+        self._early += int((early & (channel >= 0)).sum())
+        kept = (channel >= 0) & ~early
+        if not kept.all():
+            batch = batch.take(kept)
+        if len(batch):
+            yield batch
+
+    def _one(self, start: int) -> _Row | Literal[False] | None:
+        """The first row at or behind an id; None without one, False if it is damaged."""
+        try:
+            row: _Row | None = self._db.execute(f"{self._select} LIMIT 1", (start,)).fetchone()
+        except (sqlite3.Error, OverflowError):
+            return False
+        return row if row is None or row[0] >= start else False
+
+    def _next_sound(self, bad: int) -> int | None:
+        """Smallest known id from which rows can be read again, None without one.
+
+        Args:
+            bad: Id of a damaged row.
+        """
+        bad, step = max(bad, 0), 1
+        while self._one(bad + step) is False:
+            step *= 2
+            if bad + step > _MAX_ROWID:
+                return None
+        good = bad + step
+        bad += step // 2
+        while good - bad > 1:
+            middle = (good + bad) // 2
+            if self._one(middle) is False:
+                bad = middle
+            else:
+                good = middle
+        return good
+
+    def _report_gap(self, start: int, found: int | None, problem: str) -> None:
+        """Report rows that SQLite does not return; row ids of rosbag2 have no gaps."""
+        first = max(start, 1)
+        # Losses behind the last row cannot be counted by ids.
+        is_last = found is None or self._one(found) is None
+        lost: int | None = None
+        if not is_last and found is not None:
+            lost = found - first
+            where = f"row {first}" if lost == 1 else f"rows {first} to {found - 1}"
+        else:
+            where = f"rows from id {first} on"
+            if self.message_count is not None:
+                known = sum(damage.messages_lost or 0 for damage in self.damage)
+                lost = max(0, self.message_count - self._got - known)
+        self.damage.append(
+            Damage(self.path, None, None, f"{where} cannot be read: SQLite says {problem}", lost)
+        )
+
+    def _report_undefined(self) -> None:
+        if self._undefined:
+            numbers = sorted(number for number in self._undefined if number is not None)
+            names = [*map(str, numbers), *(["NULL"] if None in self._undefined else [])]
+            ids = listed(names)
+            reason = f"messages of topics that the bag does not list (topic id {ids})"
+            lost = self._undefined.total()
+            self.damage.append(Damage(self.path, None, None, reason, lost))
+
+
+_LOG_TIMES = ("timestamp", "recv_timestamp")
+_MAX_REGIONS = 4096
+
+
+class _Header(NamedTuple):
+    """The used part of a database header: bytes of a page, number of pages."""
+
+    page: int
+    pages: int
+
+
+def _read_header(path: Path) -> _Header:
+    try:
+        with path.open("rb") as file:
+            data = file.read(100)
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    if not data.startswith(MAGIC):
+        raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
+    page = int.from_bytes(data[16:18], "big")
+    return _Header(1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big"))
+
+
+def _connect_whole_pages(
+    path: Path, header: _Header, size: int
+) -> tuple[sqlite3.Connection, Path | None]:
+    """Open a database without its truncated last page.
+
+    SQLite would read zeros for the missing part of that page, and return them as payload.
+    """
+    if header.page < 512 or size % header.page == 0:
+        return _connect(path)
+    spooled = copy_start(path, size - size % header.page)
+    try:
+        return _connect(spooled.path)
+    finally:
+        spooled.remove()
+
+
+def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:
+    """Open an untrusted database read-only.
+
+    A database with a write-ahead log, left by a crashed recorder, is opened with it. Others
+    are opened as immutable, so that no file is written beside them.
+
+    Returns:
+        The connection, and the write-ahead log if it could not be used.
+    """
+    unread: Path | None = None
+    uri = "file:" + quote(os.fsencode(path.absolute())) + "?mode=ro"
+    log = path.with_name(path.name + "-wal")
+    if log.is_file() and log.stat().st_size:
+        db = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        try:
+            db.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall()
+        except sqlite3.Error:
+            db.close()
+            unread = log
+        else:
+            return _guarded(db), None
+    db = sqlite3.connect(f"{uri}&immutable=1", uri=True, check_same_thread=False)
+    return _guarded(db), unread
+
+
+def _guarded(db: sqlite3.Connection) -> sqlite3.Connection:
+    db.text_factory = lambda data: data.decode(errors="replace")
+    db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_PAYLOAD)
+    db.execute("PRAGMA trusted_schema = OFF")
+    db.execute("PRAGMA cell_size_check = ON")
+    db.execute("PRAGMA query_only = ON")
+    return db
+
+
+def _unreadable(path: Path, error: Exception) -> SourceError:
+    return SourceError(
+        f"{path}: SQLite cannot read it ({error}); try to repair a copy with "
+        "`sqlite3 FILE .recover | sqlite3 NEW` and use that"
+    )

@@ -1,0 +1,160 @@
+"""Unpacks compressed files to temporary files, so that a reader can seek."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+import tempfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import zstandard
+
+from hybridlog.formats.reading import cannot_open
+from hybridlog_storage.disk.unfinished import undone
+from hybridlog_storage.errors import NO_SPACE, SourceError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import IO
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+_PIECE = 1 << 20
+_SPARE = 64 << 20
+# Frames that need more memory than this are refused (as zstd's `--long=27`).
+_MAX_WINDOW = 1 << 27
+
+
+@dataclass(slots=True)
+class Spooled:
+    """A temporary unpacked file. Call `remove` once a reader has opened it.
+
+    Attributes:
+        path: The temporary file.
+        problem: Reason for truncated content, None if it is complete.
+    """
+
+    path: Path
+    problem: str | None
+
+    def remove(self) -> None:
+        """Remove the temporary file's name; a reader may still use the open file."""
+        self.path.unlink(missing_ok=True)
+
+
+def peek(path: Path, count: int) -> bytes:
+    """The first unpacked bytes of a zstd file, fewer if it is damaged.
+
+    Raises:
+        SourceError: The file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(1 << 17)
+    except OSError as error:
+        raise cannot_open(path, error) from error
+    try:
+        unpacker = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
+        with unpacker.stream_reader(data) as reader:
+            return reader.read(count)
+    except zstandard.ZstdError:
+        return b""
+
+
+def spool(path: Path) -> Spooled:
+    """Unpack the intact part of a zstd file to a temporary file.
+
+    Raises:
+        SourceError: It cannot be read, or there is no room for it.
+    """
+    try:
+        with path.open("rb") as source:
+            size = zstandard.frame_content_size(source.read(32))
+            source.seek(0)
+            return _to_temporary(path, max(size, 0), partial(_unpack, source))
+    except OSError as error:
+        raise cannot_open(path, error) from error
+
+
+def copy_start(path: Path, count: int) -> Spooled:
+    """Copy the first `count` bytes of a file to a temporary file.
+
+    Raises:
+        SourceError: It cannot be read, or there is no room for it.
+    """
+    try:
+        with path.open("rb") as source:
+            return _to_temporary(path, count, partial(_copy, source, count))
+    except OSError as error:
+        raise cannot_open(path, error) from error
+
+
+def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]) -> Spooled:
+    """Create and fill a temporary file.
+
+    Args:
+        path: The source file.
+        size: Least number of bytes that it takes.
+        fill: Writes at most the given number of bytes to it, and returns a problem or None.
+    """
+    folder = Path(tempfile.gettempdir())
+    room = shutil.disk_usage(folder).free - _SPARE
+    if size > room:
+        raise _no_room(path, folder)
+    spooled = Spooled(folder / f"hybridlog-{secrets.token_hex(8)}", None)
+    with undone(spooled.remove):
+        try:
+            with open(spooled.path, "xb", opener=_private) as target:
+                spooled.problem = fill(target, room)
+        except OSError as error:
+            if error.errno in NO_SPACE:
+                raise _no_room(path, folder) from error
+            raise
+    return spooled
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
+def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:
+    while count > 0:
+        data = source.read(min(_PIECE, count))
+        if not data:
+            return
+        target.write(data)
+        count -= len(data)
+
+
+def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:
+    """Copy the content of the frames of `source`; return a description of damage."""
+    done = 0
+    data = source.read(_PIECE)
+    while data:
+        frame = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).decompressobj()
+        while not frame.eof:
+            if not data:
+                return f"the compressed file is cut short; it gives {done} bytes"
+            try:
+                part = frame.decompress(data)
+            except zstandard.ZstdError as error:
+                return f"the compressed file is damaged after {done} unpacked bytes: {error}"
+            done += len(part)
+            if done > room:
+                raise OSError(errno.ENOSPC, "no space left")
+            target.write(part)
+            data = frame.unused_data if frame.eof else source.read(_PIECE)
+        data = data or source.read(_PIECE)
+    return None
+
+
+def _no_room(path: Path, folder: Path) -> SourceError:
+    return SourceError(
+        f"{path}: has to be unpacked to read it, and {folder} has no room for that; make room "
+        "there, or set TMPDIR to a folder that has it"
+    )

@@ -1,1 +1,0 @@
-"""Readers of foreign logs: ROS 1 bags, ROS 2 bags, MCAP."""

@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from rosbags.rosbag1 import Reader
+
+from hybridlog.formats.mcap.writer import McapWriter
+from hybridlog.formats.raw import RawStreamWriter, RawWriter
+from hybridlog.formats.rosbag1.writer import BagWriter
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.messages import Batch, Channel, Schema
+from tests.data import DATA, needs_data
+from tests.formats.batches import STRING, STRING_MD5, batch, many, ros1_channels
+
+
+def test_mcap_carries_everything(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    channels = [*ros1_channels(), Channel("plain", "json", None), Channel("plain", "", None)]
+    first, second = many(400, channels=5), many(300, channels=5, start=2 * 10**18)
+    with McapWriter(path, profile="ros1", chunk_size=2000) as writer:
+        writer.write(first, channels)
+        # The same channels again as other objects, in another order.
+        turned = [Channel(c.topic, c.message_encoding, c.schema, c.metadata) for c in channels][
+            ::-1
+        ]
+        second.channel[:] = 4 - second.channel
+        writer.write(second, turned)
+    second.channel[:] = 4 - second.channel
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        header, summary = reader.get_header(), reader.get_summary()
+        assert header.profile == "ros1"
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 700
+        assert len(summary.channels) == 5
+        assert len(summary.schemas) == 2
+        assert all(index.compression == "zstd" for index in summary.chunk_indexes)
+        found = list(reader.iter_messages(log_time_order=False))
+    row = 0
+    for source in (first, second):
+        for i in range(len(source)):
+            schema, channel, message = found[row]
+            original = channels[source.channel[i]]
+            assert message.data == source.payload(i)
+            assert message.log_time == source.log_time[i]
+            assert message.publish_time == source.publish_time[i]
+            assert message.sequence == source.sequence[i]
+            assert channel.topic == original.topic
+            assert channel.message_encoding == original.message_encoding
+            assert channel.metadata == {
+                k: v for k, v in original.metadata.items() if k != "hybridlog.x"
+            }
+            if original.schema is None:
+                assert schema is None
+                assert channel.schema_id == 0
+            else:
+                assert schema is not None
+                assert (schema.name, schema.encoding, schema.data) == (
+                    original.schema.name,
+                    original.schema.encoding,
+                    original.schema.data,
+                )
+            row += 1
+
+
+def test_empty_mcap() -> None:
+    stream = io.BytesIO()
+    with McapWriter(stream) as writer:
+        writer.write(many(0), [])
+    stream.seek(0)
+    summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == 0
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+def test_bag_carries_everything(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "out.bag"
+    channels = ros1_channels()
+    # Enough for several chunks of a mebibyte.
+    source = batch(
+        [bytes([row % 251]) * 9_000 for row in range(300)],
+        [row % 3 for row in range(300)],
+        [10**18 + row for row in range(300)],
+    )
+    with BagWriter(path, compression=compression) as writer:  # type: ignore[arg-type]
+        writer.write(source.take(slice(0, 150)), channels)
+        writer.write(source.take(slice(150, 300)), ros1_channels())
+    content = path.read_bytes()
+    if compression == "none":
+        assert b"# caf\xe9, in Latin-1" in content
+    assert b"hybridlog" not in content
+    # rosbags wants definitions in UTF-8; the bytes of the Latin-1 one were seen above.
+    path.write_bytes(content.replace(b"caf\xe9", b"cafe"))
+    if compression != "none":
+        return
+    with Reader(path) as reader:
+        assert reader.message_count == 300
+        assert len(reader.connections) == 3
+        found = sorted(reader.messages(), key=lambda item: item[1])
+        for row, (connection, time, data) in enumerate(found):
+            original = channels[source.channel[row]]
+            assert time == source.log_time[row]
+            assert data == source.payload(row)
+            assert connection.topic == original.topic
+            assert connection.digest == original.metadata["md5sum"]
+            assert connection.ext.callerid == original.metadata.get("callerid")  # type: ignore[union-attr]
+            assert connection.ext.latching == (  # type: ignore[union-attr]
+                1 if "latching" in original.metadata else None
+            )
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4"])
+def test_compressed_bag(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "out.bag"
+    channels = ros1_channels()[:2]
+    with BagWriter(path, compression=compression) as writer:  # type: ignore[arg-type]
+        writer.write(many(500, channels=2), channels)
+    with Reader(path) as reader:
+        assert [bytes(data) for _, _, data in reader.messages()] == [
+            bytes(many(500).payload(row)) for row in range(500)
+        ]
+
+
+def test_empty_bag(tmp_path: Path) -> None:
+    path = tmp_path / "out.bag"
+    with BagWriter(path) as writer:
+        writer.write(many(0), [])
+    assert path.read_bytes().startswith(b"#ROSBAG V2.0\n")
+    with Reader(path) as reader:
+        assert reader.message_count == 0
+
+
+def test_bag_without_a_hash_gets_one(tmp_path: Path) -> None:
+    path = tmp_path / "out.bag"
+    hostile = Schema("a/B", "ros1msg", b"\xff" * 100)
+    with BagWriter(path) as writer:
+        writer.write(
+            batch([b"\0" * 4, b""], [0, 1], [5, 6]),
+            [Channel("/a", "ros1", STRING), Channel("/b", "ros1", hostile)],
+        )
+    content = path.read_bytes()
+    assert f"md5sum={STRING_MD5}".encode() in content
+    assert b"md5sum=*" in content
+    assert b"message_definition=" + b"\xff" * 100 in content
+
+
+@pytest.mark.parametrize(
+    ("channel", "time", "message"),
+    [
+        (Channel("/a", "cdr", STRING), 5, "--format mcap"),
+        (Channel("/a", "ros1", None), 5, "without a definition"),
+        (ros1_channels()[0], 2**32 * 10**9, "2106"),
+    ],
+)
+def test_what_a_bag_cannot_hold(tmp_path: Path, channel: Channel, time: int, message: str) -> None:
+    with pytest.raises(UsageError, match=message), BagWriter(tmp_path / "out.bag") as writer:
+        writer.write(batch([b"x"], [0], [time]), [channel])
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_data
+def test_a_real_bag_comes_back(tmp_path: Path) -> None:
+    source = DATA / "real" / "tilt_laser.bag"
+    path = tmp_path / "out.bag"
+    with Reader(source) as reader:
+        channels = [
+            Channel(
+                c.topic,
+                "ros1",
+                Schema(c.msgtype.replace("/msg/", "/"), "ros1msg", c.msgdef.data.encode()),
+                {
+                    "md5sum": c.digest,
+                    **({"callerid": c.ext.callerid} if c.ext.callerid else {}),  # type: ignore[union-attr]
+                },
+            )
+            for c in reader.connections
+        ]
+        numbers = {c.id: i for i, c in enumerate(reader.connections)}
+        messages = [(numbers[c.id], time, bytes(data)) for c, time, data in reader.messages()]
+    everything = batch(
+        [data for _, _, data in messages],
+        [number for number, _, _ in messages],
+        [time for _, time, _ in messages],
+    )
+    with BagWriter(path) as writer:
+        for first in range(0, len(everything), 1000):
+            writer.write(everything.take(slice(first, first + 1000)), channels)
+    with Reader(source) as before, Reader(path) as after:
+        assert after.message_count == before.message_count
+        assert [(c.topic, t, bytes(d)) for c, t, d in after.messages()] == [
+            (c.topic, t, bytes(d)) for c, t, d in before.messages()
+        ]
+        for one, other in zip(before.connections, after.connections, strict=True):
+            assert (one.msgtype, one.digest, one.msgdef.data) == (
+                other.msgtype,
+                other.digest,
+                other.msgdef.data,
+            )
+
+
+def test_mcap_to_a_pipe_is_read_without_seeking() -> None:
+    class Pipe(io.RawIOBase):
+        def __init__(self) -> None:
+            self.data = bytearray()
+
+        def writable(self) -> bool:
+            return True
+
+        def write(self, data: bytes) -> int:  # type: ignore[override]
+            self.data += data
+            return len(data)
+
+    pipe = Pipe()
+    with McapWriter(pipe) as writer:  # type: ignore[arg-type]
+        writer.write(many(100), ros1_channels())
+    assert len(list(NonSeekingReader(io.BytesIO(bytes(pipe.data))).iter_messages())) == 100
+
+
+def test_raw(tmp_path: Path) -> None:
+    hostile = ["/../../etc/passwd", "..", "/a/b", "/a__b", "", "/" + "x" * 500, "a\0b\n", "/é", "."]
+    channels = [Channel(topic, "json", None) for topic in hostile]
+    source = batch(
+        [bytes([row]) * row for row in range(45)],
+        [row % 9 for row in range(45)],
+        [5, 5, 5, 5, 5, 5, 5, 5, 5, *([7] * 9), *([5] * 9), *([9] * 9), *([5] * 9)],
+    )
+    target = tmp_path / "out"
+    with RawWriter(target) as writer:
+        writer.write(source.take(slice(0, 20)), channels)
+        writer.write(source.take(slice(20, 45)), channels)
+    assert list(tmp_path.iterdir()) == [target]
+    lines = [json.loads(line) for line in (target / "index.jsonl").read_text().splitlines()]
+    assert len(lines) == 45
+    assert len({line["file"] for line in lines}) == 45
+    for row, line in enumerate(lines):
+        path = (target / line["file"]).resolve()
+        assert path.is_relative_to(target)
+        assert path.parent.parent == target
+        assert path.read_bytes() == source.payload(row)
+        assert line["topic"] == hostile[source.channel[row]]
+        assert line["log_time_ns"] == source.log_time[row]
+        assert line["sequence"] == source.sequence[row]
+    assert len(list(target.iterdir())) == 10
+    assert (target / "a__b" / "5.bin").exists()
+    assert (target / "a__b" / "5-1.bin").exists()
+
+
+def test_raw_target(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with RawWriter(tmp_path / "empty") as writer:
+        writer.write(many(3), ros1_channels())
+    assert (tmp_path / "empty" / "index.jsonl").exists()
+    with pytest.raises(UsageError, match="not empty"):
+        RawWriter(tmp_path / "empty")
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="is a file"):
+        RawWriter(tmp_path / "file")
+
+
+def test_raw_stream() -> None:
+    stream = io.BytesIO()
+    with RawStreamWriter(stream) as writer:
+        writer.write(many(20), ros1_channels())
+    assert stream.getvalue() == b"".join(bytes(many(20).payload(row)) for row in range(20))
+
+
+def test_memory_of_a_long_bag_is_bounded(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "out.bag") as writer:
+        for _ in range(5):
+            writer.write(many(20_000, channels=2), ros1_channels())
+        written = writer._writer.chunks[:-1]
+        assert len(written) > 3
+        # A list of tuples a message would be what grows.
+        assert all(not isinstance(v, list) for c in written for v in c.connections.values())
+    with Reader(tmp_path / "out.bag") as reader:
+        assert reader.message_count == 100_000
+
+
+def test_batches_over_other_buffers() -> None:
+    source = many(10, channels=1)
+    view = Batch(
+        memoryview(bytearray(source.buffer)),
+        source.offset,
+        source.length,
+        source.channel,
+        source.log_time,
+        source.publish_time,
+        source.sequence,
+    )
+    one, other = io.BytesIO(), io.BytesIO()
+    for stream, rows in ((one, source), (other, view)):
+        with McapWriter(stream) as writer:
+            writer.write(rows, ros1_channels())
+    assert one.getvalue() == other.getvalue()
+    assert np.array_equal(view.offset, source.offset)

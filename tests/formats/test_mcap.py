@@ -1,0 +1,616 @@
+"""Foreign MCAP files: everything that the official reader gives, and every fault named."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections import Counter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+import hybridlog as hl
+from hybridlog.formats.mcap.reader import McapSource
+from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.mcap.mcap_scan import MAGIC, ScannedChunk, scan
+from hybridlog_storage.segments.attachments import Attachment
+from tests.data import DATA, needs_data
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+class Seen(NamedTuple):
+    topic: str
+    encoding: str
+    schema: tuple[str, str, bytes] | None
+    metadata: tuple[tuple[str, str], ...]
+    log_time: int
+    publish_time: int
+    sequence: int
+    payload: bytes
+
+
+class Read(NamedTuple):
+    source: McapSource
+    messages: list[Seen]
+
+    @property
+    def damage(self) -> list[Damage]:
+        return self.source.damage
+
+    @property
+    def lost(self) -> list[int | None]:
+        return [damage.messages_lost for damage in self.source.damage]
+
+
+def read(path: Path) -> Read:
+    messages: list[Seen] = []
+    with McapSource(path) as source:
+        for batch in source.batches():
+            assert len(batch) > 0
+            assert len(batch) <= BATCH_MESSAGES
+            for i in range(len(batch)):
+                channel = source.channels[batch.channel[i]]
+                schema = channel.schema
+                messages.append(
+                    Seen(
+                        channel.topic,
+                        channel.message_encoding,
+                        schema and (schema.name, schema.encoding, schema.data),
+                        tuple(sorted(channel.metadata.items())),
+                        int(batch.log_time[i]),
+                        int(batch.publish_time[i]),
+                        int(batch.sequence[i]),
+                        bytes(batch.payload(i)),
+                    )
+                )
+        assert source.bytes_read == source.size_bytes
+    return Read(source, messages)
+
+
+def official(path: Path) -> list[Seen]:
+    """What the format's own forward reader gives."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    found = []
+    with path.open("rb") as file:
+        for record in StreamReader(file, validate_crcs=True).records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels[record.channel_id]
+                schema = schemas.get(channel.schema_id)
+                found.append(
+                    Seen(
+                        channel.topic,
+                        channel.message_encoding,
+                        schema and (schema.name, schema.encoding, schema.data),
+                        tuple(sorted(channel.metadata.items())),
+                        record.log_time,
+                        record.publish_time,
+                        record.sequence,
+                        record.data,
+                    )
+                )
+    return found
+
+
+def test_a_count_that_no_file_can_hold_is_not_kept(tmp_path: Path) -> None:
+    """The loss ledger goes into a database whose integers have 64 bits."""
+    out = io.BytesIO()
+    writer = Writer(out, enable_crcs=False)
+    writer.start()
+    channel = writer.register_channel("/a", "json", 0)
+    writer.add_message(channel, 1, b"{}", 1)
+    writer.finish()
+    count = struct.pack("<BQQ", Opcode.STATISTICS, 56, 1)
+    assert out.getvalue().count(count) == 1
+    path = tmp_path / "a.mcap"
+    path.write_bytes(out.getvalue().replace(count, count[:9] + b"\xff" * 8))
+    found = read(path)
+    assert len(found.messages) == 1
+    assert found.lost == [None]
+
+
+GOOD = [
+    "real/auv_ros2.mcap",
+    "real/ouster.mcap",
+    *[f"odd/rosbag2/split_mcap/wbag_{i}.mcap" for i in range(5)],
+    "odd/rosbag2/talker.mcap",
+    "odd/rosbag2/topics_and_services.mcap",
+    "odd/every_sensor_msg_ros2.mcap",
+    "odd/foxglove_log.mcap",
+    "odd/protobuf.mcap",
+]
+
+
+@needs_data
+@pytest.mark.parametrize("name", GOOD)
+def test_real_files_are_read_as_the_official_reader_reads_them(name: str) -> None:
+    path = DATA / name
+    found = read(path)
+    assert found.messages == official(path)
+    assert found.damage == []
+    assert found.source.message_count == len(found.messages)
+    times = [m.log_time for m in found.messages]
+    assert found.source.time_range == (min(times), max(times) + 1)
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert found.source.profile == reader.get_header().profile
+        extras = [*reader.iter_metadata(), *reader.iter_attachments()]
+    assert sorted(map(repr, found.source.extras)) == sorted(map(repr, extras))
+    ros2 = found.source.profile == "ros2"
+    assert found.source.kind == ("ROS 2 bag (mcap)" if ros2 else "MCAP")
+
+
+@needs_data
+def test_all_conformance_files_give_their_messages_and_no_damage() -> None:
+    files = sorted(DATA.glob("mcap-conformance/data/*/*.mcap"))
+    assert len(files) == 416
+    total = 0
+    for path in files:
+        found = read(path)
+        assert found.messages == official(path), path.name
+        assert found.damage == [], path.name
+        total += len(found.messages)
+    assert total == 1768
+
+
+@pytest.fixture(scope="module")
+def auv() -> list[Seen]:
+    return official(DATA / "real/auv_ros2.mcap")
+
+
+@needs_data
+def test_a_file_without_summary_gives_all_messages(auv: list[Seen]) -> None:
+    found = read(DATA / "damaged/auv_no_summary.mcap")
+    assert found.messages == auv
+    assert (found.source.message_count, found.source.time_range) == (None, None)
+    assert found.lost == [0]
+    assert "not closed" in found.damage[0].reason
+
+
+@needs_data
+def test_a_cut_file_gives_all_chunks_and_the_beginning_of_the_torn_one(auv: list[Seen]) -> None:
+    found = read(DATA / "damaged/auv_trunc60.mcap")
+    assert found.messages == auv[: len(found.messages)]
+    assert len(found.messages) > 11_000
+    (damage,) = found.damage
+    assert (damage.offset, damage.length) == (1705589, 2280396 - 1705589)
+    assert damage.messages_lost is None
+    assert "3189 messages of its beginning" in damage.reason
+
+
+@needs_data
+def test_a_record_that_claims_2_to_the_63_bytes_costs_nothing(
+    auv: list[Seen], tmp_path: Path
+) -> None:
+    path = DATA / "damaged/auv_huge_record_len.mcap"
+    found = read(path)
+    assert found.messages == auv
+    assert [(d.offset, d.messages_lost) for d in found.damage] == [(849070, 0)]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-30_000])
+    found = read(cut)
+    assert found.messages == auv
+    assert found.damage[0].offset == 849070
+    assert "summary is damaged" in found.damage[1].reason
+    assert found.lost == [0, 0]
+
+
+@needs_data
+def test_a_chunk_that_does_not_decompress_is_lost_alone() -> None:
+    path = DATA / "damaged/ouster_zstd_bitflip.mcap"
+    found = read(path)
+    wanted = official(DATA / "real/ouster.mcap")
+    (damage,) = found.damage
+    assert (damage.offset, damage.length) == (43, 2165021 + 9)
+    assert damage.messages_lost == len(wanted) - len(found.messages)
+    assert found.messages == wanted[-len(found.messages) :]
+    assert len(found.messages) == 100
+
+
+@needs_data
+def test_the_message_indexes_tell_what_was_lost_when_the_summary_cannot(tmp_path: Path) -> None:
+    data = bytearray((DATA / "damaged/auv_no_summary.mcap").read_bytes())
+    data[849070 + 49 + 5] = 0xFF  # the length of the first record inside the chunk
+    path = tmp_path / "x.mcap"
+    path.write_bytes(data)
+    found = read(path)
+    wanted = official(DATA / "real/auv_ros2.mcap")
+    assert [d.offset for d in found.damage] == [849070, len(data)]
+    assert found.lost == [len(wanted) - len(found.messages), 0]
+    assert not Counter(found.messages) - Counter(wanted)
+
+
+# Files made here
+
+
+class Made(NamedTuple):
+    data: bytes
+    messages: list[Seen]
+
+
+def make(
+    compression: CompressionType = CompressionType.NONE,
+    *,
+    chunk_size: int = 300,
+    chunked: bool = True,
+    count: int = 12,
+    **options: Any,
+) -> bytes:
+    out = io.BytesIO()
+    writer = Writer(
+        out, chunk_size=chunk_size, compression=compression, use_chunking=chunked, **options
+    )
+    writer.start("ros2", "tests")
+    schema = writer.register_schema("s/msg/S", "ros2msg", b"int32 x")
+    channels = [writer.register_channel(t, "cdr", schema, {"q": t}) for t in ("/a", "/b")]
+    rng = np.random.default_rng(5)
+    for i in range(count):
+        writer.add_message(channels[i % 2], i + 1, rng.bytes(20) + b"same " * 5, i, i)
+        if i == 5:
+            writer.add_metadata("m", {"k": "v"})
+            writer.add_attachment(1, 2, "a", "t", b"data")
+    writer.finish()
+    return out.getvalue()
+
+
+VARIANTS = {
+    **{c.name: make(c) for c in CompressionType},
+    "LOOSE": make(chunked=False),
+    "ONE_CHUNK": make(CompressionType.NONE, chunk_size=1 << 20),
+}
+IN_CHUNKS = [name for name in VARIANTS if name != "LOOSE"]
+
+
+@pytest.fixture
+def put(tmp_path: Path) -> Callable[[bytes], Path]:
+    def write(data: bytes) -> Path:
+        path = tmp_path / "x.mcap"
+        path.write_bytes(data)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_made_files_come_back(name: str, put: Callable[[bytes], Path]) -> None:
+    path = put(VARIANTS[name])
+    found = read(path)
+    assert found.messages == official(path)
+    assert len(found.messages) == found.source.message_count == 12
+    assert found.source.time_range == (1, 13)
+    assert found.damage == []
+    assert [type(e) for e in found.source.extras] == [Metadata, Attachment]
+
+
+FAULTS = settings(
+    max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
+
+
+def wanted_of(name: str, put: Callable[[bytes], Path]) -> Counter[Seen]:
+    return Counter(official(put(VARIANTS[name])))
+
+
+@FAULTS
+@given(data=st.data())
+@pytest.mark.parametrize("name", VARIANTS)
+def test_any_cut_gives_messages_of_the_original_only(
+    name: str, put: Callable[[bytes], Path], data: st.DataObject
+) -> None:
+    wanted = wanted_of(name, put)
+    cut = data.draw(st.integers(0, len(VARIANTS[name]) - 1))
+    path = put(VARIANTS[name][:cut])
+    if cut < len(MAGIC):
+        with pytest.raises(SourceError, match="not an MCAP file"):
+            McapSource(path)
+        return
+    found = read(path)
+    assert not Counter(found.messages) - wanted
+    assert found.damage
+    end = found.damage[-1]
+    assert end.offset is not None
+    assert end.offset + (end.length or 0) == cut
+
+
+@FAULTS
+@given(data=st.data())
+@pytest.mark.parametrize("name", VARIANTS)
+def test_any_changed_byte_gives_no_wrong_payload_and_is_counted(
+    name: str, put: Callable[[bytes], Path], data: st.DataObject
+) -> None:
+    wanted = wanted_of(name, put)
+    at = data.draw(st.integers(0, len(VARIANTS[name]) - 1))
+    bad = bytearray(VARIANTS[name])
+    bad[at] ^= data.draw(st.integers(1, 255))
+    path = put(bytes(bad))
+    if at < len(MAGIC):
+        with pytest.raises(SourceError, match="not an MCAP file"):
+            McapSource(path)
+        return
+    found = read(path)
+    if name not in IN_CHUNKS:  # nothing there could tell a changed payload
+        assert len(found.messages) >= 5
+        return
+    assert not Counter(found.messages) - wanted
+    missing = wanted.total() - len(found.messages)
+    known = [lost for lost in found.lost if lost is not None]
+    if None not in found.lost:
+        assert sum(known) == missing
+    assert missing == 0 or found.damage
+
+
+@pytest.mark.parametrize("summary", [True, False])
+@pytest.mark.parametrize("name", ["NONE", "ZSTD"])
+def test_a_record_marked_as_another_kind_gives_no_wrong_payload(
+    name: str, put: Callable[[bytes], Path], *, summary: bool
+) -> None:
+    good = VARIANTS[name]
+    wanted = Counter(official(put(good)))
+    places = {o: i for o, i in scan(io.BytesIO(good), size=len(good)) if o < len(good) - 8}
+    end = next(o for o, i in places.items() if isinstance(i, DataEnd))
+    for at in places:
+        for opcode in [*range(16), 0x20, 0x90]:
+            if at < end and opcode != good[at]:
+                bad = bytearray(good if summary else good[:end])
+                bad[at] = opcode
+                found = read(put(bytes(bad)))
+                assert not Counter(found.messages) - wanted, (at, opcode)
+                if summary:
+                    assert sum(x or 0 for x in found.lost) == 12 - len(found.messages), (at, opcode)
+
+
+def test_a_changed_byte_in_the_footer_costs_nothing(put: Callable[[bytes], Path]) -> None:
+    good = VARIANTS["ZSTD"]
+    wanted = official(put(good))
+    for at in range(len(good) - 37 - 13, len(good)):
+        for change in (1, 0x80):
+            bad = bytearray(good)
+            bad[at] ^= change
+            found = read(put(bytes(bad)))
+            assert found.messages == wanted, at
+            assert sum(lost or 0 for lost in found.lost) == 0, at
+
+
+def test_a_changed_byte_costs_one_chunk_at_most(put: Callable[[bytes], Path]) -> None:
+    good = VARIANTS["ZSTD"]
+    chunks = [i for _, i in scan(io.BytesIO(good), size=len(good)) if isinstance(i, ScannedChunk)]
+    assert len(chunks) >= 3
+    for chunk in chunks:
+        for at in range(chunk.offset, chunk.offset + chunk.length):
+            bad = bytearray(good)
+            bad[at] ^= 0x55
+            found = read(put(bytes(bad)))
+            assert len(found.messages) >= 12 - 5, at
+            assert sum(lost or 0 for lost in found.lost) == 12 - len(found.messages), at
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89MCAP0\r", b"#ROSBAG V2.0\n", b"SQLite format 3\0"])
+def test_other_files_are_refused(data: bytes, put: Callable[[bytes], Path]) -> None:
+    path = put(data)
+    with pytest.raises(SourceError, match="not an MCAP file") as caught:
+        McapSource(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_files_and_directories_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="no such file"):
+        McapSource(tmp_path / "nothing.mcap")
+    with pytest.raises(SourceError, match=r"cannot be read"):
+        McapSource(tmp_path)
+
+
+def test_a_file_of_magic_only_gives_nothing_and_says_so(put: Callable[[bytes], Path]) -> None:
+    found = read(put(MAGIC))
+    assert found.messages == []
+    assert found.lost == [0]
+
+
+def raw(*records: Any, profile: str = "") -> bytes:
+    builder = RecordBuilder()
+    for record in (Header(profile, ""), *records, DataEnd(0), Footer(0, 0, 0)):
+        record.write(builder)
+    return MAGIC + builder.end() + MAGIC
+
+
+def message(channel: int, n: int) -> Message:
+    return Message(channel, n, b"%d" % n, n, n)
+
+
+A = Schema(1, b"A", "e", "A")
+B = Schema(1, b"B", "e", "B")
+
+
+def test_a_channel_defined_anew_is_another_channel(put: Callable[[bytes], Path]) -> None:
+    first, second = Channel(1, "/x", "cdr", {}, 1), Channel(1, "/y", "cdr", {}, 1)
+    path = put(
+        raw(
+            A,
+            first,
+            message(1, 0),
+            first,
+            message(1, 1),
+            second,
+            message(1, 2),
+            first,
+            message(1, 3),
+        )
+    )
+    found = read(path)
+    assert found.messages == official(path)
+    assert [m.topic for m in found.messages] == ["/x", "/x", "/y", "/x"]
+    assert [c.topic for c in found.source.channels] == ["/x", "/y"]
+    assert found.damage == []
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_definitions_that_change_inside_a_chunk_hold_from_there(
+    compression: CompressionType, put: Callable[[bytes], Path]
+) -> None:
+    from mcap.records import Chunk
+
+    from hybridlog_storage.segments.compression import Compressor
+
+    builder = RecordBuilder()
+    channel = Channel(1, "/x", "cdr", {}, 1)
+    for record in (A, channel, message(1, 0), B, message(1, 1), A, message(1, 2)):
+        record.write(builder)
+    content = builder.end()
+    codec, packed = Compressor(compression.name.lower(), min_gain=-9).compress(content)  # type: ignore[arg-type]
+    path = put(raw(Chunk(codec, bytes(packed), 2, 0, 0, len(content))))
+    found = read(path)
+    assert found.messages == official(path)
+    assert [m.schema and m.schema[0] for m in found.messages] == ["A", "B", "A"]
+    assert len(found.source.channels) == 2
+
+
+def test_messages_without_definitions_are_counted(put: Callable[[bytes], Path]) -> None:
+    good = Channel(1, "/x", "cdr", {}, 1)
+    bare = Channel(2, "/bare", "json", {}, 0)
+    no_schema = Channel(3, "/odd", "cdr", {}, 9)
+    found = read(
+        put(
+            raw(
+                *(A, good, bare, no_schema),
+                *(message(1, 0), message(7, 1), message(2, 2), message(7, 3), message(3, 4)),
+            )
+        )
+    )
+    assert [(m.topic, m.log_time) for m in found.messages] == [("/x", 0), ("/bare", 2), ("/odd", 4)]
+    assert [m.schema is None for m in found.messages] == [False, True, True]
+    assert found.lost == [0, 2]
+    assert "schema 9 of channel 3 (/odd)" in found.damage[0].reason
+    assert "2 messages on channels that are not defined (7)" in found.damage[1].reason
+
+
+def test_times_past_int64_are_counted(put: Callable[[bytes], Path]) -> None:
+    channel = Channel(1, "/x", "cdr", {}, 0)
+    late = Message(1, 1 << 63, b"late", 0, 0)
+    found = read(put(raw(channel, message(1, 0), late, late, message(1, 3))))
+    assert [m.log_time for m in found.messages] == [0, 3]
+    assert found.lost == [2]
+    assert "2^63" in found.damage[0].reason
+
+
+def test_the_summary_replaces_definitions_that_a_damaged_chunk_took(
+    put: Callable[[bytes], Path],
+) -> None:
+    good = VARIANTS["ZSTD"]
+    first = next(
+        i for _, i in scan(io.BytesIO(good), size=len(good)) if isinstance(i, ScannedChunk)
+    )
+    bad = bytearray(good)
+    bad[first.offset + first.length - 3] ^= 0xFF
+    found = read(put(bytes(bad)))
+    wanted = official(put(good))
+    assert found.messages == wanted[-len(found.messages) :]
+    assert found.lost == [12 - len(found.messages)]
+    assert 0 < len(found.messages) < 12
+
+
+def test_a_summary_that_counts_more_than_there_is_raises_suspicion(
+    put: Callable[[bytes], Path],
+) -> None:
+    data = bytearray(make(enable_crcs=False))
+    at = bytes(data).rindex(struct.pack("<QHI", 12, 1, 2))
+    struct.pack_into("<Q", data, at, 15)
+    found = read(put(bytes(data)))
+    assert len(found.messages) == 12
+    assert found.lost == [3]
+
+
+def test_large_chunks_become_batches_of_bounded_size(put: Callable[[bytes], Path]) -> None:
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=1 << 30, compression=CompressionType.ZSTD)
+    writer.start()
+    channel = writer.register_channel("/a", "x", 0)
+    for i in range(40_000):
+        writer.add_message(channel, i, b"", i)
+    for i in range(20):
+        writer.add_message(channel, i, bytes(300_000), i)
+    writer.finish()
+    with McapSource(put(out.getvalue())) as source:
+        batches = list(source.batches())
+    assert sum(map(len, batches)) == 40_020
+    assert max(map(len, batches)) <= BATCH_MESSAGES
+    assert max(b.payload_bytes for b in batches) <= BATCH_BYTES + 300_000
+    assert min(b.payload_bytes for b in batches[3:-1]) >= BATCH_BYTES
+
+
+def test_batches_outlive_the_source(put: Callable[[bytes], Path]) -> None:
+    path = put(VARIANTS["LOOSE"])
+    with McapSource(path) as source:
+        batches = list(source.batches())
+        source.close()
+    assert [bytes(b.payload(i)) for b in batches for i in range(len(b))] == [
+        m.payload for m in official(path)
+    ]
+
+
+def test_a_bomb_is_damage_and_no_allocation(put: Callable[[bytes], Path]) -> None:
+    import tracemalloc
+
+    import zstandard
+    from mcap.records import Chunk
+
+    compressor = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+    packed = b"".join(compressor.compress(bytes(1 << 20)) for _ in range(32)) + compressor.flush()
+    channel = Channel(1, "/x", "cdr", {}, 0)
+    path = put(
+        raw(
+            channel,
+            Chunk("zstd", packed, 0, 0, 0, 1 << 40),
+            Chunk("zstd", packed, 0, 0, 0, 1 << 10),
+            message(1, 1),
+        )
+    )
+    tracemalloc.start()
+    try:
+        found = read(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert [m.log_time for m in found.messages] == [1]
+    assert found.lost == [None, None]
+    assert peak < 8 << 20
+
+
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_what_stands_behind_the_last_message_is_recorded(
+    tmp_path: Path, *, use_chunking: bool
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=use_chunking)  # a chunk comes last
+        writer.start()
+        writer.add_attachment(1, 1, "before", "text/plain", b"first")
+        channel = writer.register_channel("/a", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.add_attachment(2, 2, "behind", "text/plain", b"last")
+        writer.add_metadata("robot", {"name": "r2"})
+        writer.finish()
+    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+        entry = store.record(path).entry
+        folder = store.directory.path / "recordings" / entry.label
+        with (folder / "000000.mcap").open("rb") as stream:
+            reader = make_reader(stream)
+            found = {a.name: a.data for a in reader.iter_attachments()}
+            metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert found == {"before": b"first", "behind": b"last"}
+    assert metadata["robot"] == {"name": "r2"}

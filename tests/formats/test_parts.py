@@ -1,0 +1,336 @@
+"""Logs of several files: the files are read, whatever the metadata or the names say."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.writer import Writer
+
+from hybridlog.formats.detect import open_source, read_time_range
+from hybridlog_storage.errors import SourceError
+
+BEGIN = 1_700_000_000_000_000_000
+SECOND = 10**9
+
+TOPIC = "INSERT INTO topics VALUES (1, '/n', 'std_msgs/msg/UInt32', 'cdr')"
+TABLES = (
+    "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)",
+    "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)",
+    "CREATE INDEX timestamp_idx ON messages (timestamp ASC)",
+    TOPIC,
+)
+
+
+def payload(number: int) -> bytes:
+    return b"\x00\x01\x00\x00" + number.to_bytes(4, "little")
+
+
+def put_db3(path: Path, numbers: Sequence[int], change: Callable[[bytes], bytes] = bytes) -> Path:
+    """A database with a message a second, numbered by their seconds."""
+    path.parent.mkdir(exist_ok=True, parents=True)
+    db = sqlite3.connect(path)
+    for line in TABLES:
+        db.execute(line)
+    rows = [(n + 1, 1, BEGIN + n * SECOND, change(payload(n))) for n in numbers]
+    db.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    db.commit()
+    db.close()
+    return path
+
+
+def put_mcap(path: Path, numbers: Sequence[int]) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/UInt32", "ros2msg", b"uint32 data\n")
+        channel = writer.register_channel("/n", "cdr", schema)
+        for n in numbers:
+            writer.add_message(channel, BEGIN + n * SECOND, payload(n), BEGIN + n * SECOND)
+        writer.finish()
+    return path
+
+
+def put_metadata(folder: Path, files: Sequence[str], messages: int, *more: str) -> None:
+    """Metadata with wrong times, as after a crash."""
+    lines = [
+        "rosbag2_bagfile_information:",
+        "  version: 5",
+        "  storage_identifier: sqlite3",
+        f"  relative_file_paths: [{', '.join(files)}]",
+        "  duration: {nanoseconds: 5000000000}",
+        f"  starting_time: {{nanoseconds_since_epoch: {BEGIN + 1}}}",
+        f"  message_count: {messages}",
+        *more,
+    ]
+    (folder / "metadata.yaml").write_text("\n".join(lines) + "\n")
+
+
+class Found:
+    """What a log gives: numbers of its messages, time range, and damage by file name."""
+
+    def __init__(self, path: Path) -> None:
+        with open_source(path) as source:
+            self.time_range = source.time_range
+            self.numbers = [
+                int.from_bytes(bytes(batch.payload(row))[4:8], "little")
+                for batch in source.batches()
+                for row in range(len(batch))
+            ]
+            self.damage = [(d.file.name, d.messages_lost) for d in source.damage]
+            self.reasons = [d.reason for d in source.damage]
+
+
+FIFTEEN = list(range(15))
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """A bag of three files with five messages each, without metadata."""
+    for part in range(3):
+        put_db3(tmp_path / "bag" / f"bag_{part}.db3", range(part * 5, part * 5 + 5))
+    return tmp_path / "bag"
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ["bag_0.db3", "bag_1.db3", "bag_2.db3"],
+        ["bag_0.db3"],
+        ["bag_2.db3", "bag_0.db3"],
+        ["bag/bag_0.db3", "bag_1.db3", "bag/bag_1.db3", "bag_0.db3"],
+    ],
+)
+@pytest.mark.parametrize("count", [0, 5, 15])
+def test_files_are_asked_before_the_metadata(bag: Path, files: list[str], count: int) -> None:
+    put_metadata(bag, files, count)
+    found = Found(bag)
+    assert found.damage == []
+    assert sorted(found.numbers) == FIFTEEN
+    assert found.time_range == (BEGIN, BEGIN + 14 * SECOND + 1)
+    assert Found(bag / "bag_1.db3").numbers == FIFTEEN[5:10]
+
+
+def test_metadata_counts_more_than_there_is(bag: Path) -> None:
+    put_metadata(bag, ["bag_0.db3", "bag_1.db3", "bag_2.db3"], 22)
+    found = Found(bag)
+    assert found.numbers == FIFTEEN
+    assert found.damage == [("metadata.yaml", 7)]
+
+
+@pytest.mark.parametrize(
+    ("count", "damage"),
+    [(10, []), (15, [("bag_1.db3", 5)]), (None, [("bag_1.db3", None)])],
+)
+def test_part_that_nothing_lists_is_missing(
+    bag: Path, count: int | None, damage: list[tuple[str, int | None]]
+) -> None:
+    (bag / "bag_1.db3").unlink()
+    if count is not None:
+        put_metadata(bag, ["bag_0.db3", "bag_2.db3"], count)
+    found = Found(bag)
+    assert found.numbers == [*FIFTEEN[:5], *FIFTEEN[10:]]
+    assert found.damage == damage
+
+
+def test_first_and_last_parts_are_missed_by_their_messages(bag: Path) -> None:
+    put_metadata(bag, ["bag_1.db3"], 15)
+    (bag / "bag_0.db3").unlink()
+    (bag / "bag_2.db3").unlink()
+    found = Found(bag)
+    assert found.numbers == FIFTEEN[5:10]
+    assert found.damage == [("metadata.yaml", 10)]
+
+
+@pytest.mark.parametrize(
+    ("listed", "count", "damage"),
+    [
+        (["x_0.db3", "x_1.db3"], 15, []),
+        (["x_0.db3"], 20, [("x_0.db3", 5)]),
+        ([], 15, []),
+        ([], 16, [("metadata.yaml", 1)]),
+    ],
+)
+def test_files_that_got_other_names(
+    bag: Path, listed: list[str], count: int, damage: list[tuple[str, int]]
+) -> None:
+    put_metadata(bag, listed, count)
+    found = Found(bag)
+    assert (found.numbers, found.damage) == (FIFTEEN, damage)
+    found = Found(bag / "bag_1.db3")
+    assert (found.numbers, found.damage) == (FIFTEEN[5:10], [])
+    put_db3(bag / "other.db3", [99])
+    with pytest.raises(SourceError, match="none of the files"):
+        open_source(bag)
+
+
+def test_several_missing_parts_and_their_names(tmp_path: Path) -> None:
+    for name, n in (("drive_008.db3", 0), ("drive_010.db3", 1), ("drive_100.db3", 2)):
+        put_db3(tmp_path / name, [n])
+    found = Found(tmp_path)
+    assert found.numbers == [0, 1, 2]
+    assert found.damage == [("drive_009.db3", None), ("drive_011.db3", None)]
+    assert "parts 11 to 99" in found.reasons[1]
+
+
+def test_paths_with_folders(tmp_path: Path) -> None:
+    put_db3(tmp_path / "data" / "x_0.db3", [0])
+    put_db3(tmp_path / "x_1.db3", [1])
+    put_metadata(tmp_path, ["data/x_0.db3", "x_1.db3", "data/x_2.db3"], 3)
+    found = Found(tmp_path)
+    assert found.numbers == [0, 1]
+    assert found.damage == [("x_2.db3", 1)]
+
+
+def test_empty_parts_are_told(bag: Path) -> None:
+    (bag / "bag_1.db3").write_bytes(b"")
+    (bag / "notes.txt").touch()
+    found = Found(bag)
+    assert found.numbers == [*FIFTEEN[:5], *FIFTEEN[10:]]
+    assert found.damage == [("bag_1.db3", None)]
+    assert "empty" in found.reasons[0]
+    put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
+    assert Found(bag).damage == [("bag_1.db3", 5)]
+    put_metadata(bag, ["bag_0.db3"], 15)
+    assert Found(bag).damage == [("bag_1.db3", 5)]
+
+
+def test_parts_named_by_numbers_alone(tmp_path: Path) -> None:
+    for n in (0, 9, 10):
+        put_db3(tmp_path / f"{n}.db3", [n])
+    found = Found(tmp_path)
+    assert found.numbers == [0, 9, 10]
+    assert found.damage == [("1.db3", None)]
+
+
+def test_files_that_are_no_parts_are_told(bag: Path) -> None:
+    put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
+    put_db3(bag / "other.db3", range(100, 103))
+    put_mcap(bag / "bag_3.mcap", range(7))
+    data = (bag / "bag_0.db3").read_bytes()
+    (bag / "bag_0.db3.zstd").write_bytes(zstandard.compress(data))
+    (bag / "other_2.db3.zstd").write_bytes(zstandard.compress(data))
+    found = Found(bag)
+    assert found.numbers == FIFTEEN
+    assert sorted(found.damage) == [
+        ("bag_0.db3.zstd", 0),
+        ("bag_3.mcap", 7),
+        ("other.db3", 3),
+        ("other_2.db3.zstd", None),
+    ]
+
+
+def test_last_part_that_was_not_compressed_any_more(bag: Path) -> None:
+    for name in ("bag_0.db3", "bag_1.db3"):
+        packed = zstandard.compress((bag / name).read_bytes())
+        (bag / f"{name}.zstd").write_bytes(packed)
+        (bag / name).unlink()
+    found = Found(bag)
+    assert (found.numbers, found.damage) == (FIFTEEN, [])
+    # A compressed file says its times only when it is unpacked.
+    assert found.time_range is None
+    put_metadata(bag, ["bag_0.db3.zstd", "bag_1.db3.zstd"], 10, "  compression_mode: FILE")
+    found = Found(bag)
+    assert (found.numbers, found.damage, found.time_range) == (FIFTEEN, [], None)
+    assert read_time_range(bag) == (BEGIN, BEGIN + 14 * SECOND + 1)
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_payloads_that_are_frames_without_a_word_about_it(tmp_path: Path, kind: str) -> None:
+    path = put_db3(tmp_path / "bag" / "bag_0.db3", FIFTEEN, zstandard.compress)
+    if kind == "mcap":
+        path.unlink()
+        path = tmp_path / "bag" / "bag_0.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            channels = [writer.register_channel("/n", form, 0) for form in ("cdr", "json")]
+            for n in FIFTEEN:
+                data = zstandard.compress(payload(n)) if n % 2 else payload(n)
+                writer.add_message(channels[0], n, data, n)
+            writer.add_message(channels[1], 99, zstandard.compress(b"{}"), 99)
+            writer.add_message(channels[0], 100, b"", 100)
+            writer.finish()
+    with open_source(path) as source:
+        found = [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))]
+        assert source.damage == []
+    want = [payload(n) for n in FIFTEEN]
+    # What is not CDR, and nothing says is compressed, stays as it is.
+    assert found == (want if kind == "db3" else [*want, zstandard.compress(b"{}"), b""])
+    with open_source(tmp_path / "bag") as source:
+        assert [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))] == found
+
+
+def test_frames_that_do_not_unpack_are_kept(tmp_path: Path) -> None:
+    broken = [zstandard.compress(payload(n))[: 9 if n == 2 else None] for n in range(4)]
+    path = put_db3(tmp_path / "bag_0.db3", range(4), lambda data: broken[data[4]])
+    want = [payload(0), payload(1), broken[2], payload(3)]
+    for mode in ("", "  compression_mode: MESSAGE"):
+        put_metadata(tmp_path, [path.name], 4, mode)
+        with open_source(tmp_path) as source:
+            found = [bytes(b.payload(row)) for b in source.batches() for row in range(len(b))]
+            assert found == want
+            assert [d.messages_lost for d in source.damage] == ([0] if mode else [])
+
+
+def test_mcap_files_one_after_the_other_in_one_file(tmp_path: Path) -> None:
+    parts = [put_mcap(tmp_path / f"{n}.mcap", range(n * 5, n * 5 + 5)) for n in range(3)]
+    whole = [part.read_bytes() for part in parts]
+    joined = tmp_path / "joined.bin"
+    joined.write_bytes(b"".join(whole))
+    found = Found(joined)
+    assert (found.numbers, found.damage) == (FIFTEEN, [])
+    assert read_time_range(joined) == (BEGIN, BEGIN + 14 * SECOND + 1)
+    joined.write_bytes(whole[0] + whole[0])
+    assert (Found(joined).numbers, Found(joined).damage) == ([*FIFTEEN[:5] * 2], [])
+    # The first was not closed: it has no summary.
+    cut = whole[0].index(b"\x0f\x04\0\0\0\0\0\0\0")
+    joined.write_bytes(whole[0][:cut] + whole[1])
+    found = Found(joined)
+    assert found.numbers == FIFTEEN[:10]
+    assert found.damage == [("joined.bin", 0)]
+    assert "another log begins" in found.reasons[0]
+    # The last one is cut short.
+    joined.write_bytes(whole[0] + whole[1][:-20])
+    assert (Found(joined).numbers, Found(joined).damage) == (FIFTEEN[:10], [("joined.bin", 0)])
+
+
+def test_wrong_statistics_of_a_split_mcap(tmp_path: Path) -> None:
+    put_mcap(tmp_path / "a_0.mcap", range(5))
+    path = put_mcap(tmp_path / "a_1.mcap", range(5, 10))
+    data = path.read_bytes()
+    # Another last time in the statistics; the checksum of the summary is switched off.
+    times = (BEGIN + 9 * SECOND).to_bytes(8, "little")
+    at = data.rindex((BEGIN + 5 * SECOND).to_bytes(8, "little") + times, 0, data.rindex(b"zstd"))
+    data = data[: at + 8] + (BEGIN + 7 * SECOND).to_bytes(8, "little") + data[at + 16 :]
+    path.write_bytes(data[:-12] + bytes(4) + data[-8:])
+    found = Found(tmp_path)
+    assert (found.numbers, found.time_range) == (FIFTEEN[:10], None)
+    shutil.rmtree(tmp_path)
+
+
+@pytest.mark.parametrize("publish", [2**63 - 1, 2**63, 2**64 - 1])
+def test_publish_times_beyond_all_clocks(tmp_path: Path, publish: int) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/n", "cdr", 0)
+        for n in range(4):
+            writer.add_message(channel, 100 + n, payload(n), publish if n == 2 else n)
+        writer.add_message(channel, 2**63, payload(4), 4)
+        writer.finish()
+    with open_source(path) as source:
+        found = [
+            (int(b.log_time[row]), int(b.publish_time[row]))
+            for b in source.batches()
+            for row in range(len(b))
+        ]
+        lost = [d.messages_lost for d in source.damage]
+    late = publish >= 2**63
+    assert found == [(100, 0), (101, 1), (102, 102 if late else publish), (103, 3)]
+    assert lost == ([1, 0] if late else [1])

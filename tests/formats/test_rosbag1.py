@@ -1,0 +1,702 @@
+"""ROS 1 bags against an independent reader, whole, cut and damaged."""
+
+from __future__ import annotations
+
+import bz2
+import re
+import struct
+import tempfile
+import tracemalloc
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag1 import Reader, Writer
+from rosbags.rosbag1.reader import ReaderError
+
+from hybridlog.formats import reading
+from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
+from hybridlog.formats.rosbag1 import records
+from hybridlog.formats.rosbag1.reader import Rosbag1Source
+from hybridlog.formats.rosbag1.records import RunReader, Stop
+from hybridlog_storage.errors import SourceError
+from tests.data import DATA, needs_data
+
+Messages = dict[tuple[str, str], list[tuple[int, bytes]]]
+
+
+def contents(source: Source) -> Messages:
+    """(time, payload) of each message, by topic and callerid, in the order of reading."""
+    found: Messages = defaultdict(list)
+    for batch in source.batches():
+        assert 0 < len(batch) <= BATCH_MESSAGES
+        for row in range(len(batch)):
+            channel = source.channels[batch.channel[row]]
+            key = (channel.topic, channel.metadata.get("callerid", ""))
+            found[key].append((int(batch.log_time[row]), bytes(batch.payload(row))))
+    return dict(found)
+
+
+def read(path: Path) -> tuple[Messages, list[Damage]]:
+    with Rosbag1Source(path) as source:
+        return contents(source), source.damage
+
+
+def reference(path: Path) -> Messages:
+    """The same, as rosbags reads it: in the order of time."""
+    found: Messages = defaultdict(list)
+    with Reader(path) as reader:
+        for connection, time, data in reader.messages():
+            found[(connection.topic, connection.ext.callerid or "")].append((time, bytes(data)))
+    return dict(found)
+
+
+def by_value(messages: Messages) -> Messages:
+    return {key: sorted(rows) for key, rows in messages.items()}
+
+
+def total(messages: Messages) -> int:
+    return sum(map(len, messages.values()))
+
+
+WHOLE = [
+    *sorted((DATA / "real").glob("*.bag")),
+    *(path for path in sorted((DATA / "odd").glob("*.bag")) if path.stat().st_size),
+]
+
+
+@needs_data
+@pytest.mark.parametrize("path", WHOLE, ids=lambda path: path.name)
+def test_as_rosbags_reads_it(path: Path) -> None:
+    with Rosbag1Source(path) as source:
+        found = contents(source)
+        assert source.damage == []
+        assert source.bytes_read == source.size_bytes == path.stat().st_size
+    expected = reference(path)
+    assert by_value(found) == by_value(expected)
+    with Reader(path) as reader:
+        assert source.message_count == reader.message_count == total(found)
+        if reader.message_count:
+            assert source.time_range is not None
+            times = [time for rows in found.values() for time, _ in rows]
+            assert source.time_range == (min(times), max(times) + 1)
+        theirs = sorted(
+            (
+                connection.topic,
+                connection.msgtype.replace("/msg/", "/"),
+                connection.msgdef.data,
+                connection.digest,
+            )
+            for connection in reader.connections
+        )
+    ours = sorted(
+        (
+            channel.topic,
+            channel.schema.name,
+            channel.schema.data.decode(),
+            channel.metadata["md5sum"],
+        )
+        for channel in source.channels
+        if channel.schema is not None
+    )
+    # rosbags names connections of the index; only those with messages need be met.
+    assert set(ours) <= set(theirs)
+    for channel in source.channels:
+        assert channel.message_encoding == "ros1"
+        assert not channel.has_publish_time
+        assert not {"topic", "type", "message_definition"} & set(channel.metadata)
+
+
+@needs_data
+def test_arrival_order_is_file_order() -> None:
+    with Rosbag1Source(DATA / "odd/example-unsorted-chunks.bag") as source:
+        times = [int(time) for batch in source.batches() for time in batch.log_time]
+    assert times == [2_000_000_000, 3_000_000_000, 1_000_000_000]
+
+
+@needs_data
+def test_unindexed() -> None:
+    with Rosbag1Source(DATA / "damaged/husky.bag.active") as source:
+        assert source.message_count is None
+        assert source.time_range is None
+        assert total(contents(source)) == 12_303
+        assert source.damage == []
+
+
+@needs_data
+def test_a_flipped_byte_costs_one_chunk() -> None:
+    found, damage = read(DATA / "damaged/luminar_lz4_bitflip.bag")
+    whole = reference(DATA / "real/luminar_pointcloud.bag")
+    assert total(found) == total(whole) - 1
+    assert [(each.offset, each.messages_lost) for each in damage] == [(1521959, 1)]
+    assert "unpacked" in damage[0].reason
+    for key, rows in found.items():
+        assert set(rows) <= set(whole[key])
+
+
+@needs_data
+def test_a_size_that_lies_costs_nothing() -> None:
+    found, damage = read(DATA / "damaged/tilt_chunksize_lie.bag")
+    assert by_value(found) == by_value(reference(DATA / "real/tilt_laser.bag"))
+    assert [(each.offset, each.messages_lost) for each in damage] == [(4117, 0)]
+
+
+@needs_data
+def test_cut_in_a_chunk() -> None:
+    cut = DATA / "damaged/tilt_trunc60.bag"
+    found, damage = read(cut)
+    whole = (DATA / "real/tilt_laser.bag").read_bytes()
+    assert whole.startswith(cut.read_bytes())
+    expected = Rosbag1Source(DATA / "real/tilt_laser.bag")
+    with expected:
+        before_cut = total_before(expected, whole, cut.stat().st_size)
+    assert total(found) == before_cut > 2000
+    assert len(damage) == 1
+    assert damage[0].messages_lost is None
+    assert damage[0].offset is not None
+    assert damage[0].length == cut.stat().st_size - damage[0].offset
+
+
+def total_before(source: Source, whole: bytes, cut: int) -> int:
+    """Messages of an uncompressed bag whose bytes lie wholly before `cut`."""
+    count = 0
+    place = 0
+    for batch in source.batches():
+        for row in range(len(batch)):
+            payload = bytes(batch.payload(row))
+            place = whole.index(struct.pack("<I", len(payload)) + payload, place)
+            place += 4 + len(payload)
+            count += place <= cut
+    return count
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("damaged/magic_only.bag", "before any message"),
+        ("odd/empty-file.bag", "empty"),
+        ("no such.bag", "no such file"),
+        ("CATALOGUE.md", "no ROS 1 bag"),
+    ],
+)
+def test_nothing_to_read(name: str, words: str) -> None:
+    with pytest.raises(SourceError, match=words) as caught:
+        Rosbag1Source(DATA / name)
+    assert str(DATA / name) in str(caught.value)
+
+
+# Bags made here.
+
+
+def make(path: Path, compression: str, *, chunk: int, messages: int, size: int = 40) -> Messages:
+    writer = Writer(path)
+    if compression != "none":
+        writer.set_compression(Writer.CompressionFormat[compression.upper()])
+    writer.chunk_threshold = chunk
+    rows: Messages = defaultdict(list)
+    with writer:
+        connections = [
+            writer.add_connection(
+                f"/topic_{number}",
+                "std_msgs/msg/String",
+                msgdef="string data\n",
+                md5sum="992ce8a1687cec8c8bd883ec73ca41d1",
+                callerid=f"/node_{number}",
+                latching=1,
+            )
+            for number in range(3)
+        ]
+        for number in range(messages):
+            connection = connections[number % 3]
+            payload = number.to_bytes(4, "little") * (number % size)
+            time = 10**18 + number * 1_000_003
+            writer.write(connection, time, payload)
+            rows[(connection.topic, f"/node_{number % 3}")].append((time, payload))
+    return dict(rows)
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+@pytest.mark.parametrize("chunk", [200, 5000, 1 << 20])
+def test_written_by_rosbags(tmp_path: Path, compression: str, chunk: int) -> None:
+    expected = make(tmp_path / "a.bag", compression, chunk=chunk, messages=400)
+    found, damage = read(tmp_path / "a.bag")
+    assert found == expected
+    assert damage == []
+
+
+def test_many_small_messages_are_split(tmp_path: Path) -> None:
+    expected = make(tmp_path / "a.bag", "none", chunk=4 << 20, messages=40_000, size=3)
+    found, damage = read(tmp_path / "a.bag")
+    assert found == expected
+    assert damage == []
+
+
+def test_windows_smaller_than_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hybridlog.formats.rosbag1.reader._WINDOW", 64)
+    expected = make(tmp_path / "a.bag", "none", chunk=3000, messages=200)
+    found, damage = read(tmp_path / "a.bag")
+    assert found == expected
+    assert damage == []
+
+
+def _cases() -> dict[str, tuple[bytes, Messages]]:
+    cases = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for compression in ("none", "bz2", "lz4"):
+            path = Path(folder) / f"{compression}.bag"
+            expected = make(path, compression, chunk=700, messages=60)
+            cases[compression] = path.read_bytes(), expected
+    return cases
+
+
+CASES = _cases()
+
+
+def read_bytes(data: bytes) -> tuple[Messages, list[Damage]]:
+    with tempfile.NamedTemporaryFile(suffix=".bag") as file:
+        file.write(data)
+        file.flush()
+        return read(Path(file.name))
+
+
+def payload_ends(data: bytes, messages: Messages) -> list[tuple[int, int]]:
+    """(time, byte after its payload) of each message of an uncompressed bag."""
+    ends = []
+    for rows in messages.values():
+        for time, payload in rows:
+            stamp = b"time=" + struct.pack("<II", time // 10**9, time % 10**9)
+            start = data.index(stamp) + len(stamp) + 4
+            assert data[start : start + len(payload)] == payload
+            ends.append((time, start + len(payload)))
+    return ends
+
+
+ENDS = payload_ends(*CASES["none"])
+
+
+def test_cut_anywhere_in_the_index() -> None:
+    """Between two of its records, too, where all that is left is sound."""
+    whole, expected = CASES["none"]
+    for cut in range(len(whole) - 2000, len(whole)):
+        found, damage = read_bytes(whole[:cut])
+        assert found == expected, cut
+        assert damage, cut
+
+
+@settings(max_examples=250, deadline=None)
+@given(compression=st.sampled_from(sorted(CASES)), data=st.data())
+def test_cut_anywhere(compression: str, data: st.DataObject) -> None:
+    whole, expected = CASES[compression]
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    try:
+        found, damage = read_bytes(whole[:cut])
+    except SourceError:
+        assert cut < 4200
+        return
+    for key, rows in found.items():
+        assert rows == expected[key][: len(rows)]
+    assert damage, "a cut file is damaged"
+    if compression == "none":
+        times = {time for rows in found.values() for time, _ in rows}
+        assert times == {time for time, end in ENDS if end <= cut}
+    lost = [each.messages_lost for each in damage]
+    if None not in lost:
+        assert total(found) + sum(filter(None, lost)) == total(expected)
+
+
+@settings(max_examples=250, deadline=None)
+@given(
+    compression=st.sampled_from(sorted(CASES)),
+    place=st.integers(0, 1 << 20),
+    value=st.integers(1, 255),
+)
+@example(compression="none", place=4117, value=1)
+def test_one_flipped_byte(compression: str, place: int, value: int) -> None:
+    whole, expected = CASES[compression]
+    place %= len(whole)
+    broken = bytearray(whole)
+    broken[place] ^= value
+    try:
+        found, _ = read_bytes(bytes(broken))
+    except SourceError:
+        assert place < 4117
+        return
+    all_times = {time for rows in expected.values() for time, _ in rows}
+    times = [time for rows in found.values() for time, _ in rows]
+    known = all_times & set(times)
+    # One byte costs one chunk at most, and an uncompressed chunk a few messages at most.
+    assert len(known) >= total(expected) - (30 if compression != "none" else 3)
+    assert len(times) <= total(expected)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.binary(max_size=400))
+def test_any_bytes(data: bytes) -> None:
+    head = CASES["none"][0][:4117]
+    found, _ = read_bytes(head + data)
+    assert total(found) == 0
+
+
+# Records put together by hand.
+
+
+def record(fields: dict[str, bytes], data: bytes) -> bytes:
+    header = b"".join(
+        struct.pack("<I", len(name) + 1 + len(value)) + name.encode() + b"=" + value
+        for name, value in fields.items()
+    )
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+
+def connection(conn: int, kind: str = "std_msgs/String", topic: str = "/a") -> bytes:
+    inner = record({"topic": topic.encode(), "type": kind.encode(), "message_definition": b""}, b"")
+    size = struct.unpack("<I", inner[:4])[0]
+    fields = {"op": b"\x07", "conn": struct.pack("<I", conn), "topic": topic.encode()}
+    return record(fields, inner[4 : 4 + size])
+
+
+def message(conn: int, time: int, data: bytes, *, order: str = "oct", **extra: bytes) -> bytes:
+    values = {
+        "o": ("op", b"\x02"),
+        "c": ("conn", struct.pack("<I", conn)),
+        "t": ("time", struct.pack("<II", time // 10**9, time % 10**9)),
+    }
+    return record(dict(values[letter] for letter in order) | extra, data)
+
+
+def chunk(data: bytes, compression: str = "none", *, size: int | None = None) -> bytes:
+    packed = {"none": bytes, "bz2": bz2.compress, "lz4": lz4.frame.compress}.get(
+        compression, bytes
+    )(data)
+    return packed_chunk(packed, compression, len(data) if size is None else size)
+
+
+def packed_chunk(packed: bytes, compression: str, size: int) -> bytes:
+    fields = {
+        "op": b"\x05",
+        "compression": compression.encode(),
+        "size": struct.pack("<I", size),
+    }
+    return record(fields, packed)
+
+
+def index(conn: int, count: int) -> bytes:
+    fields = {
+        "op": b"\x04",
+        "ver": struct.pack("<I", 1),
+        "conn": struct.pack("<I", conn),
+        "count": struct.pack("<I", count),
+    }
+    return record(fields, bytes(12 * count))
+
+
+def bag(*records: bytes, encryptor: bytes = b"") -> bytes:
+    fields = {
+        "op": b"\x03",
+        "index_pos": bytes(8),
+        "conn_count": bytes(4),
+        "chunk_count": bytes(4),
+    }
+    if encryptor:
+        fields["encryptor"] = encryptor
+    return b"#ROSBAG V2.0\n" + record(fields, b" " * 4027) + b"".join(records)
+
+
+def values(found: Messages) -> list[bytes]:
+    return [payload for rows in found.values() for _, payload in rows]
+
+
+def test_messages_outside_of_chunks() -> None:
+    found, damage = read_bytes(
+        bag(connection(3), *(message(3, time, bytes([time])) for time in range(5)))
+    )
+    assert values(found) == [bytes([time]) for time in range(5)]
+    assert damage == []
+
+
+def test_headers_in_any_order_and_with_more_fields() -> None:
+    orders = ["oct", "cot", "toc", "cto"]
+    rows = [message(0, time, bytes([time]), order=orders[time % 4]) for time in range(40)]
+    rows += [message(0, 40 + n, b"+", note=b"x" * n) for n in range(30)]
+    found, damage = read_bytes(bag(chunk(connection(0) + b"".join(rows))))
+    assert values(found) == [bytes([time]) for time in range(40)] + [b"+"] * 30
+    assert sorted(time for time, _ in found[("/a", "")]) == list(range(70))
+    assert damage == []
+
+
+def with_index_lengths(data: bytes, change: Callable[[int, int], int]) -> bytes:
+    """A bag whose index records state other lengths: `change(length, number)`."""
+    out = bytearray(data)
+    at, number = 13, 0
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        place = at + 4 + size
+        (length,) = struct.unpack_from("<I", data, place)
+        if re.search(rb"op=[\x04\x06]", data[at + 4 : place]):
+            struct.pack_into("<I", out, place, max(change(length, number), 0))
+            number += 1
+        at = place + 4 + length
+    return bytes(out)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda length, _: length + 1,
+        lambda length, _: length - 1,
+        lambda length, _: length * 20 // 12,
+        lambda length, number: length + 7 * (number % 3) - 5 * (number % 2),
+        lambda _length, _: 0,
+        lambda _length, _: 2**32 - 1,
+    ],
+)
+def test_index_records_that_state_a_wrong_length(
+    tmp_path: Path, compression: str, change: Callable[[int, int], int]
+) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=2000, messages=400)
+    path.write_bytes(with_index_lengths(path.read_bytes(), change))
+    found, damage = read(path)
+    assert found == expected
+    assert damage == []
+    with Rosbag1Source(path) as source:
+        assert source.message_count == 400
+        assert source.time_range == (10**18, 10**18 + 399 * 1_000_003 + 1)
+
+
+def test_a_gap_between_chunks_does_not_count_the_messages_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, "none", chunk=2000, messages=400)
+    data = path.read_bytes()
+    # Neither the length nor the count of the last index record of the first chunk is right, and
+    # the length reaches into the second chunk.
+    second = data.index(b"op=\x05", data.index(b"op=\x05") + 1)
+    start = data.rindex(b"count=", 0, second)
+    (count,) = struct.unpack_from("<I", data, start + 6)
+    broken = bytearray(data)
+    struct.pack_into("<I", broken, start + 6, count + 1)
+    size = data.index(struct.pack("<I", 12 * count), start + 10)
+    struct.pack_into("<I", broken, size, 12 * count + 150)
+    path.write_bytes(broken)
+    found, damage = read(path)
+    assert found == expected
+    assert [each.messages_lost for each in damage] == [0]
+
+
+def test_connections_without_messages_are_channels(tmp_path: Path) -> None:
+    path = tmp_path / "a.bag"
+    make(path, "none", chunk=2000, messages=2)  # of three topics
+    with Rosbag1Source(path) as source:
+        assert total(contents(source)) == 2
+        assert sorted(c.topic for c in source.channels) == ["/topic_0", "/topic_1", "/topic_2"]
+
+
+def test_undefined_connection_is_counted() -> None:
+    body = connection(0) + message(0, 1, b"a") + message(9, 2, b"b") + message(0, 3, b"c")
+    found, damage = read_bytes(bag(chunk(body, "lz4")))
+    assert values(found) == [b"a", b"c"]
+    assert [each.messages_lost for each in damage] == [1]
+    assert "id 9" in damage[0].reason
+
+
+def test_a_connection_id_that_changes_its_meaning(tmp_path: Path) -> None:
+    body = (
+        connection(0, "a/A")
+        + message(0, 1, b"a")
+        + connection(0, "b/B")
+        + message(0, 2, b"b")
+        + connection(0, "b/B")
+        + message(0, 3, b"b")
+    )
+    (tmp_path / "a.bag").write_bytes(bag(chunk(body)))
+    with Rosbag1Source(tmp_path / "a.bag") as source:
+        (batch,) = source.batches()
+        types = [source.channels[number].schema for number in batch.channel]
+    assert [schema.name for schema in types if schema is not None] == ["a/A", "b/B", "b/B"]
+    assert len(source.channels) == 2
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4"])
+def test_bomb(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hybridlog.formats.rosbag1.reader._UNSTATED", 1 << 20)
+    bomb = chunk(bytes(3 << 20), compression, size=5)
+    good = chunk(connection(0) + message(0, 1, b"a"), compression)
+    found, damage = read_bytes(bag(good, index(0, 1), bomb, index(0, 7), good, index(0, 1)))
+    assert values(found) == [b"a", b"a"]
+    assert [each.messages_lost for each in damage] == [7]
+    assert "its header says 5 bytes, it has more than 1048576" in damage[0].reason
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+@pytest.mark.parametrize("lie", [-40, -7, 5, 999, 1 << 30])
+def test_chunk_length_that_lies(compression: str, lie: int) -> None:
+    rows = [message(0, time, bytes([time, time])) for time in range(20)]
+    one = bytearray(chunk(connection(0) + b"".join(rows), compression))
+    head = struct.unpack_from("<I", one)[0] + 4
+    length = struct.unpack_from("<I", one, head)[0]
+    struct.pack_into("<I", one, head, max(0, length + lie))
+    two = chunk(message(0, 100, b"z"), compression)
+    found, damage = read_bytes(bag(bytes(one), index(0, 20), two, index(0, 1)))
+    assert values(found) == [bytes([time, time]) for time in range(20)] + [b"z"]
+    assert damage
+    assert all(each.messages_lost == 0 for each in damage)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_message_length_that_lies(compression: str) -> None:
+    rows = [message(0, time, bytes(30)) for time in range(20)]
+    broken = bytearray(rows[7])
+    struct.pack_into("<I", broken, len(broken) - 34, 77)
+    rows[7] = bytes(broken)
+    found, damage = read_bytes(
+        bag(chunk(connection(0) + b"".join(rows), compression), index(0, 20))
+    )
+    assert [time for time, _ in found[("/a", "")]] == [t for t in range(20) if t != 7]
+    assert set(values(found)) == {bytes(30)}
+    assert [each.messages_lost for each in damage] == [1]
+
+
+def test_unknown_compression_and_destroyed_chunk_header() -> None:
+    good = chunk(connection(0) + message(0, 1, b"a"))
+    odd = chunk(b"?" * 50, "zzz")
+    header_gone = b"\xff" * 60 + chunk(message(0, 5, b"l"), "lz4")[60:]
+    found, damage = read_bytes(
+        bag(good, index(0, 1), odd, index(0, 4), header_gone, index(0, 3), good, index(0, 1))
+    )
+    assert values(found) == [b"a", b"a"]
+    assert [each.messages_lost for each in damage] == [4, 3]
+    assert "'zzz'" in damage[0].reason
+
+
+def test_encrypted_and_old() -> None:
+    with pytest.raises(SourceError, match="encrypted"):
+        read_bytes(bag(encryptor=b"rosbag/AesCbcEncryptor"))
+    with pytest.raises(SourceError, match=r"version 1\.2"):
+        read_bytes(b"#ROSBAG V1.2\n" + bytes(100))
+
+
+def test_the_definition_is_found_in_the_index_when_its_chunk_is_lost(tmp_path: Path) -> None:
+    expected = make(tmp_path / "a.bag", "lz4", chunk=700, messages=60)
+    data = bytearray((tmp_path / "a.bag").read_bytes())
+    data[4117 + 60 : 4117 + 80] = bytes(20)
+    found, damage = read_bytes(bytes(data))
+    assert 0 < total(found) < total(expected)
+    assert [each.messages_lost for each in damage] == [total(expected) - total(found)]
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4"])
+def test_a_cut_chunk_gives_what_unpacks(compression: str) -> None:
+    rows = [message(0, time, bytes([time, time + 1]) * 30_000) for time in range(40)]
+    one = chunk(connection(0) + b"".join(rows), compression)
+    found, damage = read_bytes(bag(one)[: -len(one) // 4])
+    times = [time for time, _ in found[("/a", "")]]
+    assert times == list(range(len(times)))
+    assert 5 < len(times) < 40
+    assert [each.messages_lost for each in damage] == [None]
+
+
+def test_zeros_are_no_records() -> None:
+    """A small chunk may unpack to very many of them."""
+    sound = connection(0) + message(0, 1, b"a")
+    data = sound + bytes(16 << 20)
+    tracemalloc.start()
+    try:
+        run = RunReader().read(data)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    assert (run.end, run.why) == (len(sound), Stop.BAD)
+    messages, damage = read_bytes(bag(chunk(sound + bytes(1 << 20), "bz2")))
+    assert values(messages) == [b"a"]
+    assert damage
+
+
+def test_run_reader_stops() -> None:
+    reader = RunReader()
+    body = connection(0) + message(0, 5, b"abc")
+    run = reader.read(body)
+    assert (run.why, run.end, run.length.tolist()) == (Stop.END, len(body), [3])
+    assert reader.read(body[:-1]).why is Stop.CUT
+    assert reader.read(body + index(0, 1)).why is Stop.FOREIGN
+    assert reader.read(body + b"\x01\x00\x00\x00abcdefgh").why is Stop.BAD
+    assert reader.read(body + b"\xff" * 40).why is Stop.BAD
+
+
+@st.composite
+def runs(draw: st.DrawFn) -> bytes:
+    """Records of several writers in a row, with payloads that look like records, and damage."""
+    decoy = message(1, 7, b"inner")
+    payloads = st.sampled_from([b"", b"abc", decoy, decoy[:-1], decoy * 2, bytes(100)])
+    records = [
+        message(draw(st.integers(0, 3)), at, draw(payloads))
+        if draw(st.integers(0, 9))
+        else connection(draw(st.integers(0, 3)))
+        for at in range(draw(st.integers(1, 40)))
+    ]
+    data = bytearray(b"".join(records))
+    for _ in range(draw(st.integers(0, 2))):
+        data[draw(st.integers(0, len(data) - 1))] ^= 1 << draw(st.integers(0, 7))
+    return bytes(data[: draw(st.integers(len(data) * 2 // 3, len(data)))])
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=runs(), more=st.sets(st.integers(0, 3000)), every=st.integers(1, 3))
+def test_places_where_records_may_start_change_nothing(
+    data: bytes, more: set[int], every: int
+) -> None:
+    head, body, end, need = records._walk(data)
+    u32 = struct.Struct("<I").unpack_from
+    places = [
+        place
+        for place in sorted({*head.tolist()[::every], *more})
+        if place + 8 <= len(data) and place + 8 + u32(data, place)[0] <= len(data)
+    ]
+    found = records._follow(data, np.frombuffer(data, np.uint8), np.array(places, np.int64))
+    assert found[0].tolist() == head.tolist()
+    assert found[1].tolist() == body.tolist()
+    assert found[2:] == (end, need)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=runs())
+def test_a_reader_that_has_seen_many_messages_finds_what_a_new_one_finds(data: bytes) -> None:
+    many = connection(0) + b"".join(message(0, at, b"x" * (at % 7)) for at in range(300))
+    seasoned = RunReader()
+    seasoned.read(many)
+    again = seasoned.read(many)
+    assert again.log_time.tolist() == list(range(300))
+    assert again.length.tolist() == [at % 7 for at in range(300)]
+    fresh, found = RunReader().read(data), seasoned.read(data)
+    for name in ("offset", "length", "connection", "log_time"):
+        assert getattr(found, name).tolist() == getattr(fresh, name).tolist(), name
+    assert found.connections == fresh.connections
+    assert (found.why, found.end, found.need, found.last) == (
+        fresh.why,
+        fresh.end,
+        fresh.need,
+        fresh.last,
+    )
+
+
+def test_rosbags_refuses_what_is_read_here() -> None:
+    """The faults above are faults to the reference reader too."""
+    with tempfile.NamedTemporaryFile(suffix=".bag") as file:
+        file.write(bag(chunk(connection(0))))
+        file.flush()
+        with pytest.raises(ReaderError), Reader(file.name):
+            pass
+
+
+def test_batches_are_bounded(tmp_path: Path) -> None:
+    make(tmp_path / "a.bag", "none", chunk=1 << 14, messages=3000, size=200)
+    with Rosbag1Source(tmp_path / "a.bag") as source:
+        sizes = [len(batch.buffer) for batch in source.batches()]
+    assert max(sizes) <= reading.BATCH_BYTES + (1 << 16)
+    assert len(sizes) < 4

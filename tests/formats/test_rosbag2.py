@@ -1,0 +1,551 @@
+"""ROS 2 bags against an independent reader, whole, compressed and damaged."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import yaml
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from hybridlog.formats.detect import open_source
+from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage, Source
+from hybridlog.formats.rosbag2.directory import parse_metadata
+from hybridlog.formats.rosbag2.sqlite import SqliteSource
+from hybridlog.formats.yaml_values import YamlError
+from hybridlog_storage.errors import SourceError
+from tests.data import DATA, needs_data
+
+Messages = Counter[tuple[str, str, int, bytes]]
+"""(topic, type, time, payload)."""
+
+
+def contents(source: Source) -> Messages:
+    found: Messages = Counter()
+    for batch in source.batches():
+        assert 0 < len(batch) <= BATCH_MESSAGES
+        for row in range(len(batch)):
+            channel = source.channels[batch.channel[row]]
+            assert channel.schema is not None
+            time = int(batch.log_time[row])
+            found[channel.topic, channel.schema.name, time, bytes(batch.payload(row))] += 1
+    return found
+
+
+def read(path: Path) -> tuple[Messages, list[Damage]]:
+    with open_source(path) as source:
+        return contents(source), source.damage
+
+
+def reference(path: Path) -> Messages:
+    with Reader(path) as reader:
+        return Counter(
+            (connection.topic, connection.msgtype, time, bytes(data))
+            for connection, time, data in reader.messages()
+        )
+
+
+def normal(messages: Messages) -> Messages:
+    """With the types of early releases spelled as rosbags spells them."""
+    return Counter(
+        {
+            (topic, kind if kind.count("/") == 2 else kind.replace("/", "/msg/"), time, data): n
+            for (topic, kind, time, data), n in messages.items()
+        }
+    )
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "name",
+    [
+        "real/auv_ros2_db3",
+        "real/auv_ros2_db3/rosbag2_2024_09_04-17_15_57_0.db3",
+        "odd/rosbag2/talker_db3",
+        "odd/rosbag2/talker_db3/metadata.yaml",
+        "odd/rosbag2/talker_db3/talker.db3",
+        "odd/rosbag2/topics_and_services.db3",
+        "odd/rosbag2/wrong_rmw_test.db3",
+        "odd/rosbag2/empty_bag_0.db3",
+        "odd/rosbag2/split_mcap",
+    ],
+)
+def test_as_rosbags_reads_it(name: str) -> None:
+    path = DATA / name
+    with open_source(path) as source:
+        found = contents(source)
+        assert source.damage == []
+        assert source.bytes_read == source.size_bytes
+        assert source.profile == "ros2"
+        assert source.kind == f"ROS 2 bag ({'mcap' if 'mcap' in name else 'sqlite3'})"
+    # rosbags gives nothing of a bag whose metadata spells a topic's QoS in another way.
+    theirs = DATA / "odd/rosbag2/talker_db3/talker.db3" if "talker" in name else path
+    assert normal(found) == normal(reference(theirs))
+    assert source.message_count == found.total()
+    with Reader(theirs) as reader:
+        ends = (reader.start_time, reader.end_time) if reader.message_count else None
+        if name.endswith("split_mcap"):
+            ends = (1000, 2999)  # its metadata names other times
+        topics = {connection.topic for connection in reader.connections}
+    assert source.time_range == ends
+    assert {channel.topic for channel in source.channels} == topics
+
+
+@needs_data
+def test_what_channels_say() -> None:
+    with open_source(DATA / "odd/rosbag2/wrong_rmw_test.db3") as source:
+        list(source.batches())
+        channels = {channel.topic: channel for channel in source.channels}
+    array = channels["/array_topic"]
+    assert array.message_encoding == "wrong_format"
+    assert array.schema is not None
+    assert (array.schema.name, array.schema.encoding, array.schema.data) == (
+        "test_msgs/StaticArrayPrimitives",
+        "",
+        b"",
+    )
+    assert array.metadata == {}
+    assert not array.has_publish_time
+    clock = channels["/clock"].schema
+    assert clock is not None
+    assert (clock.name, clock.encoding, clock.data) == ("rosgraph_msgs/Clock", "", b"")
+
+    with open_source(DATA / "odd/rosbag2/topics_and_services.db3") as source:
+        list(source.batches())
+        channels = {channel.topic: channel for channel in source.channels}
+    events, services = channels["/parameter_events"], channels["/add_two_ints/_service_event"]
+    assert events.schema is not None
+    assert events.schema.data.startswith(b"# This message contains a parameter event.")
+    assert events.metadata["offered_qos_profiles"].startswith("- history")
+    assert events.metadata["topic_type_hash"].startswith("RIHS01_")
+    assert services.schema is not None
+    assert (services.schema.encoding, services.schema.name) == (
+        "ros2msg",
+        "example_interfaces/srv/AddTwoInts_Event",
+    )
+    assert b"---" in services.schema.data
+
+
+@needs_data
+def test_database_cut_in_half() -> None:
+    found, damage = read(DATA / "damaged/lidar_trunc50.db3")
+    # The rows before the first page that is missing: the cut is at 905 216 bytes.
+    assert found.total() == 217
+    assert all(3600 < len(data) < 3800 for *_, data in found)
+    assert [each.messages_lost for each in damage] == [None]
+    assert "malformed" in damage[0].reason
+
+
+# Bags made here.
+
+
+def make(
+    folder: Path,
+    *,
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
+    mode: CompressionMode = CompressionMode.NONE,
+    messages: int = 300,
+    version: int = 9,
+) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Writer(folder, version=version, storage_plugin=storage)
+    if mode is not CompressionMode.NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = [
+            writer.add_connection(f"/topic{number}", kind, typestore=store)
+            for number, kind in enumerate(["std_msgs/msg/String", "std_msgs/msg/Int32"])
+        ]
+        for number in range(messages):
+            payload = number.to_bytes(4, "little") * (number % 90)
+            writer.write(connections[number % 2], 10**18 + number * 999_983, payload)
+    return folder
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize(
+    "mode", [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE]
+)
+@pytest.mark.parametrize("version", [8, 9])
+def test_written_by_rosbags(
+    tmp_path: Path, storage: StoragePlugin, mode: CompressionMode, version: int
+) -> None:
+    folder = make(tmp_path / "bag", storage=storage, mode=mode, version=version)
+    expected = reference(folder)
+    assert expected.total() == 300
+    found, damage = read(folder)
+    assert damage == []
+    assert found == expected
+    # The file alone says enough too: beside its metadata, and a database away from it.
+    (file,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
+    assert read(file) == (expected, [])
+    (folder / "metadata.yaml").unlink()
+    assert file.suffix == ".zstd" or mode is not CompressionMode.FILE
+    if storage is StoragePlugin.SQLITE3 or mode is not CompressionMode.MESSAGE:
+        assert read(file) == (expected, [])
+        assert read(folder) == (expected, [])
+
+
+def test_no_temporary_file_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = make(tmp_path / "bag", mode=CompressionMode.FILE)
+    spool = tmp_path / "tmp"
+    spool.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(spool))
+    with open_source(folder) as source:
+        assert list(spool.iterdir()) == []
+        assert contents(source).total() == 300
+    assert list(spool.iterdir()) == []
+
+
+def test_no_room_to_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = make(tmp_path / "bag", mode=CompressionMode.FILE)
+    usage = shutil.disk_usage(tmp_path)._replace(free=(64 << 20) + 1000)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage)
+    with pytest.raises(SourceError, match="TMPDIR"):
+        open_source(folder)
+    # A frame that does not say its size is stopped when it has filled the room.
+    file = next(folder.glob("*.zstd"))
+    raw = zstandard.ZstdDecompressor().decompressobj().decompress(file.read_bytes())
+    file.write_bytes(zstandard.ZstdCompressor(write_content_size=False).compress(raw))
+    with pytest.raises(SourceError, match="TMPDIR"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("keep", [0.01, 0.3, 0.95])
+def test_compressed_file_cut_short(tmp_path: Path, keep: float) -> None:
+    folder = make(tmp_path / "bag", mode=CompressionMode.FILE, messages=5000)
+    expected = reference(folder)
+    file = next(folder.glob("*.zstd"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * keep)])
+    if keep < 0.1:
+        # Not even the first block is there.
+        with pytest.raises(SourceError, match="zstd -t") as caught:
+            read(folder)
+        assert str(file) in str(caught.value)
+        return
+    found, damage = read(folder)
+    assert found <= expected
+    assert 0 < found.total() < 5000
+    assert all(each.file == file for each in damage)
+    assert sum(each.messages_lost or 0 for each in damage) == 5000 - found.total()
+
+
+def split(folder: Path, parts: int) -> Path:
+    """Turns a bag into one of several files with the same metadata."""
+    whole = next(folder.glob("*.db3"))
+    for number in range(parts):
+        part = folder / f"bag_{number}.db3"
+        shutil.copy(whole, part)
+        with sqlite3.connect(part) as db:
+            db.execute("DELETE FROM messages WHERE id % ? != ?", (parts, number))
+        db.close()
+    whole.unlink()
+    text = yaml.safe_load((folder / "metadata.yaml").read_text())
+    bag = text["rosbag2_bagfile_information"]
+    bag["relative_file_paths"] = [f"bag_{number}.db3" for number in range(parts)]
+    bag.pop("files")
+    with (folder / "metadata.yaml").open("w") as file:
+        yaml.dump(text, file)
+    return folder
+
+
+def test_split_bag(tmp_path: Path) -> None:
+    folder = make(tmp_path / "bag")
+    expected = reference(folder)
+    split(folder, 12)
+    found, damage = read(folder)
+    assert (found, damage) == (expected, [])
+    with open_source(folder) as source:
+        assert [path.name for path in source.files] == [f"bag_{n}.db3" for n in range(12)]
+        assert source.message_count == 300
+        list(source.batches())
+        assert len(source.channels) == 2
+    (folder / "metadata.yaml").unlink()
+    assert read(folder) == (expected, [])
+    with open_source(folder) as source:
+        assert [path.name for path in source.files] == [f"bag_{n}.db3" for n in range(12)]
+        assert source.message_count == 300
+
+
+def test_split_bag_with_missing_and_broken_files(tmp_path: Path) -> None:
+    folder = split(make(tmp_path / "bag"), 4)
+    expected = reference(folder)
+    (folder / "bag_1.db3").unlink()
+    (folder / "bag_2.db3").write_bytes(b"SQLite format 3\x00" + bytes(5000))
+    found, damage = read(folder)
+    assert found <= expected
+    assert found.total() == 150
+    assert [each.file.name for each in damage] == ["bag_1.db3", "bag_2.db3"]
+    assert "missing" in damage[0].reason
+    (folder / "bag_0.db3").unlink()
+    (folder / "bag_3.db3").unlink()
+    with pytest.raises(SourceError, match="SQLite"):
+        open_source(folder).batches().__next__()
+    (folder / "bag_2.db3").unlink()
+    with pytest.raises(SourceError, match="none of the files"):
+        open_source(folder)
+
+
+def test_counts_of_the_metadata_are_checked(tmp_path: Path) -> None:
+    folder = make(tmp_path / "bag", version=8)
+    db = sqlite3.connect(folder / "bag.db3")
+    db.execute("DELETE FROM messages WHERE id > 290")
+    db.commit()
+    db.close()
+    _, damage = read(folder)
+    assert [each.messages_lost for each in damage] == [10]
+
+
+@pytest.mark.parametrize("text", ["", "{", "a: b", "[" * 3000, "rosbag2_bagfile_information: 3"])
+def test_damaged_metadata(tmp_path: Path, text: str) -> None:
+    folder = make(tmp_path / "bag")
+    (folder / "metadata.yaml").write_text(text)
+    found, damage = read(folder)
+    assert found.total() == 300
+    assert [(each.file.name, each.messages_lost) for each in damage] == [("metadata.yaml", 0)]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(max_size=60) | st.sampled_from(["!!python/object:os.system x", "&a [*a]"]))
+def test_metadata_is_untrusted(text: str) -> None:
+    with pytest.raises(YamlError):
+        parse_metadata(text)
+    head = "rosbag2_bagfile_information:\n  version: 4\n  storage_identifier: sqlite3\n  "
+    for key in ("relative_file_paths", "message_count", "files", "duration", "compression_mode"):
+        with suppress(YamlError):
+            assert parse_metadata(f"{head}{key}: {text!r}").files == []
+
+
+def test_metadata_names_no_other_folder() -> None:
+    found = parse_metadata(
+        "rosbag2_bagfile_information:\n  relative_file_paths:\n    - ../../etc/passwd\n"
+        "    - bag/bag_0.db3\n    - C:\\x\\bag_1.db3\n    - ..\n"
+    )
+    assert found.files == ["passwd", "bag/bag_0.db3", "bag_1.db3"]
+
+
+# Databases put together by hand.
+
+
+def database(path: Path, *script: str, rows: Iterable[tuple[object, ...]] = ()) -> Path:
+    db = sqlite3.connect(path)
+    for line in script:
+        db.execute(line)
+    if rows:
+        db.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    db.commit()
+    db.close()
+    return path
+
+
+TOPICS = (
+    "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+)
+MESSAGES = (
+    "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+)
+TOPIC = "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr')"
+
+
+def test_publish_time(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        TOPICS,
+        TOPIC,
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, recv_timestamp INTEGER,"
+        " send_timestamp INTEGER, data BLOB)",
+        "INSERT INTO messages VALUES (1, 1, 50, 40, x'00'), (2, 1, 60, NULL, x'01')",
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+        assert source.channels[0].has_publish_time
+    assert batch.log_time.tolist() == [50, 60]
+    assert batch.publish_time.tolist() == [40, 60]
+
+
+def test_values_of_odd_types_and_unknown_topics(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        TOPICS,
+        MESSAGES,
+        TOPIC,
+        rows=[(1, 1, 5, "text"), (2, "x", 6, b"lost"), (3, 1, None, None), (9, 1, "7", b"b")],
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+    rows = [(int(t), bytes(batch.payload(row))) for row, t in enumerate(batch.log_time)]
+    assert rows == [(5, b"text"), (0, b""), (7, b"b")]
+    assert [each.messages_lost for each in source.damage] == [1]
+
+
+def test_times_before_1970_are_left_out_and_counted(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        TOPICS,
+        MESSAGES,
+        TOPIC,
+        rows=[(1, 1, -1, b"lost"), (2, 1, 0, b"a"), (3, 1, 2**63 - 1, b"b"), (4, 1, -(2**63), b"")],
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+    assert batch.log_time.tolist() == [0, 2**63 - 1]
+    (damage,) = source.damage
+    assert damage.messages_lost == 2
+    assert "1970" in damage.reason
+
+
+def test_messages_and_topics_without_an_id(tmp_path: Path) -> None:
+    path = database(
+        tmp_path / "a.db3",
+        "CREATE TABLE topics(id, name TEXT, type TEXT, serialization_format TEXT)",
+        MESSAGES,
+        "INSERT INTO topics VALUES (NULL, '/n', 'a/B', 'cdr'), ('x', '/x', 'a/B', 'cdr')",
+        "INSERT INTO topics VALUES ('1', '/a', 'a/B', 'cdr')",
+        rows=[(1, 1, 5, b"a"), (2, None, 6, b"lost"), (3, 7, 7, b"lost")],
+    )
+    with SqliteSource(path) as source:
+        (batch,) = source.batches()
+    assert [source.channels[c].topic for c in batch.channel] == ["/a"]
+    (damage,) = source.damage
+    assert damage.messages_lost == 2
+    assert "7, NULL" in damage.reason
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        [],
+        [TOPICS],
+        ["CREATE TABLE messages(a, b)", TOPICS],
+        [
+            TOPICS,
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 "
+            "FROM n) SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM n",
+        ],
+        [TOPICS, MESSAGES + " WITHOUT ROWID"],
+    ],
+)
+def test_databases_that_are_no_bag(tmp_path: Path, script: list[str]) -> None:
+    path = database(tmp_path / "a.db3", "CREATE TABLE x(y)", *script)
+    with pytest.raises(SourceError, match=r"no ROS 2 bag|SQLite cannot") as caught:
+        SqliteSource(path)
+    assert str(path) in str(caught.value)
+
+
+def test_odd_file_names(tmp_path: Path) -> None:
+    path = database(tmp_path / "a ?mode=memory&x=%41#é.db3", TOPICS, MESSAGES, TOPIC)
+    with open_source(path) as source:
+        assert list(source.batches()) == []
+        assert source.message_count == 0
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_write_ahead_log_of_a_crashed_recorder(tmp_path: Path) -> None:
+    live = tmp_path / "live.db3"
+    db = sqlite3.connect(live)
+    db.execute("PRAGMA journal_mode = WAL")
+    for line in (TOPICS, MESSAGES, TOPIC, "INSERT INTO messages VALUES (1, 1, 5, x'05')"):
+        db.execute(line)
+    db.commit()
+    crashed = tmp_path / "crashed.db3"
+    shutil.copy(live, crashed)
+    shutil.copy(f"{live}-wal", f"{crashed}-wal")
+    db.close()
+    with open_source(crashed) as source:
+        (batch,) = source.batches()
+    assert batch.log_time.tolist() == [5]
+
+
+def test_large_payloads_are_bounded(tmp_path: Path) -> None:
+    rows = [(number, 1, number, bytes(900_000 if number > 500 else 3)) for number in range(520)]
+    path = database(tmp_path / "a.db3", TOPICS, MESSAGES, TOPIC, rows=rows)
+    with SqliteSource(path) as source:
+        sizes = [len(batch.buffer) for batch in source.batches()]
+    assert sum(sizes) == sum(len(row[3]) for row in rows)  # type: ignore[arg-type]
+    assert max(sizes) < BATCH_BYTES + 900_000
+
+
+def damaged_database(path: Path, break_page: Callable[[int, int], bool]) -> tuple[int, int]:
+    """Writes 2000 rows, then overwrites leaf pages of the messages; (rows, pages)."""
+    rows = [(number, 1, 1000 + number, bytes([number % 256]) * 100) for number in range(1, 2001)]
+    database(path, TOPICS, MESSAGES, TOPIC, rows=rows)
+    data = bytearray(path.read_bytes())
+    leaves = [
+        page for page in range(4096, len(data), 4096) if data[page] == 0x0D and data[page + 4]
+    ]
+    leaves = [page for page in leaves if int.from_bytes(data[page + 3 : page + 5], "big") > 20]
+    broken = [page for number, page in enumerate(leaves) if break_page(number, len(leaves))]
+    lost = 0
+    for page in broken:
+        lost += int.from_bytes(data[page + 3 : page + 5], "big")
+        data[page : page + 200] = b"\xff" * 200
+    path.write_bytes(data)
+    return 2000 - lost, len(broken)
+
+
+@pytest.mark.parametrize(
+    "which",
+    [
+        pytest.param(lambda n, _: n == 10, id="one"),
+        pytest.param(lambda n, _: n in {3, 20, 21, 22, 40}, id="some"),
+        pytest.param(lambda n, _: n == 0, id="first"),
+    ],
+)
+def test_goes_on_behind_damaged_pages(tmp_path: Path, which: Callable[[int, int], bool]) -> None:
+    kept, broken = damaged_database(tmp_path / "a.db3", which)
+    assert broken
+    found, damage = read(tmp_path / "a.db3")
+    assert found.total() == kept
+    assert all(data == bytes([(time - 1000) % 256]) * 100 for _, _, time, data in found)
+    assert sum(each.messages_lost or 0 for each in damage) == 2000 - kept
+    assert all("SQLite" in each.reason for each in damage)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(100, 1 << 18), st.integers(0, 255)), max_size=40))
+def test_random_damage_is_never_fatal(
+    tmp_path_factory: pytest.TempPathFactory, changes: list[tuple[int, int]]
+) -> None:
+    path = tmp_path_factory.mktemp("db") / "a.db3"
+    rows = [(number, 1, 1000 + number, bytes([number % 256]) * 50) for number in range(1, 400)]
+    database(path, TOPICS, MESSAGES, TOPIC, rows=rows)
+    data = bytearray(path.read_bytes())
+    for place, value in changes:
+        data[place % len(data)] = value
+    path.write_bytes(data)
+    try:
+        with open_source(path) as source:
+            assert sum(map(len, source.batches())) <= 1000
+    except SourceError:
+        return
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_cut_anywhere(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    path = tmp_path_factory.mktemp("db") / "a.db3"
+    payloads = {number: bytes([number]) * (number * 211) for number in range(1, 60)}
+    rows = [(number, 1, number, payload) for number, payload in payloads.items()]
+    whole = database(path, TOPICS, MESSAGES, TOPIC, rows=rows).read_bytes()
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    path.write_bytes(whole[:cut])
+    try:
+        source = open_source(path)
+    except SourceError:
+        assert cut < 3 * 4096
+        return
+    with source:
+        for batch in source.batches():
+            for row in range(len(batch)):
+                assert batch.payload(row) == payloads[int(batch.log_time[row])]
+        assert source.damage

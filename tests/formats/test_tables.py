@@ -1,0 +1,482 @@
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import itertools
+import json
+import math
+import random
+import zipfile
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import pyarrow.ipc
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridlog.formats import json_text, jsonl, tables
+from hybridlog.formats.json_text import json_column
+from hybridlog.formats.jsonl import (
+    JsonlWriter,
+    json_line,
+    json_rows,
+    object_line,
+)
+from hybridlog.formats.npz import NpzWriter
+from hybridlog.formats.tables import ArrowWriter, CsvWriter, ParquetWriter
+from hybridlog_storage.errors import UsageError
+
+T = 1_425_407_313_123_456_789
+
+
+def table(rows: int = 3, *, first: int = 0) -> pa.Table:
+    """A table of every kind of column; of no rows too, with all types."""
+    return _table(max(rows, 3), first=first).slice(0, rows)
+
+
+def _table(rows: int, *, first: int) -> pa.Table:
+    numbers = np.arange(first, first + rows)
+    return pa.table(
+        {
+            "log_time": pa.array(T + numbers, pa.timestamp("ns", "UTC")),
+            "x": numbers / 4,
+            "f": pa.array(numbers.astype(np.float32)),
+            "u": pa.array(numbers.astype(np.uint64) + np.uint64(2**63)),
+            "b": numbers % 2 == 0,
+            "s": [f'a"b,{number}\né' for number in numbers],
+            "v": [[0.5] * (number % 3) for number in numbers.tolist()],
+            "m": pa.array([[i, i + 1] for i in numbers.tolist()], pa.list_(pa.int32(), 2)),
+            "names": [["p", "q\0r"][: number % 3] for number in numbers.tolist()],
+            "o": [{"y": number, "w": {"z": [1]}} for number in numbers.tolist()],
+            "d": pa.array(numbers, pa.duration("ns")),
+            "raw": [bytes([number % 256]) * 3 for number in numbers.tolist()],
+        }
+    )
+
+
+def read_parquet(data: bytes) -> pa.Table:
+    return pq.read_table(io.BytesIO(data))
+
+
+def read_arrow(data: bytes) -> pa.Table:
+    return pa.feather.read_table(io.BytesIO(data))
+
+
+WRITERS = [(ParquetWriter, read_parquet), (ArrowWriter, read_arrow)]
+
+
+def written(writer: object, *pieces: pa.Table, **options: object) -> bytes:
+    stream = io.BytesIO()
+    with writer(stream, **options) as out:  # type: ignore[operator]
+        for piece in pieces:
+            out.write(piece)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(("writer", "read"), WRITERS)
+def test_a_table_comes_back(writer: type, read: object) -> None:
+    pieces = [table(100), table(1, first=100), table(0), table(50, first=101)]
+    back = read(written(writer, *pieces))  # type: ignore[operator]
+    assert back.equals(pa.concat_tables(pieces))
+
+
+def test_parquet_is_zstd_and_gathers_pieces(tmp_path: Path) -> None:
+    path = tmp_path / "out.parquet"
+    with ParquetWriter(path) as writer:
+        for first in range(0, 1000, 10):
+            writer.write(table(10, first=first))
+    file = pq.ParquetFile(path)
+    assert file.metadata.num_rows == 1000
+    assert file.metadata.num_row_groups == 1
+    assert file.metadata.row_group(0).column(0).compression == "ZSTD"
+
+
+@pytest.mark.parametrize(("writer", "read"), WRITERS)
+@pytest.mark.parametrize("held", [1 << 20, 0])
+def test_columns_that_come_and_go(writer: type, read: object, held: int) -> None:
+    one = pa.table({"a": pa.array([1], pa.int32()), "b": ["x"]})
+    two = pa.table({"b": ["y"]})
+    turned = pa.table({"b": ["z"], "a": pa.array([3], pa.int64())})
+    back = read(written(writer, one, two, turned, held_bytes=held))  # type: ignore[operator]
+    assert back.to_pylist() == [{"a": 1, "b": "x"}, {"a": None, "b": "y"}, {"a": 3, "b": "z"}]
+
+
+@pytest.mark.parametrize(("writer", "read"), WRITERS)
+def test_columns_that_appear_late(writer: type, read: object) -> None:
+    empty = pa.table({"a": pa.nulls(1)})
+    late = pa.table({"a": [0.5], "c": [1]})
+    back = read(written(writer, empty, late))  # type: ignore[operator]
+    assert back.to_pylist() == [{"a": None, "c": None}, {"a": 0.5, "c": 1}]
+    with pytest.raises(UsageError, match="'c' first appears after 2 rows"):
+        written(writer, pa.table({"a": [1.0, 2.0]}), late, held_bytes=0)
+    schema = pa.schema({"a": pa.float64(), "c": pa.int64()})
+    back = read(written(writer, empty, late, schema=schema))  # type: ignore[operator]
+    assert back.schema.equals(schema)
+
+
+@pytest.mark.parametrize("writer", [ParquetWriter, ArrowWriter, CsvWriter])
+@pytest.mark.parametrize("held", [1 << 20, 0])
+def test_types_that_change(writer: type, held: int) -> None:
+    read = dict(zip([ParquetWriter, ArrowWriter, CsvWriter], READS, strict=True))[writer]
+    for values in (["x", 1.5], [1.5, (1 << 53) + 1], [-1, (1 << 64) - 1], [True, 1]):
+        parts = [
+            pa.table({"a": pa.array([v], pa.uint64() if v == (1 << 64) - 1 else None)})
+            for v in values
+        ]
+        if not held:
+            with pytest.raises(UsageError, match="does not fit"):
+                written(writer, *parts, held_bytes=held)
+            continue
+        found = read(written(writer, *parts, held_bytes=held))
+        assert [json.loads(text) for text in found] == values
+        # Known before, the type is that from the first row on.
+        schema = pa.schema({"a": pa.json_()})
+        found = read(written(writer, *parts, held_bytes=0, schema=schema))
+        assert [json.loads(text) for text in found] == values
+
+
+READS = (
+    lambda data: read_parquet(data)["a"].to_pylist(),
+    lambda data: read_arrow(data)["a"].to_pylist(),
+    lambda data: [row["a"] for row in csv.DictReader(io.StringIO(data.decode(), newline=""))],
+)
+
+
+def test_integers_stay_integers_and_doubles_exact() -> None:
+    parts = [pa.table({"a": [1, (1 << 53) + 1]}), pa.table({"a": pa.nulls(1)})]
+    assert read_parquet(written(ParquetWriter, *parts))["a"].type == pa.int64()
+    parts = [pa.table({"a": [1]}), pa.table({"a": pa.array([(1 << 64) - 1], pa.uint64())})]
+    back = read_parquet(written(ParquetWriter, *parts))["a"]
+    assert back.type == pa.uint64()
+    assert back.to_pylist() == [1, (1 << 64) - 1]
+    parts = [pa.table({"a": [1 << 53]}), pa.table({"a": [0.5]})]
+    assert read_parquet(written(ParquetWriter, *parts))["a"].to_pylist() == [float(1 << 53), 0.5]
+
+
+def test_parquet_has_no_statistics_of_floats() -> None:
+    import pyarrow.parquet as pq
+
+    data = written(
+        ParquetWriter,
+        pa.table(
+            {
+                "a.b": [1.5, math.nan],
+                "i": [1, 2],
+                "l": [[1.5], [math.nan]],
+                "o": [{"f": 1.5, "s": "x"}, {"f": math.nan, "s": "y"}],
+            }
+        ),
+    )
+    group = pq.ParquetFile(io.BytesIO(data)).metadata.row_group(0)
+    columns = [group.column(i) for i in range(group.num_columns)]
+    assert {c.path_in_schema: c.is_stats_set for c in columns} == {
+        "a.b": False,
+        "i": True,
+        "l.list.element": False,
+        "o.f": False,
+        "o.s": True,
+    }
+
+
+@pytest.mark.parametrize("writer", [ParquetWriter, ArrowWriter, CsvWriter, NpzWriter])
+def test_two_columns_of_one_name(writer: type) -> None:
+    twice = pa.Table.from_arrays([pa.array([1]), pa.array([2])], names=["a", "a"])
+    with pytest.raises(UsageError, match="two columns"):
+        written(writer, twice)
+
+
+@pytest.mark.parametrize(("writer", "read"), WRITERS)
+def test_no_rows_and_no_pieces(writer: type, read: object) -> None:
+    assert read(written(writer, table(0))).schema.equals(table(0).schema)  # type: ignore[operator]
+    assert read(written(writer)).num_rows == 0  # type: ignore[operator]
+
+
+def test_parquet_of_messages_without_fields() -> None:
+    empty = pa.table({"t": [1, 2], "e": pa.array([{}, {}], pa.struct([]))})
+    assert read_parquet(written(ParquetWriter, empty)).column("e").to_pylist() == [None, None]
+    nested = pa.table({"e": pa.array([[{}]], pa.list_(pa.struct([])))})
+    with pytest.raises(UsageError, match="as parquet"):
+        written(ParquetWriter, nested)
+
+
+def test_csv() -> None:
+    text = written(CsvWriter, table(3), table(2, first=3)).decode()
+    rows = list(csv.DictReader(io.StringIO(text, newline="")))
+    assert len(rows) == 5
+    expected = table(5).to_pydict()
+    for number, row in enumerate(rows):
+        assert row["log_time"] == f"2015-03-03 18:28:33.{123456789 + number}Z"
+        assert float(row["x"]) == expected["x"][number]
+        assert int(row["u"]) == expected["u"][number]
+        assert row["b"] == str(expected["b"][number]).lower()
+        assert row["s"] == expected["s"][number]
+        assert json.loads(row["v"]) == expected["v"][number]
+        assert json.loads(row["m"]) == expected["m"][number]
+        assert json.loads(row["names"]) == expected["names"][number]
+        assert json.loads(row["o"]) == expected["o"][number]
+        assert row["d"] == str(number)
+        assert base64.b64decode(row["raw"]) == expected["raw"][number]
+
+
+def test_csv_nulls_and_nothing() -> None:
+    odd = pa.table(
+        {"a": [None, 1], "v": [None, [1, None]], "n": pa.nulls(2), "s": pa.array(["", None])}
+    )
+    assert written(CsvWriter, odd) == b'"a","v","n","s"\n,,,""\n1,"[1, null]",,\n'
+    assert written(CsvWriter) == b""
+    assert written(CsvWriter, pa.table({"a": pa.array([], pa.int64())})) == b'"a"\n'
+    words = pa.table({"c": pa.array(["a", "b", "a"]).dictionary_encode()})
+    assert written(CsvWriter, words) == b'"c"\n"a"\n"b"\n"a"\n'
+
+
+leaf = st.none() | st.integers(-(2**63), 2**63 - 1)
+words = st.text(st.characters(exclude_categories=["Cs"]), max_size=5)
+nested = st.fixed_dictionaries(
+    {
+        "i": leaf,
+        "f": st.none() | st.floats(),
+        "s": st.none() | words,
+        "b": st.none() | st.booleans(),
+        "v": st.none() | st.lists(st.none() | st.floats(width=32), max_size=3),
+        "o": st.none()
+        | st.fixed_dictionaries(
+            {'k"': leaf, "l": st.lists(st.lists(words, max_size=2), max_size=2)}
+        ),
+    }
+)
+SCHEMA = pa.struct(
+    {
+        "i": pa.int64(),
+        "f": pa.float64(),
+        "s": pa.string(),
+        "b": pa.bool_(),
+        "v": pa.list_(pa.float32()),
+        "o": pa.struct({'k"': pa.int64(), "l": pa.list_(pa.list_(pa.string()))}),
+    }
+)
+
+
+def without_nan(value: object) -> object:
+    if isinstance(value, float):
+        words = {math.inf: "Infinity", -math.inf: "-Infinity"}
+        return "NaN" if math.isnan(value) else words.get(value, value)
+    if isinstance(value, dict):
+        return {key: without_nan(item) for key, item in value.items()}
+    return [without_nan(item) for item in value] if isinstance(value, list) else value
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(nested, max_size=6), st.integers(0, 3))
+def test_json_text_is_what_json_reads(rows: list[dict[str, object]], cut: int) -> None:
+    array = pa.array(rows, SCHEMA).slice(cut)
+    expected = [without_nan(row) for row in rows[cut:]]
+    texts = json_column(array).to_pylist()
+    for text, want in zip(texts, expected, strict=True):
+        assert text is not None
+        read = json.loads(text)
+        # Single precision is spelled with its own shortest digits.
+        for found, wanted in ((read, want),):
+            assert isinstance(wanted, dict)
+            for got, value in zip(found.pop("v") or [], wanted.pop("v") or [], strict=True):
+                if isinstance(got, float) and isinstance(value, float):
+                    assert np.float32(got) == np.float32(value)
+                else:
+                    assert got == value
+        assert read == want
+
+
+def test_jsonl() -> None:
+    stream = io.BytesIO()
+    rows = [
+        {"nan": math.nan, "deep": [{"inf": -math.inf, "ok": 1}], "tuple": (math.nan,)},
+        {"big": 2**64 - 1, "i": np.int64(2**63 - 1), "f": np.float32(0.5), "n": np.float64("nan")},
+        {"a": np.array([1, 2]), "m": np.array([[1.0, math.nan]]), "b": np.bool_(True)},
+        {"bytes": b"abc", "view": memoryview(b"abcd"), "s": "é\ud800\n", "none": None},
+        {"t": datetime(2015, 3, 3, tzinfo=UTC), "d": timedelta(seconds=1.5)},
+        {"t64": np.datetime64(T, "ns"), "set": frozenset([1])},
+    ]
+    with JsonlWriter(stream) as writer:
+        writer.write(map(json_line, rows))
+    lines = stream.getvalue().decode().splitlines()
+    assert [json.loads(line, parse_constant=pytest.fail) for line in lines] == [
+        {"nan": "NaN", "deep": [{"inf": "-Infinity", "ok": 1}], "tuple": ["NaN"]},
+        {"big": 2**64 - 1, "i": 2**63 - 1, "f": 0.5, "n": "NaN"},
+        {"a": [1, 2], "m": [[1.0, "NaN"]], "b": True},
+        {"bytes": "YWJj", "view": "YWJjZA==", "s": "é\ud800\n", "none": None},
+        {"t": "2015-03-03T00:00:00+00:00", "d": 1.5},
+        {"t64": T, "set": [1]},
+    ]
+
+
+def test_jsonl_refuses() -> None:
+    deep: object = 1
+    for _ in range(100_000):
+        deep = [deep]
+    for value in (object(), 1j, deep, [math.nan, deep]):
+        with pytest.raises(UsageError), JsonlWriter(io.BytesIO()) as writer:
+            writer.write([json_line({"a": value})])
+
+
+def test_lines_that_are_made_already() -> None:
+    stream = io.BytesIO()
+    plain = table(10).drop_columns(["log_time", "d", "raw"])
+    with JsonlWriter(stream) as writer:
+        writer.write(json_column(plain.to_struct_array().combine_chunks()).to_pylist())
+    found = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert found == plain.to_pylist()
+    assert found[3]["u"] == 2**63 + 3
+
+
+def load(data: bytes) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def test_npz() -> None:
+    pieces = [table(7), table(0), table(5, first=7)]
+    whole = pa.concat_tables(pieces)
+    data = written(NpzWriter, *pieces)
+    arrays = load(data)
+    assert set(arrays) == {
+        *("log_time", "x", "f", "u", "b", "s", "v.values", "v.offsets", "m", "d"),
+        *("names.values.values", "names.values.offsets", "names.offsets"),
+        *("o.y", "o.w.z.values", "o.w.z.offsets", "raw.values", "raw.offsets"),
+    }
+    assert arrays["log_time"].dtype == "datetime64[ns]"
+    assert arrays["log_time"].astype(np.int64).tolist() == list(range(T, T + 12))
+    for name in ("x", "f", "u", "b"):
+        assert arrays[name].dtype == whole.column(name).type.to_pandas_dtype()
+        assert arrays[name].tolist() == whole.column(name).to_pylist()
+    assert arrays["s"].tolist() == whole.column("s").to_pylist()
+    assert arrays["m"].shape == (12, 2)
+    assert arrays["m"].tolist() == whole.column("m").to_pylist()
+    ends = arrays["v.offsets"]
+    assert [arrays["v.values"][a:b].tolist() for a, b in itertools.pairwise(ends)] == (
+        whole.column("v").to_pylist()
+    )
+    bounds, letters = arrays["names.values.offsets"], arrays["names.values.values"].tobytes()
+    names = [letters[a:b].decode() for a, b in itertools.pairwise(bounds)]
+    ends = arrays["names.offsets"]
+    assert [names[a:b] for a, b in itertools.pairwise(ends)] == (whole.column("names").to_pylist())
+    assert arrays["o.y"].tolist() == list(range(12))
+    assert written(NpzWriter, *pieces) == data
+
+
+def test_npz_nulls_and_late_columns() -> None:
+    arrays = load(
+        written(
+            NpzWriter,
+            pa.table({"a": [1, None], "z": pa.nulls(2)}),
+            pa.table(
+                {
+                    "late": [0.5],
+                    "z": ["x"],
+                    "m": pa.array([[1.0, None]], pa.list_(pa.float64(), 2)),
+                    "t": pa.array([5], pa.timestamp("us")),
+                    "o": [{"y": [1]}],
+                }
+            ),
+            pa.table(
+                {
+                    "a": [3],
+                    "m": pa.array([None], pa.list_(pa.float64(), 2)),
+                    "o": pa.array([None], pa.struct({"y": pa.list_(pa.int64())})),
+                }
+            ),
+        )
+    )
+    assert arrays["a"].tolist() == [1, 0, 0, 3]
+    assert arrays["a.valid"].tolist() == [True, False, False, True]
+    assert arrays["z"].tolist() == ["", "", "x", ""]
+    assert arrays["late"].tolist()[2] == 0.5
+    assert np.isnan(arrays["late"][[0, 1, 3]]).all()
+    assert arrays["m"].shape == (4, 2)
+    assert arrays["m"][2, 0] == 1.0
+    assert np.isnan(arrays["m"]).sum() == 7
+    assert np.isnat(arrays["t"]).tolist() == [True, True, False, True]
+    assert arrays["t"][2] == np.datetime64(5, "us")
+    assert arrays["o.y.offsets"].tolist() == [0, 0, 0, 1, 1]
+
+
+def test_npz_strings() -> None:
+    arrays = load(
+        written(
+            NpzWriter,
+            pa.table({"long": ["x" * 300, "é"], "nul": ["a\0", "b"], "short": ["é" * 256, ""]}),
+        )
+    )
+    assert arrays["long.values"].tobytes().decode() == "x" * 300 + "é"
+    assert arrays["long.offsets"].tolist() == [0, 300, 302]
+    assert arrays["nul.values"].tobytes() == b"a\0b"
+    assert arrays["short"].tolist() == ["é" * 256, ""]
+
+
+def test_npz_of_slices_and_other_types() -> None:
+    whole = table(20)
+    assert np.array_equal(
+        load(written(NpzWriter, whole.slice(5, 9)))["names.values.values"],
+        load(written(NpzWriter, pa.Table.from_pylist(whole.slice(5, 9).to_pylist(), whole.schema)))[
+            "names.values.values"
+        ],
+    )
+    words = pa.table({"c": pa.array(["a", "b", "a"]).dictionary_encode()})
+    assert load(written(NpzWriter, words))["c"].tolist() == ["a", "b", "a"]
+    with pytest.raises(UsageError, match="does not fit"):
+        written(NpzWriter, pa.table({"a": [1]}), pa.table({"a": ["x"]}))
+    with pytest.raises(UsageError, match="numpy does not have"):
+        written(
+            NpzWriter, pa.table({"a": pa.array([[("k", 1)]], pa.map_(pa.string(), pa.int64()))})
+        )
+    assert load(written(NpzWriter)) == {}
+
+
+def test_npz_names_stay_in_their_place() -> None:
+    names = ["../../x", "..\\y", "a/b", "a_b", "v", "v.values", "n\0", ""]
+    columns = [pa.array([[1]]) if name == "v" else pa.array([1]) for name in names]
+    data = written(NpzWriter, pa.Table.from_arrays(columns, names=names))
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.namelist()
+    assert len(set(entries)) == len(entries) == len(names) + 1
+    assert not any("/" in entry or "\\" in entry for entry in entries)
+
+
+def test_long_rows_in_pieces_are_the_same_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = random.Random(0)
+    rows = [
+        {
+            "s": rng.choice(["a", 'b"c', "é,\n", None, "", "x" * 40]),
+            "l": rng.choice([None, [], [rng.random() for _ in range(rng.choice([1, 50]))]]),
+            "n": rng.choice([None, 1, 2]),
+            "b": rng.choice([None, b"xyz" * 5, b"", b"1234"]),
+            "m": [{"x": rng.choice([1.5, math.nan]), "q": ['"', "z"] * rng.choice([0, 3])}]
+            * rng.choice([0, 1, 9]),
+            "d": {"k": rng.choice([None, True]), "t": [1] * 3},
+        }
+        for _ in range(100)
+    ]
+    table = pa.Table.from_pylist(rows)
+    records = table.to_struct_array().combine_chunks()
+
+    def written() -> tuple[bytes, bytes]:
+        csv, lines = io.BytesIO(), io.BytesIO()
+        with CsvWriter(csv) as writer:
+            writer.write(table)
+        with JsonlWriter(lines) as jsonl_writer:
+            jsonl_writer.write(json_rows(records))
+        return csv.getvalue(), lines.getvalue()
+
+    whole = written()
+    for module in (tables, jsonl):
+        monkeypatch.setattr(module, "rows_within", lambda *_: 1)
+    for size in (3, 30, 300):
+        monkeypatch.setattr(json_text, "PIECE_BYTES", size)
+        monkeypatch.setattr(tables, "PIECE_BYTES", size)
+        assert written() == whole
+    long = {"a": [1, math.nan, "é"] * 3000, "b": [], "c": {"d": [None] * 5000}, "e": 2**70}
+    assert "".join(object_line(long)) == json_line(long)

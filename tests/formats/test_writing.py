@@ -1,0 +1,390 @@
+from __future__ import annotations
+
+import errno
+import gc
+import io
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+
+import pyarrow as pa
+import pytest
+
+import hybridlog.formats
+from hybridlog.formats import OUTPUTS, formats_of
+from hybridlog.formats.writing import Sink
+from hybridlog_storage.disk import unfinished
+from hybridlog_storage.disk.unfinished import (
+    beside,
+    is_published,
+    scratch_directory,
+    undo_unfinished,
+    undone,
+)
+from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from tests.formats.batches import many, ros1_channels
+
+WRITERS = formats_of("lines", "table", "log", "payloads")
+TABLE = pa.table({"x": [1.0, 2.0], "name": ["a", "b"], "v": [[1, 2], []]})
+
+
+def fill(name: str, target: object, times: int = 1, messages: int = 300) -> object:
+    """A writer of any format with something in it."""
+    writer = OUTPUTS[name].open(target)  # type: ignore[arg-type]
+    for _ in range(times):
+        if OUTPUTS[name].content == "table":
+            writer.write(TABLE)
+        elif OUTPUTS[name].content == "lines":
+            writer.write(['{"x": 1}'] * 100)
+        else:
+            writer.write(many(messages), ros1_channels())
+    return writer  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_nothing_is_there_before_close_and_nothing_stays_after_abort(
+    name: str, tmp_path: Path
+) -> None:
+    target = tmp_path / "out"
+    writer = fill(name, target)
+    assert not target.exists()
+    writer.abort()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+    writer.abort()  # type: ignore[attr-defined]
+    writer.close()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_close_leaves_only_the_target(name: str, tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    writer = fill(name, target)
+    writer.close()  # type: ignore[attr-defined]
+    writer.close()  # type: ignore[attr-defined]
+    writer.abort()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_exception_in_the_block_aborts(name: str, tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    if name != "raw":
+        target.write_bytes(b"what was there")
+    with pytest.raises(KeyError), fill(name, target):  # type: ignore[attr-defined]
+        raise KeyError
+    if name == "raw":
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert target.read_bytes() == b"what was there"
+        assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "raw"])
+def test_a_full_disk(name: str) -> None:
+    with pytest.raises(DiskFullError, match="no space left"):
+        fill(name, "/dev/full").close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_disk_that_fills_up_at_the_end(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    writer = fill(name, tmp_path / "out")
+    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "sync", full)
+    with pytest.raises(DiskFullError):
+        writer.close()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "raw"])
+def test_a_stream_gets_the_same_bytes(name: str, tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    fill(name, stream).close()  # type: ignore[attr-defined]
+    fill(name, tmp_path / "out").close()  # type: ignore[attr-defined]
+    assert stream.getvalue() == (tmp_path / "out").read_bytes()
+    assert not stream.closed
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_wrong_places(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no directory|No such file"):
+        fill(name, tmp_path / "missing" / "out")
+    (tmp_path / "dir" / "inner").mkdir(parents=True)
+    with pytest.raises(UsageError, match=r"is a directory|not empty"):
+        fill(name, tmp_path / "dir")
+    with pytest.raises(UsageError, match=r"[Tt]oo long"):
+        fill(name, tmp_path / ("x" * 300)).close()  # type: ignore[attr-defined]
+    assert list(tmp_path.iterdir()) == [tmp_path / "dir"]
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real" / "file")
+    sink = Sink(tmp_path / "link")
+    sink.write(b"abc")
+    sink.commit()
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "file").read_bytes() == b"abc"
+
+
+def test_a_pipe_is_written_not_replaced(tmp_path: Path) -> None:
+    fifo = tmp_path / "pipe"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    sink = Sink(fifo)
+    sink.write(b"abc")
+    sink.commit()
+    assert os.read(reader, 100) == b"abc"
+    os.close(reader)
+    assert stat.S_ISFIFO(fifo.stat().st_mode)
+
+
+def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        sink = Sink(tmp_path / "out")
+        sink.commit()
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == 0o640
+
+
+def test_a_broken_pipe_stays_one() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    stream = open(write, "wb", buffering=0)  # noqa: PTH123, SIM115
+    with pytest.raises(BrokenPipeError):
+        Sink(stream).write(b"x")
+    stream.close()
+
+
+def test_other_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    sink = Sink(tmp_path / "out")
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(HybridlogError, match="Input/output"):
+        sink.commit()
+    sink.abort()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_table_of_formats_loads_no_library() -> None:
+    code = (
+        "import sys, hybridlog.formats, hybridlog.query.times, hybridlog.query.topics, "
+        "hybridlog.query.predicate.parser, hybridlog.query.predicate.from_mongo; "
+        "print(sorted({'pyarrow', 'pandas', 'rosbags', 'mcap', 'pymongo', 'numpy', 're2'} "
+        "& set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", ["parquet", "arrow", "csv", "npz", "mcap"])
+def test_an_aborted_stream_has_no_end(name: str) -> None:
+    stream = io.BytesIO()
+    writer = fill(name, stream)
+    before = stream.getvalue()
+    writer.abort()  # type: ignore[attr-defined]
+    del writer
+    gc.collect()
+    assert stream.getvalue() == before
+
+
+def write_whole(name: str, target: Path) -> None:
+    """What a command does: whoever began it holds nothing when it is interrupted."""
+    try:
+        with fill(name, target, messages=5):  # type: ignore[attr-defined]
+            pass
+    except BaseException:
+        undo_unfinished()
+        raise
+
+
+def write_alone(name: str, target: Path) -> None:
+    """What a script does."""
+    with fill(name, target, messages=5):  # type: ignore[attr-defined]
+        pass
+
+
+class Interruption:
+    """Ctrl-C at one instant: before the n-th step of the export modules and of the caller.
+
+    A step is a bytecode there, and the call of any function from there.
+
+    Args:
+        at: Number of the step, from 1; 0 for none.
+    """
+
+    OURS = (str(Path(hybridlog.formats.__file__).parent), unfinished.__file__)
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+        self.steps = 0
+
+    def __call__(self, frame: FrameType, event: str, arg: object) -> object:
+        code = frame.f_code
+        ours = code.co_filename.startswith(self.OURS)
+        if not ours and code not in {write_whole.__code__, write_alone.__code__}:
+            caller = frame.f_back
+            if caller is not None and caller.f_code.co_filename.startswith(self.OURS):
+                self._step()
+            return None
+        frame.f_trace_opcodes = True
+        self._step()
+        return self._within
+
+    def _within(self, frame: FrameType, event: str, arg: object) -> object:
+        if event == "opcode":
+            self._step()
+        return self._within
+
+    def _step(self) -> None:
+        self.steps += 1
+        if self.steps == self.at:
+            raise KeyboardInterrupt
+
+
+def interrupted(at: int, write: Callable[[str, Path], None], name: str, target: Path) -> int:
+    """Write with an interruption; returns how many steps were done."""
+    interruption = Interruption(at)
+    before = sys.gettrace()
+    try:
+        sys.settrace(interruption)  # type: ignore[arg-type]
+        write(name, target)
+    except BaseException:
+        # Libraries may make another error of it; what counts is what they leave.
+        assert at > 0
+    finally:
+        sys.settrace(before)
+    return interruption.steps
+
+
+# Files that nobody could close are closed by the collector, which warns.
+UNCLOSED = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+@UNCLOSED
+@pytest.mark.parametrize("write", [write_whole, write_alone])
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
+    name: str,
+    write: Callable[[str, Path], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    (tmp_path / "whole").mkdir()
+    for time in range(2):  # what is done once only, such as imports, is not counted
+        target = tmp_path / "whole" / f"out{time}"
+        steps = interrupted(0, write, name, target)
+    whole = contents(target)
+    outcomes = set()
+    for at in range(1, steps + 1, max(1, steps // 500)):
+        place = tmp_path / str(at)
+        place.mkdir()
+        interrupted(at, write, name, place / "out")
+        left = [path.name for path in place.iterdir()]
+        assert left in ([], ["out"]), at
+        assert list(scratch.iterdir()) == [], at
+        if left:
+            assert contents(place / "out") == whole, at
+        outcomes.add(len(left))
+    assert outcomes == {0, 1}
+    gc.collect()
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """The bytes of a file, or of all files in a directory."""
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+@UNCLOSED
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_writer_that_is_let_go_leaves_nothing(name: str, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    writer = fill(name, tmp_path / "in" / "out")
+    del writer
+    gc.collect()
+    assert list((tmp_path / "in").iterdir()) == []
+
+
+def test_what_is_unfinished_goes_at_the_end_of_the_process(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from hybridlog.formats.writing import Sink; "
+        "sink = Sink(sys.argv[1]); sink.flush(); print(len(list(Path(sys.argv[2]).iterdir())))"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "out"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "1\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_child_process_removes_nothing_of_its_parent(tmp_path: Path) -> None:
+    file, directory = beside(tmp_path / "out"), beside(tmp_path / "dir")
+    file.path.touch()
+    directory.path.mkdir()
+    (directory.path / "inner").touch()
+    child = os.fork()
+    if not child:
+        try:
+            undo_unfinished()
+            file.remove()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 2
+    undo_unfinished()
+    assert list(tmp_path.iterdir()) == []
+    file.path.touch()  # another's by now
+    file.remove()
+    assert list(tmp_path.iterdir()) == [file.path]
+
+
+def test_what_was_done_is_undone_when_the_process_is_stopped_or_the_work_fails() -> None:
+    done: list[str] = []
+    with undone(lambda: done.append("over")):
+        pass
+    with suppress(ValueError), undone(lambda: done.append("failed")):
+        raise ValueError
+    with undone(lambda: done.append("outer")), undone(lambda: done.append("inner")):
+        child = os.fork()
+        if not child:
+            undo_unfinished()
+            os._exit(len(done) - 1)
+        assert os.waitpid(child, 0)[1] == 0
+        undo_unfinished()
+    undo_unfinished()
+    assert done == ["failed", "inner", "outer"]
+
+
+def test_a_file_is_published_once_it_has_its_name(tmp_path: Path) -> None:
+    place = beside(tmp_path / "x")
+    place.path.touch()
+    assert not is_published(tmp_path / "x")
+    place.publish(tmp_path / "x")
+    assert is_published(tmp_path / "x")
+
+
+def test_a_scratch_directory_is_private(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    place = scratch_directory()
+    assert stat.S_IMODE(place.path.stat().st_mode) == 0o700
+    place.remove()
+    assert list(tmp_path.iterdir()) == []
