@@ -560,14 +560,17 @@ MARKED = "tests/test_repair.py::test_a_mark_beside_a_lost_segment_takes_nothing_
 
 MAINTENANCE = [
     *_of(
-        "hybridlog/columns/payload_writer.py",
+        "hybridlog/columns/parquet_file.py",
         (
             "late-row-groups-are-in-order",
-            "file.last < first and order_of(time, seq) is None",
-            "order_of(time, seq) is None",
+            "and is_later and order_of(time, seq) is None",
+            "and order_of(time, seq) is None",
             LATE,
         ),
-        ("columns-are-not-synced", "close(about, sync=True)", "close(about)", POWER),
+    ),
+    *_of(
+        "hybridlog/columns/payload_writer.py",
+        ("columns-are-not-synced", "payloads=payloads, sync=True)", "payloads=payloads)", POWER),
     ),
     *_of(
         "hybridlog/columns/payload_files.py",

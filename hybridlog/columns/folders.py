@@ -30,7 +30,6 @@ from hybridlog.columns.layout import (
     SHARED,
     SUFFIX,
     TABLES,
-    About,
     Section,
     is_of_folder,
     parts_folder,
@@ -324,7 +323,7 @@ class TableFolders:
         )
         try:
             writer.write(table)
-            writer.close(About(sections, ((table.num_rows, 0, 0, 0, 0),)), sync=True)
+            writer.close(sections, sync=True)
         except BaseException:
             writer.discard()
             raise

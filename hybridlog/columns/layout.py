@@ -254,7 +254,7 @@ class About:
     Attributes:
         recordings: The recordings with rows in the file, in its order.
         bounds: For each row group: its rows, then log time and arrival number of its first and
-            last row. The keys are zeros in a file of several topics.
+            last row. The keys are zeros in a file of several topics or recordings.
         span: First byte of the row groups, and the one after their end.
         body: Bytes before the footer.
         checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.

@@ -14,7 +14,6 @@ import re
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -24,11 +23,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hybridlog.columns.fields import has_summaries, original_name
-from hybridlog.columns.layout import ABOUT, IN_TYPE, OWN, OWN_COLUMNS, About
+from hybridlog.columns.layout import ABOUT, IN_TYPE, OWN, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
+from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
@@ -99,6 +99,9 @@ class ParquetFileWriter:
         in_front: bool = False,
     ) -> None:
         self.path = path
+        self.is_ordered = True
+        """True if rows are in order of time and arrival."""
+        self._bounds: list[tuple[int, int, int, int, int]] = []
         self._depth = depth
         self._sink = _Sink(path, depth)
         kinds = {leaf.path: leaf.kind for leaf in leaves(sample.schema)}
@@ -138,12 +141,24 @@ class ParquetFileWriter:
             OSError: the row group cannot be written.
         """
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
+        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
+        first, last = ((int(time[row]), int(seq[row])) if len(time) else (0, 0) for row in (0, -1))
+        is_later = not self._bounds or self._bounds[-1][3:] < first
+        self.is_ordered = self.is_ordered and is_later and order_of(time, seq) is None
+        self._bounds.append((len(time), *first, *last))
 
-    def close(self, about: About, *, sync: bool = False) -> tuple[int, str]:
+    def close(
+        self,
+        sections: Sequence[Section],
+        *,
+        payloads: Mapping[str, Any] | None = None,
+        sync: bool = False,
+    ) -> tuple[int, str]:
         """Finish the file.
 
         Args:
-            about: The description of the file, without `body` and `checksums`.
+            sections: The recordings with rows in it, in its order.
+            payloads: What a file of payloads needs besides.
             sync: True to force it to the disk.
 
         Returns:
@@ -161,7 +176,12 @@ class ParquetFileWriter:
                     raise NoRoomError
                 self._put(self._behind)
             body, checksums = self._sink.end_body()
-            about = replace(about, span=span, body=body, checksums=checksums)
+            # Keys of rows of several topics are no bounds.
+            is_one = sum(len(section.topics) for section in sections) == 1
+            bounds = self._bounds if is_one else [(one[0], 0, 0, 0, 0) for one in self._bounds]
+            about = About(
+                sections, tuple(bounds), span, body, checksums, payloads=dict(payloads or {})
+            )
             self._writer.add_key_value_metadata(
                 {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
             )

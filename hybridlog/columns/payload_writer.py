@@ -11,7 +11,6 @@ import pyarrow as pa
 from hybridlog.columns.encodings import LEVEL, encodings_of
 from hybridlog.columns.layout import (
     IN_PAYLOADS,
-    About,
     Section,
     TopicCounts,
     payload_file,
@@ -23,7 +22,6 @@ from hybridlog.columns.payload_rows import TopicColumns, field_of, rows_of, valu
 from hybridlog.columns.zones import Zone
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.journal import PayloadFile
-from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,10 +48,7 @@ class _OpenFile:
         size: Bytes of all its messages.
         zones: For each row group, the zone of each array, by path.
         chunks: For each row group, segment, number and rows of each chunk in it.
-        bounds: See `About`.
-        segments: See `About`.
-        last: Time and arrival number of the last row.
-        is_ordered: True if rows are in order of time and arrival.
+        segments: Digests of its segments, by number.
     """
 
     name: str
@@ -64,10 +59,7 @@ class _OpenFile:
     pending: list[list[int]] = field(default_factory=list)
     chunks: list[list[list[int]]] = field(default_factory=list)
     zones: list[dict[str, list[Any]]] = field(default_factory=list)
-    bounds: list[tuple[int, int, int, int, int]] = field(default_factory=list)
     segments: dict[str, str] = field(default_factory=dict)
-    last: tuple[int, int] = (-(1 << 63), -1)
-    is_ordered: bool = True
     rows: int = 0
 
 
@@ -149,14 +141,9 @@ class TopicWriter:
             file.writer.write(table)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
-        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
-        first, last = (int(time[0]), int(seq[0])), (int(time[-1]), int(seq[-1]))
-        file.is_ordered &= file.last < first and order_of(time, seq) is None
-        file.last = last
-        file.bounds.append((len(time), *first, *last))
         file.chunks.append(file.pending)
         file.zones.append(self._zones(table))
-        file.rows += len(time)
+        file.rows += table.num_rows
         file.tables, file.pending, file.waiting = [], [], 0
 
     def _zones(self, table: pa.Table) -> dict[str, list[Any]]:
@@ -175,17 +162,12 @@ class TopicWriter:
             "layout": layout.to_json() if layout is not None else None,
             "chunks": file.chunks,
             "zones": file.zones,
-            "is_ordered": file.is_ordered,
+            "is_ordered": file.writer.is_ordered,
         }
         topics = {self._channel.topic: TopicCounts(file.rows)}
-        path = self._folder / file.name
+        section = Section(self._recording, 0, file.segments, topics)
         try:
-            about = About(
-                [Section(self._recording, 0, file.segments, topics)],
-                bounds=tuple(file.bounds),
-                payloads=payloads,
-            )
-            size, digest = file.writer.close(about, sync=True)
+            size, digest = file.writer.close([section], payloads=payloads, sync=True)
         except OSError as error:
-            raise durability.explain(error, path, "writing") from error
+            raise durability.explain(error, file.writer.path, "writing") from error
         self.written.append(PayloadFile(file.name, size, digest, self._channel.topic, file.rows))

@@ -26,7 +26,6 @@ import numpy as np
 from hybridlog.columns.layout import (
     IN_PARTS,
     SUFFIX,
-    About,
     Section,
     TopicCounts,
     parts_folder,
@@ -194,7 +193,6 @@ class _File:
         self._topic = topic
         self._segments: set[int] = set()
         self._counts = TopicCounts(0)
-        self._bounds: list[tuple[int, int, int, int, int]] = []
         self._has_publish_time = has_publish_time
         self._writer: ParquetFileWriter | None = None
 
@@ -219,13 +217,9 @@ class _File:
             )
         elif table.schema != self.schema:
             table = self._fitting(table)
-        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
         step = _rows_of_group(table)
         for begin in range(0, table.num_rows, step):
-            end = min(begin + step, table.num_rows)
-            self._writer.write(table.slice(begin, end - begin))
-            first, last = ((int(time[row]), int(seq[row])) for row in (begin, end - 1))
-            self._bounds.append((end - begin, *first, *last))
+            self._writer.write(table.slice(begin, step))
         self._segments.update(piece.segment for piece in pieces)
         self._counts = self._counts.plus(_counts(pieces))
 
@@ -246,7 +240,7 @@ class _File:
         assert self._writer is not None
         segments = {str(number): digests[number] for number in sorted(self._segments)}
         section = Section(self._topic.recording, 0, segments, {self._topic.name: self._counts})
-        self._writer.close(About([section], tuple(self._bounds)))
+        self._writer.close([section])
 
     def discard(self) -> None:
         """Delete the unfinished file."""

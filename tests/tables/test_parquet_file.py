@@ -34,19 +34,24 @@ def table() -> pa.Table:
         names=["x", "list"],
     )
     return pa.table(
-        {"t": np.arange(ROWS), "x": dice.random(ROWS), "point": point, "text": ["a"] * ROWS}
+        {
+            "t": np.arange(ROWS),
+            "x": dice.random(ROWS),
+            "point": point,
+            "text": ["a"] * ROWS,
+            "seq": np.arange(ROWS),
+        }
     )
 
 
-def write(path: Path, table: pa.Table, groups: int = 2, **about: str) -> About:
+def write(path: Path, table: pa.Table, groups: int = 2, **about: str) -> Section:
     rows = table.num_rows
     writer = ParquetFileWriter(path, table, depth=1)
     for _ in range(groups):
         writer.write(table)
     section = Section("id", 0, {"0": about.get("digest", "d")}, {"/a": TopicCounts(rows * groups)})
-    said = About([section], ((rows, 0, 0, rows - 1, 1),) * groups)
-    writer.close(said)
-    return said
+    writer.close([section])
+    return section
 
 
 @pytest.fixture
@@ -68,11 +73,11 @@ def test_a_discarded_file_is_let_go_in_silence(path: Path, table: pa.Table) -> N
 def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
     said = write(path, table)
     reader = ParquetFileReader(path)
-    assert reader.about.recordings == said.recordings
+    assert reader.about.recordings == [said]
     assert reader.groups == 2
     names = [leaf.names for leaf in leaves(reader.schema)]
-    assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",)]
-    assert reader.read(1, [0, 1, 2, 3, 4]).equals(table)
+    assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",), ("seq",)]
+    assert reader.read(1, [0, 1, 2, 3, 4, 5]).equals(table)
     some = reader.read(0, [1, 3])
     assert some.column("x").equals(table.column("x"))
     assert some.schema.field("point").type.num_fields == 1
@@ -155,6 +160,7 @@ def test_no_float_has_statistics(path: Path, table: pa.Table) -> None:
         "point.x": False,
         "point.list.list.element": True,
         "text": True,
+        "seq": True,
     }
 
 
@@ -163,12 +169,14 @@ def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
     kept, before = None, None
     sizes = []
     for number in range(1, 12):
-        table = pa.table({"x": np.random.default_rng(number).random(1000 * number)})
+        rows = np.arange(1000 * number)
+        numbers = np.random.default_rng(number).random(len(rows))
+        table = pa.table({"x": numbers, "t": rows, "seq": rows})
         in_front = kept is not None and len(kept.data) * 1.3 < kept.offset
         writer = ParquetFileWriter(path, table, depth=1, kept=kept, in_front=in_front)
         writer.write(table)
         section = Section("id", 0, {}, {"/a": TopicCounts(table.num_rows)})
-        writer.close(About([section], ((table.num_rows, 0, 0, 0, 0),)))
+        writer.close([section])
         assert pq.read_table(path).equals(table)
         if before is not None:
             metadata, old = before
