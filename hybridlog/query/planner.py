@@ -269,7 +269,8 @@ class Planner:
         if engine is not self._tables:
             return False
         try:
-            self._tables.check(part)
+            if part.predicate is not None:
+                self._tables.check(part)
         except _RETRIED:
             return False
         return True

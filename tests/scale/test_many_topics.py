@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.query.answers import field_statistics
 from tests.scale.cost import cost_of
 
 START = 1_577_836_800 * 10**9
@@ -54,3 +56,25 @@ def test_a_condition_on_another_topic_reads_each_chunk_once(stores: dict[int, Pa
             costs[count] = cost_of(store, store.all_topics().during(query.question.during).count)
             assert costs[count].bytes_read <= size
     assert costs[MANY].counts == costs[FEW].counts
+
+
+def test_statistics_of_many_topics_are_planned_together(
+    stores: dict[int, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned: list[int] = []
+    real = field_statistics.Planner
+
+    def seen(*arguments: Any) -> Any:
+        planned[-1] += 1
+        return real(*arguments)
+
+    monkeypatch.setattr(field_statistics, "Planner", seen)
+    for count, path in stores.items():
+        planned.append(0)
+        with hl.open(path) as store:
+            found = store.all_topics().stats()
+        assert [(one.topic, one.field) for one in found] == [
+            (topic, "data") for topic in sorted(f"/s{n}" for n in range(count))
+        ]
+        assert {(one.count, one.min, one.max) for one in found} == {(MESSAGES, 0, MESSAGES - 1)}
+    assert planned[0] == planned[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from hybridlog.query.question import Question
+    from hybridlog.query.question import Part, Question
     from hybridlog.session import Session
 
 
@@ -117,9 +118,16 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
     """Statistics of numeric fields; see `Query.stats`."""
     if not question.returns_all or question.reverse:
         raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
+    counted = Counters()
+    planner = Planner(session, question, counted)
+    in_tables = _of_tables(planner) if question.fields is None else {}
+    counters.add(counted)
     recordings = [row.summary.id for row in RangeResolver(session, question).resolve()]
     found = []
     for topic in question.topics:
+        if topic in in_tables:
+            found += [values.result(topic, name) for name, values in in_tables[topic].items()]
+            continue
         one = replace(question, topics=(topic,))
         known = session.field_types((topic,), question.recordings)
         if question.fields is None and known is not None:
@@ -138,6 +146,35 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         found += [values.result(topic, name) for name, values in running.items()]
     if question.fields is not None and not found:
         raise UsageError(f"{', '.join(question.fields)}: no field with numbers.")
+    return found
+
+
+def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
+    """Statistics of the topics whose fields stand in tables, planned together."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    by_topic: dict[str, list[Part]] = defaultdict(list)
+    for part in planner.parts():
+        by_topic[part.topic].append(part)
+    found: dict[str, dict[str, _Running]] = {}
+    for topic, parts in by_topic.items():
+        types = parts[0].field_types or {}
+        fields = [path for path, kind in types.items() if kind in NUMBERS]
+        if not fields or not all(
+            part.field_types == types
+            and not any(channel.is_reduced for channel in part.channels)
+            and planner.reads_tables(part, fields)
+            for part in parts
+        ):
+            continue
+        found[topic] = {path: _Running() for path in fields}
+        for part in parts:
+            for values in planner.values(part, fields):
+                planner.counters.messages += len(values.log_time)
+                for path, running in found[topic].items():
+                    column = pc.struct_field(values.records, path.split("."))
+                    running.add(pa.chunked_array([column]))
     return found
 
 
