@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.samples import NAME, Journal
 from hybridlog.cli import signals
-from hybridlog.cli.exit_codes import of_os_error
+from hybridlog.cli.app import of_os_error
 from hybridlog.cli.output import note, parse_size, print_table, printable
 from hybridlog_storage.errors import HybridlogError, UsageError
 from hybridlog_storage.stopping import anywhere, at_safe_points

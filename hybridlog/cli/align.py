@@ -1,4 +1,4 @@
-"""`hybridlog align`."""
+"""`hybridlog align` and `resample`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options
-from hybridlog.cli.answer_notes import print_cost
-from hybridlog.cli.answers import Destination, answer_tables, table_options
+from hybridlog.cli.answers import Destination, answer_tables, print_cost, table_options
 from hybridlog.cli.completion import complete_recording, complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output import notes
-from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.query_options import asked, parse_fields, query_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -167,3 +167,57 @@ def _named(store: Store, queries: list[Query], text: str, form: str) -> tuple[li
     if not places:
         raise TopicError(f"{topic} is no topic of this alignment.")
     return places, rest
+
+
+@click.command()
+@options.topics
+@click.option("--step", required=True, metavar="DURATION", help="Time between two rows: 100ms.")
+@click.option(
+    "--how",
+    type=click.Choice(
+        ["asof", "nearest", "interpolate", "count", "first", "last", "min", "max", "mean"]
+    ),
+    default="asof",
+    help="The last message not after the row, the nearest one, or between the last and the next. "
+    "Or of the messages from a row to the next: their number, the first, the last, or the least, "
+    "greatest or mean of each number.",
+)
+@options.near
+@options.store
+@options.between
+@options.where
+@options.choice
+@click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
+@table_options
+@options.verbose
+def resample_command(
+    *,
+    topic: tuple[str, ...],
+    step: str,
+    how: str,
+    tolerance: str | None,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    where: tuple[str, ...],
+    choice: Choice,
+    fields: str | None,
+    to: Destination,
+    strict: bool,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Show topics at regular times, or what they say between these.
+
+    The times begin with each recording, or with the range of --between.
+    """
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        query = asked(
+            opened, topic, choice, between=between, where=where, fields=fields, strict=strict
+        )
+        rows = query.resample(step, how, tolerance)
+        answer_tables(rows.to_tables(), rows.schema, to)
+        sys.stdout.flush()
+        if not quiet:
+            print_cost(rows.counters, time.monotonic() - started, count=False)
+            notes(rows.remarks(*topic))

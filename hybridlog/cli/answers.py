@@ -1,10 +1,11 @@
-"""Prints an answer on the terminal, or writes it to a file or a stream."""
+"""Prints an answer or writes it to a file or a stream; says what it cost and lacks."""
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial, wraps
 from itertools import chain, groupby, islice
@@ -15,11 +16,12 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.output_path import check_room, not_written, replacing
+from hybridlog.cli.options import VERBOSE
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import IN_FORCE, Front, add_extras, batches_of, profile_of
+from hybridlog_storage.disk.unfinished import is_published, undone
 from hybridlog_storage.errors import DefinitionError, HybridlogError, PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
 
@@ -36,8 +38,10 @@ if TYPE_CHECKING:
         Target,
     )
     from hybridlog.query.answers.follow import Following
+    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.sql.engine import SqlAnswer
+
 
 SCREEN: Final = "table"
 """The format for people, on the screen."""
@@ -273,11 +277,11 @@ def write_answer(
     Returns:
         Messages that are missing, because they do not fit their definition.
     """
-    from hybridlog.frames.answer import json_columns
-    from hybridlog.frames.lines import lines
-    from hybridlog.query.planner import Planner
 
     def objects() -> Iterator[list[Line]]:
+        from hybridlog.frames.lines import lines
+        from hybridlog.query.planner import Planner
+
         query.session.renew()
         query.counters.reset()
         yield from lines(Planner(query.session, query.question, query.counters))
@@ -300,6 +304,8 @@ def write_answer(
         columns = query.schema() if content == "table" else None
         rows = Rows(lines=objects, tables=query.to_tables, schema=lambda: columns)
         written = _write_rows(rows, form, target, progress)
+    from hybridlog.frames.answer import json_columns
+
     for name in json_columns(columns):
         output.note(f"{name} has values of several types: it is written as JSON text.")
     return counters.messages - counters.reduced - written
@@ -482,3 +488,133 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
             fields = zip(names[begin:], row[begin:], strict=True)
             output.print_record(title, [(name, cell) for name, cell in fields if cell])
     return read
+
+
+def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
+    """Print what an answer cost, with `--verbose`; without, the latched messages in front.
+
+    Args:
+        counters: Of the query.
+        elapsed: Seconds, including the opening of the store.
+        count: The answer was a number, not messages.
+    """
+    if not click.get_current_context().meta.get(VERBOSE):
+        if counters.latched and not count:
+            output.note(f"{output.counted(counters.latched, 'latched message')} in front")
+        return
+    used = []
+    if not count:
+        given = counters.messages - counters.reduced
+        used.append(f"{output.counted(given, 'message')}{latched(counters)}")
+    if counters.payload_bytes:
+        used.append(f"{output.size(counters.payload_bytes)} of payload")
+    if counters.bytes_read:
+        chunks = counters.chunks_read
+        where = f" in {output.counted(chunks, 'chunk')}" if chunks else ""
+        used.append(f"{output.size(counters.bytes_read)} read from disk{where}")
+    if counters.documents_read:
+        used.append(output.counted(counters.documents_read, "index document"))
+    time = f"{elapsed:.3f} s"
+    output.note(f"{', '.join(used)}, {time}" if used else f"answered in {time}")
+
+
+def latched(counters: Counters) -> str:
+    """The end of a number of messages: ` and 2 latched messages in front`, if any."""
+    if not counters.latched:
+        return ""
+    return f" and {output.counted(counters.latched, 'latched message')} in front"
+
+
+def print_lost(query: Query, count: int) -> None:
+    """Print the limits of a count of messages, if any of the range are lost."""
+    lost = query.lost()
+    if lost:
+        output.note(lost.describe(count, query.question.limit))
+
+
+def print_remarks(query: Query, topics: Sequence[str], *, is_empty: bool | None = None) -> None:
+    """Print what is to be known about an answer, a line each.
+
+    Args:
+        query: The query that was answered.
+        topics: Its topics as typed.
+        is_empty: The answer was empty; None to tell by its counters.
+    """
+    output.notes(query.remarks(*topics, is_empty=is_empty))
+
+
+def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
+    """Refuse to overwrite without --force, and foreign directories even with it.
+
+    Args:
+        path: The output.
+        force: --force was given.
+        is_directory: It is to be a directory with a file a message.
+
+    Raises:
+        UsageError: The path cannot be written.
+    """
+    if not os.path.lexists(path) or _is_device(path):
+        return
+    if path.is_dir():
+        if not is_directory:
+            raise UsageError(f"{path} is a directory; name a file in it.")
+        inside = next(path.iterdir(), None)
+        if inside is None:
+            return
+        if not _holds_messages(path):
+            raise UsageError(f"{path} is a directory that holds other things; name a new one.")
+    elif is_directory:
+        raise UsageError(f"{path} is a file; messages go into a directory.")
+    if not force:
+        raise UsageError(f"{path} exists; --force overwrites it.")
+
+
+@contextmanager
+def replacing(path: Path, *, force: bool, is_directory: bool = False) -> Iterator[None]:
+    """Move a directory aside while a new one is written; it comes back when the block fails.
+
+    Files are replaced by their writers in one step.
+
+    Raises:
+        UsageError: The path cannot be written.
+    """
+    check_room(path, force=force, is_directory=is_directory)
+    if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
+        yield
+        return
+    import secrets
+    import shutil
+
+    aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
+    with undone(partial(_bring_back, aside, path)):
+        try:
+            path.rename(aside)
+        except OSError as error:
+            raise UsageError(f"{path} cannot be replaced: {error.strerror}.") from error
+        yield
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _bring_back(aside: Path, path: Path) -> None:
+    with suppress(OSError):
+        if not path.exists():
+            aside.rename(path)
+
+
+def not_written(path: Path) -> str:
+    """The sentence about an output file after a stopped command; empty if the file is complete."""
+    return "" if is_published(path) else f"{path} is not written."
+
+
+def _holds_messages(path: Path) -> bool:
+    from hybridlog.formats.raw import holds_messages
+
+    try:
+        return holds_messages(path)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def _is_device(path: Path) -> bool:
+    return path.exists() and not path.is_file() and not path.is_dir()

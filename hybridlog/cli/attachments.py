@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
+from hybridlog.cli.answers import check_room, not_written
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room, not_written
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError

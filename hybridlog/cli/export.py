@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import latched, print_remarks
-from hybridlog.cli.answers import write_answer
+from hybridlog.cli.answers import (
+    check_room,
+    latched,
+    not_written,
+    print_remarks,
+    replacing,
+    write_answer,
+)
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room, not_written, replacing
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, suffixes_of

@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost, print_lost, print_remarks
 from hybridlog.cli.answers import (
     Destination,
     answer_query,
     format_of,
     format_option,
     output_option,
+    print_cost,
+    print_lost,
+    print_remarks,
     write_following,
 )
 from hybridlog.cli.open_store import opened_store
@@ -177,7 +179,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
         stopped = error
     if not choices.quiet:
         print_cost(query.counters, time.monotonic() - started, count=False)
-        from hybridlog.cli.recording_summary import status
+        from hybridlog.cli.ls import status_text
         from hybridlog.query.query import Query
 
         asked = Query(query.session, following.question)
@@ -185,7 +187,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
         print_remarks(asked, choices.topic)
         for one in asked.summaries():
             if one.status != "open":
-                output.note(f"{one.label} has ended: {status(one)}.")
+                output.note(f"{one.label} has ended: {status_text(one)}.")
     if stopped is not None:
         raise stopped
 

@@ -1,4 +1,4 @@
-"""`hybridlog index`: MongoDB indexes on fields, the address of the index, and its rebuilding."""
+"""`hybridlog index` and `trust`: what the index has, and whose MongoDB is used."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.query.choice import Choice
+
 
 _FIELDS = click.argument(
     "field",
@@ -204,3 +205,27 @@ def _print(found: list[FieldIndex], *, as_json: bool, quiet: bool) -> None:
         )
     elif not quiet:
         output.say("no index on a field")
+
+
+@click.command()
+@options.store
+@click.option("--forget", is_flag=True, help="Do not trust this store's server any more.")
+def trust_command(*, store: Path | None, forget: bool) -> None:
+    """Trust the MongoDB server that another user's store names.
+
+    Until then, commands do not connect to it: a user's own stores only are trusted. The store
+    does not contain the password: see HYBRIDLOG_MONGO_PASSWORD.
+    """
+    from hybridlog.index import consent
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import is_uri, read_settings
+
+    settings = read_settings(store_path(store))
+    if forget:
+        found = consent.forget(settings.store_id)
+        output.say("forgotten" if found else "nothing was trusted")
+    elif not is_uri(settings.mongo):
+        output.say("the store names no MongoDB: there is nothing to trust")
+    else:
+        consent.remember(settings.store_id, settings.mongo)
+        output.say(f"trusted {settings.mongo}")

@@ -1,4 +1,4 @@
-"""`hybridlog info`."""
+"""`hybridlog info`: recordings and topics, or a segment file."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridlog.cli import coverage, options, output, recording_summary, sizes_table
+from hybridlog.cli import options, output
 from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.losses import describe_coverage
+from hybridlog.cli.ls import print_sizes, recording_dict, size_dict, status_text, with_misfits
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import line_of, losses_of
 from hybridlog.wording import MOST_LISTED
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import SegmentError, StoreError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.sizes import Size, Sizes
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
+
 
 _MAX_LINE = 100  # characters of a name and what follows it
 _MOST_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
@@ -61,16 +64,12 @@ def info_command(
 ) -> None:
     """Show topics, types, rates, sizes, times, clock skew, losses."""
     if what is not None and _is_segment(what):
-        from hybridlog.cli.segment_info import show_segment
-
         show_segment(Path(what), as_json=as_json)
         return
     with opened_store(store, mongo, quiet=as_json) as opened:
         if what is not None:
             choice = replace(choice, name=(what, *choice.name))
-        chosen = [
-            recording_summary.with_misfits(opened, entry) for entry in recordings_of(opened, choice)
-        ]
+        chosen = [with_misfits(opened, entry) for entry in recordings_of(opened, choice)]
         is_one = choice == Choice.of(what) and opened.is_one(choice.name)
         index = opened.index_place
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
@@ -82,7 +81,7 @@ def info_command(
         full = [_as_dict(entry, *extras[entry.id]) for entry in chosen]
         for about, entry in zip(full, chosen, strict=True):
             if entry.label in found:
-                about["sizes"] = [sizes_table.as_dict(row) for row in found[entry.label].rows]
+                about["sizes"] = [size_dict(row) for row in found[entry.label].rows]
         output.print_json(full[0] if is_one else full)
         return
     if not chosen:
@@ -94,7 +93,7 @@ def info_command(
         if entry.label in found:
             output.say()
             of_one = found[entry.label]
-            sizes_table.print_sizes(of_one.rows, of_one.total, topics=True)
+            print_sizes(of_one.rows, of_one.total, topics=True)
 
 
 def _extras(
@@ -131,9 +130,9 @@ def _as_dict(
     from hybridlog.entries import summary_of
 
     return {
-        **recording_summary.as_dict(summary_of(entry)),
+        **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
-        "coverage": coverage.describe(entry, losses_of(entry)),
+        "coverage": describe_coverage(entry, losses_of(entry)),
         "losses": losses_of(entry),
         "notes": entry.notes,
         "marks": entry.marks,
@@ -194,7 +193,7 @@ def _print_recording(
     losses = losses_of(entry)
     source = entry.source
     summary = summary_of(entry)
-    status = recording_summary.status(summary)
+    status = status_text(summary)
     if entry.status == "open":
         status += f"; `hybridlog top {entry.label}` shows it"
     held = (
@@ -211,7 +210,7 @@ def _print_recording(
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
         ("messages", str(entry.messages)),
         ("stored", held),
-        *_coverage(entry, coverage.describe(entry, losses)),
+        *_coverage(entry, describe_coverage(entry, losses)),
         *(("", line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
@@ -353,3 +352,90 @@ def _source(source: Mapping[str, Any]) -> str:
     size = f", {output.size(source['bytes'])}" if source["bytes"] else ""
     kind = f"{source['kind']}{size}"
     return f"{source['path']} ({kind})" if source["path"] else kind
+
+
+def show_segment(path: Path, *, as_json: bool) -> None:
+    """Print the summary of a sealed segment.
+
+    Raises:
+        StoreError: It is being written, or is no segment of a store.
+    """
+    from hybridlog_storage.segments.segment_reader import SegmentReader
+
+    stem = path.name.split(".")[0]
+    if path.name.endswith(".open"):
+        raise StoreError(
+            f"{path} is being written, or was left by a crash. Any command on its store, such as "
+            "`hybridlog ls --store DIR`, seals segments that a crash left."
+        )
+    if not path.is_file():
+        raise StoreError(f"{path} is no file; a segment is a file that ends in .mcap.")
+    _check_magic(path)
+    number = int(stem) if stem.isascii() and stem.isdigit() else 0
+    with SegmentReader(path, number) as reader:
+        summary = reader.summary()
+        bytes_all = reader.size
+    chunks = summary.chunks
+    channels = [
+        {
+            "topic": channel.topic,
+            "type": channel.schema.name if channel.schema is not None else None,
+            "messages": summary.counts.get(channel_id, 0),
+            "chunks": sum(channel_id in place.channels for place in chunks),
+        }
+        for channel_id, channel in sorted(summary.channels.items())
+    ]
+    first = min((place.first for place in chunks), default=None)
+    last = max((place.last for place in chunks), default=None)
+    if as_json:
+        output.print_json(
+            {
+                "segment": str(path),
+                "bytes": bytes_all,
+                "recording": summary.recording,
+                "end": summary.end,
+                "first_ns": first,
+                "last_ns": last,
+                "chunks": len(chunks),
+                "channels": channels,
+            }
+        )
+        return
+    from hybridlog.query.times import format_time
+
+    output.print_table(
+        [("segment", "left"), (str(path), "left")],
+        [
+            ("recording", str(summary.recording.get("name"))),
+            ("id", str(summary.recording.get("id"))),
+            ("start", format_time(first) if first is not None else "-"),
+            ("last", format_time(last) if last is not None else "-"),
+            ("bytes", output.size(bytes_all)),
+            ("chunks", str(len(chunks))),
+            ("messages", str(sum(summary.counts.values()))),
+        ],
+    )
+    output.say()
+    output.print_table(
+        [("topic", "left"), ("type", "left"), ("messages", "right"), ("chunks", "right")],
+        [
+            (str(c["topic"]), str(c["type"] or ""), str(c["messages"]), str(c["chunks"]))
+            for c in channels
+        ],
+    )
+
+
+def _check_magic(path: Path) -> None:
+    """Tell another file from a damaged segment."""
+    from hybridlog_storage.mcap.mcap_scan import MAGIC
+
+    try:
+        with path.open("rb") as file:
+            begins = file.read(len(MAGIC))
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+    if begins != MAGIC:
+        raise StoreError(
+            f"{path} is no segment of a hybridlog store. If it is a log, `hybridlog record {path}` "
+            "records it."
+        )

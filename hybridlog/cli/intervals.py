@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost, print_remarks
+from hybridlog.cli.answers import print_cost, print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked, parse_fields
 

@@ -9,8 +9,8 @@ import traceback
 from pathlib import Path
 from typing import NoReturn, TextIO
 
-from hybridlog.cli import import_blocker, signals
-from hybridlog.cli.exit_codes import EXIT_CODES, INTERNAL, of_os_error
+from hybridlog.cli import signals
+from hybridlog.cli.app import EXIT_CODES, INTERNAL, of_os_error
 from hybridlog_storage.errors import HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
@@ -19,7 +19,7 @@ __all__ = ["EXIT_CODES", "main"]
 def main() -> NoReturn:
     """Run the command line and exit with one of `EXIT_CODES`."""
     signals.install()
-    import_blocker.install()
+    block_imports()
     # A shell may have closed them: `hybridlog ls >&-`.
     sys.stdout = sys.stdout or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
@@ -118,3 +118,22 @@ def _leave(code: int) -> NoReturn:
 def _discard(stream: TextIO) -> None:
     """Discard what a stream still holds; the interpreter flushes it at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+_BLOCKED = frozenset({"pandas"})
+"""pyarrow imports pandas to see whether it is given one of its objects; no command has one.
+The import takes three tenths of a short command's time."""
+
+
+class _Blocker:
+    """A finder of modules that reports the blocked ones as not installed."""
+
+    @staticmethod
+    def find_spec(fullname: str, *_: object) -> None:
+        if fullname in _BLOCKED:
+            raise ModuleNotFoundError(f"No command needs {fullname}.", name=fullname)
+
+
+def block_imports() -> None:
+    """Block the imports in this process from now on."""
+    sys.meta_path.insert(0, _Blocker())

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost, print_remarks
+from hybridlog.cli.answers import check_room, not_written, print_cost, print_remarks
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.output_path import check_room, not_written
 from hybridlog.cli.query_options import asked, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError

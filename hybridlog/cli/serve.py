@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_remarks
+from hybridlog.cli.answers import print_remarks
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked
 from hybridlog.cli.signals import SIGNALS

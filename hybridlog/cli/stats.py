@@ -1,4 +1,4 @@
-"""`hybridlog stats`."""
+"""`hybridlog stats` and `rate`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost, print_remarks
+from hybridlog.cli.answers import (
+    Destination,
+    answer_tables,
+    print_cost,
+    print_remarks,
+    table_options,
+)
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import asked, parse_fields
 
@@ -20,6 +26,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.choice import Choice
+
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
@@ -92,3 +99,36 @@ def _number(value: float | None) -> str:
     if value is None:
         return ""
     return str(value) if isinstance(value, int) else f"{value:.6g}"
+
+
+@click.command()
+@options.only_topics
+@click.option("--window", metavar="DURATION", help="A row for each so long, such as 1s.")
+@options.store
+@options.between
+@options.where
+@options.choice
+@table_options
+@options.verbose
+def rate_command(
+    *,
+    topic: tuple[str, ...],
+    window: str | None,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    where: tuple[str, ...],
+    choice: Choice,
+    to: Destination,
+    strict: bool,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Show how many messages came in a second."""
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
+        answer_tables([query.rate(window)], lambda: None, to)
+        sys.stdout.flush()
+        if not quiet:
+            print_cost(query.counters, time.monotonic() - started, count=True)
+            print_remarks(query, topic, is_empty=False)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answer_notes import print_cost
+from hybridlog.cli.answers import print_cost
 from hybridlog.cli.open_store import opened_store
 from hybridlog_storage.errors import UsageError
 

@@ -17,7 +17,7 @@ import pyarrow.feather
 import pyarrow.parquet
 import pytest
 
-from hybridlog.cli.answer_notes import print_cost
+from hybridlog.cli.answers import print_cost
 from hybridlog.cli.options import VERBOSE, check_latched
 from hybridlog.query.counters import Counters
 from hybridlog_storage.errors import UsageError

@@ -1,0 +1,255 @@
+"""`hybridlog verify`, `repair`, `compact` and `import`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.query_options import recordings_of
+from hybridlog.cli.signals import if_stopped
+from hybridlog.wording import listed
+from hybridlog_storage.errors import DatabaseError, StoreError, UsageError, WithoutMongoError
+
+if TYPE_CHECKING:
+    from hybridlog.maintenance.report import CompactedTopic
+    from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.choice import Choice
+
+
+@click.command()
+@options.only_recordings
+@options.choice
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def verify_command(
+    *,
+    choice: Choice,
+    store: Path | None,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Read everything, check checksums and references.
+
+    Exits with 1 when it finds a problem, and prints a cure for each.
+    """
+    started = time.monotonic()
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        chosen = recordings_of(opened, choice)
+        total = sum(entry.stored_bytes for entry in chosen.summaries)
+        with progress_bar("verify", total, quiet=quiet) as bar:
+            result = opened.verify(None if choice.is_everything else chosen, Stages(bar))
+        why = opened.without_database
+    elapsed = time.monotonic() - started
+    if as_json:
+        output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
+    else:
+        _print(result, elapsed, quiet=quiet)
+        running = [one.label for one in chosen.summaries if one.status == "open"]
+        if running and not quiet:
+            output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
+    is_wanted = not isinstance(why, WithoutMongoError)
+    if not result.index and is_wanted and (result.findings or why is None):
+        output.note(f"The index was not compared: {why}")
+    if result.findings:
+        raise click.exceptions.Exit(1)
+    if not result.index and is_wanted and why is not None:
+        raise DatabaseError(f"The index was not compared: {why}")
+
+
+def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
+    for finding in result.findings:
+        of = f"{finding.recording}: " if finding.recording else ""
+        output.say(f"{of}{finding.place}: {finding.problem}; {finding.cure}")
+    if quiet:
+        return
+    verdict = "all is well" if result.index else "all is well in the files"
+    if result.findings:
+        verdict = output.counted(len(result.findings), "problem")
+    output.say(
+        f"{output.counted(result.recordings, 'recording')}, "
+        f"{output.counted(result.chunks, 'chunk')}, "
+        f"{output.counted(result.messages, 'message')}, "
+        f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: {verdict}"
+        f"{output.without_documents(result.without_documents)}"
+    )
+
+
+@click.command()
+@options.only_recordings
+@options.choice
+@options.store
+@click.option("--moved", is_flag=True, help="The store was moved to here: take its index over.")
+@click.option(
+    "--new-id",
+    is_flag=True,
+    help="The store is a copy: give it an id of its own, with the index at --mongo.",
+)
+@options.mongo
+@options.as_json
+@options.quiet
+def repair_command(
+    *,
+    choice: Choice,
+    store: Path | None,
+    moved: bool,
+    new_id: bool,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Repair what can be repaired without losing anything.
+
+    It restores the names of segments, writes damaged summaries and journals again, and brings
+    catalog and index up to date. Exits with 1, and a list, when only a copy can restore the
+    rest.
+    """
+    if moved and new_id:
+        raise UsageError("A store was moved or it is a copy: give --moved or --new-id, not both.")
+    if new_id:
+        from hybridlog.maintenance.lease import become_another
+        from hybridlog.store import store_path
+
+        become_another(store_path(store), mongo)
+        output.say("the store has a new id now")
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        if moved:
+            opened.take_over()
+            output.say("the index belongs to the store at this place now")
+        chosen = None if choice.is_everything else recordings_of(opened, choice)
+        with progress_bar("repair", 0, quiet=quiet) as bar:
+            done = opened.repair(chosen, Stages(bar))
+    left = [one for one in done if not one.is_cured]
+    if as_json:
+        output.print_json([asdict(one) for one in done])
+    else:
+        for one in done:
+            result = "mended" if one.is_cured else "left"
+            of = f"{one.recording}: " if one.recording else ""
+            output.say(f"{of}{one.place}: {result}: {one.done}")
+        if not done and not quiet:
+            output.say("nothing to mend")
+    if left:
+        raise click.exceptions.Exit(1)
+
+
+@click.command()
+@options.choice
+@options.only_topics
+@click.option(
+    "--older-than",
+    metavar="DURATION",
+    help="Only recordings whose last message is at least this old, such as 1d.",
+)
+@click.option(
+    "--drop-mcap",
+    is_flag=True,
+    help="Take payloads that are in columns out of the segments.",
+)
+@click.option("--dry-run", is_flag=True, help="Only say what would be done.")
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def compact_command(
+    *,
+    choice: Choice,
+    topic: tuple[str, ...],
+    older_than: str | None,
+    drop_mcap: bool,
+    dry_run: bool,
+    store: Path | None,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Write payloads into columns that any reader opens.
+
+    Of ended recordings: laser scans, point clouds by their own fields, images, and other
+    arrays of numbers. Every message is rebuilt from its columns and compared byte for byte
+    before the columns are used. Without --topic, topics are chosen that consist of arrays
+    mostly.
+    """
+    from hybridlog.query.times import parse_duration
+
+    age = 0 if older_than is None else parse_duration(older_than)
+    with (
+        opened_store(store, mongo, quiet=quiet) as opened,
+        if_stopped("Recordings that were finished have their columns; run it again."),
+        progress_bar("compact", 0, quiet=quiet) as bar,
+    ):
+        found = opened.compact(
+            None if choice.is_everything else recordings_of(opened, choice),
+            topic or None,
+            older_than_ns=age,
+            drop_mcap=drop_mcap,
+            dry_run=dry_run,
+            progress=Stages(bar),
+        )
+    if as_json:
+        output.print_json([asdict(one) for one in found])
+        return
+    for one in found:
+        output.say(_told(one, dry_run=dry_run))
+    if not found and not quiet:
+        output.say("nothing to compact")
+
+
+def _told(one: CompactedTopic, *, dry_run: bool) -> str:
+    """A line about a topic."""
+    parts = []
+    if one.messages and dry_run:
+        parts.append(f"{one.messages} messages would get columns")
+    elif one.messages:
+        parts.append(
+            f"{one.messages} messages, {output.size(one.payload_bytes)}, in columns of "
+            f"{output.size(one.column_bytes)}"
+        )
+    if one.dropped:
+        parts.append(f"{one.dropped} messages taken out of the segments")
+    if one.both:
+        parts.append(f"{one.both} stay there, too: their chunks hold messages without columns")
+    if one.kept:
+        parts.append(f"{one.kept} without columns: {one.reason}")
+    return f"{one.recording} {one.topic}: {'; '.join(parts)}"
+
+
+@click.command("import")
+@click.argument("other", type=options.PATH, metavar="STORE", help="Directory of the other store.")
+@options.choice
+@options.store
+@options.as_json
+@options.quiet
+def import_command(
+    *, other: Path, choice: Choice, store: Path | None, as_json: bool, quiet: bool
+) -> None:
+    """Copy recordings from another store.
+
+    Every byte is checked. After an interruption, run it again: copied recordings stay.
+    """
+    with (
+        opened_store(store, None, create=True, quiet=quiet) as opened,
+        if_stopped("Run the command again: copied recordings are not copied again."),
+        progress_bar("import", 0, quiet=quiet) as bar,
+    ):
+        report = opened.import_from(other, choice, Stages(bar))
+    if as_json:
+        output.print_json(asdict(report))
+    elif not quiet:
+        for label in report.imported:
+            output.say(f"imported {label}")
+        for label in report.known:
+            output.say(f"{label} is here already")
+    if report.refused:
+        sys.stdout.flush()
+        raise StoreError(" ".join(report.refused.values()))
