@@ -34,10 +34,10 @@ from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
-from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.query.topics import resolve
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import listed
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import ChannelStats
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
@@ -166,7 +166,7 @@ class Session:
         directory: The store's directory.
         connection: The connection to MongoDB.
         repairs: Repairs made when the store was opened.
-        recent_chunks: Chunks that single messages were read from.
+        cache: What was read or worked out; chunks of single messages are a kind of it.
         field_indexes: The indexes on fields in MongoDB; empty without a connection.
     """
 
@@ -182,7 +182,7 @@ class Session:
         self._progress = progress
         self.connection = Connection(directory, mongo, cache_mb)
         self.repairs = RepairReport()
-        self.recent_chunks = RecentChunks()
+        self.cache = Cache()
         self.field_indexes: list[FieldIndex] = []
         self._uncertain: tuple[int, dict[str, set[str]]] | None = None
         self._unavailable: HybridlogError | None = None
@@ -1237,7 +1237,7 @@ class Session:
             for key in [key for key in self._segments if key[0] in recordings]:
                 del self._segments[key]
         self._columns.clear()
-        self.recent_chunks.clear()
+        self.cache.drop("chunk")
         if "tables" in vars(self):
             self.tables.look_again()
         self._remember_meanings()
@@ -1254,7 +1254,7 @@ class Session:
             self._contents.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
         self._columns.clear()
-        self.recent_chunks.clear()
+        self.cache.drop("chunk")
         self._tables_tried.clear()
         if "tables" in vars(self):
             self.tables.invalidate()
@@ -1267,7 +1267,7 @@ class Session:
                 reader.close()
             self._segments.clear()
             self._contents.clear()
-        self.recent_chunks.clear()
+        self.cache.drop("chunk")
         self._tables_tried.clear()
         if "tables" in vars(self):
             self.tables.invalidate()

@@ -42,6 +42,11 @@ class RecordedChunks:
         """Number of parts that are known; parts are only added."""
         return self._size
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the parts that are known."""
+        return sum(rows.nbytes for rows in self._rows)
+
     def topics(self) -> list[str]:
         """Names of all topics, sorted."""
         return sorted({channel.topic for channel in self._recording.channels})

@@ -9,7 +9,7 @@ that a running recording adds are counted into the blocks that they touch.
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from itertools import groupby, product
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
-_RECORDINGS: Final = 4
-_MOST_BYTES: Final = 24 << 20  # of the blocks of one recording
 _BLOCK: Final = 10  # a block has 2^10 bins
 _STEPS: Final = 4  # of zooming in that are drawn from the same bins
 _MOST_BINS: Final = 1 << 21  # that are counted for one picture
@@ -51,6 +49,16 @@ class _Block(NamedTuple):
     exact: bool
     parts: int
 
+    @classmethod
+    def of(cls, counts: NDArray[np.int64], *, is_exact: bool, parts: int) -> _Block:
+        """A block with numbers that are as small as possible."""
+        return cls(counts.astype(np.min_scalar_type(int(counts.max()))), is_exact, parts)
+
+    def with_more(self, more: _Block) -> _Block:
+        """The block with the counts of parts that came later."""
+        counts = self.counts.astype(np.int64) + more.counts
+        return _Block.of(counts, is_exact=self.exact and more.exact, parts=more.parts)
+
 
 class DensityCache:
     """Counts messages by pixel for many clients. Thread safe.
@@ -61,8 +69,6 @@ class DensityCache:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._recordings: OrderedDict[str, _Recorded] = OrderedDict()
-        self._lock = threading.Lock()
 
     def density(
         self,
@@ -88,7 +94,9 @@ class DensityCache:
         """
         recorded = self._of(recording)
         with held(recorded.lock):
-            return recorded.density(recording, span, pixels, topics)
+            found = recorded.density(recording, span, pixels, topics)
+        self._keep(recording, recorded)
+        return found
 
     def periods(
         self, recording: RecordingEntry, span: tuple[int, int], topics: Sequence[str]
@@ -102,15 +110,16 @@ class DensityCache:
         """
         recorded = self._of(recording)
         with held(recorded.lock):
-            return [recorded.period(recording, span, topic) for topic in topics]
+            found = [recorded.period(recording, span, topic) for topic in topics]
+        self._keep(recording, recorded)
+        return found
 
     def _of(self, recording: RecordingEntry) -> _Recorded:
-        with self._lock:
-            found = self._recordings.pop(recording.id, None) or _Recorded(self._session)
-            self._recordings[recording.id] = found
-            while len(self._recordings) > _RECORDINGS:
-                self._recordings.popitem(last=False)
-            return found
+        found: _Recorded | None = self._session.cache.get("recording", recording.id)
+        return found or _Recorded(self._session)
+
+    def _keep(self, recording: RecordingEntry, recorded: _Recorded) -> None:
+        self._session.cache.put("recording", recording.id, value=recorded, size=recorded.size)
 
 
 class _Recorded:
@@ -120,17 +129,18 @@ class _Recorded:
         self.lock = threading.Lock()
         self._session = session
         self._chunks: RecordedChunks | None = None
-        self._blocks: OrderedDict[tuple[int, int, str], _Block] = OrderedDict()
-        self._bytes = 0
         self._periods: dict[str, tuple[float, int]] = {}  # and the messages that told it
 
     def follow(self, recording: RecordingEntry) -> RecordedChunks:
         """The chunks as they are now."""
         if self._chunks is None or not self._chunks.follow(recording):
-            self._blocks.clear()
-            self._bytes = 0
             self._chunks = RecordedChunks(self._session, recording)
         return self._chunks
+
+    @property
+    def size(self) -> int:
+        """Its memory without blocks, bytes."""
+        return 0 if self._chunks is None else self._chunks.nbytes
 
     def period(self, recording: RecordingEntry, span: tuple[int, int], topic: str) -> float:
         chunks = self.follow(recording)
@@ -160,17 +170,16 @@ class _Recorded:
         fine = self._fine_level(chunks, topics, level, begin, end)
         steps = level - fine
         numbers = range(begin << steps >> _BLOCK, ((end << steps) - 1 >> _BLOCK) + 1)
-        self._count(chunks, topics, fine, numbers)
+        blocks = self._count(chunks, topics, fine, numbers)
         low = (begin << steps) - (numbers.start << _BLOCK)
         high = low + ((end - begin) << steps)
         counts = np.empty((len(topics), end - begin), np.int64)
         exact = np.ones(len(topics), np.bool_)
         for row, topic in enumerate(topics):
-            blocks = [self._blocks[fine, number, topic] for number in numbers]
-            bins = np.concatenate([block.counts for block in blocks])[low:high]
+            own = [blocks[number, topic] for number in numbers]
+            bins = np.concatenate([block.counts for block in own])[low:high]
             counts[row] = bins.reshape(-1, 1 << steps).sum(axis=1, dtype=np.int64)
-            exact[row] = all(block.exact for block in blocks)
-        self._make_room()
+            exact[row] = all(block.exact for block in own)
         return Density(tuple(topics), _edges(level, begin, end), counts, exact)
 
     def _fine_level(
@@ -192,17 +201,18 @@ class _Recorded:
 
     def _count(
         self, chunks: RecordedChunks, topics: Sequence[str], level: int, numbers: range
-    ) -> None:
-        """Count what is missing in some blocks."""
+    ) -> dict[tuple[int, str], _Block]:
+        """Blocks by number and topic; what is missing is counted."""
         chunks.load((numbers.start << level + _BLOCK, numbers.stop << level + _BLOCK))
         now = chunks.size
+        blocks: dict[tuple[int, str], _Block] = {}
         missing: dict[tuple[int, int], list[str]] = defaultdict(list)
         for number, topic in product(numbers, topics):
-            block = self._blocks.get((level, number, topic))
+            block = self._session.cache.get("density", chunks, level, number, topic)
+            if block is not None:
+                blocks[number, topic] = block
             if block is None or block.parts < now:
                 missing[number, 0 if block is None else block.parts].append(topic)
-            else:
-                self._blocks.move_to_end((level, number, topic))
         # Neighbouring blocks that lack the same are counted together.
         ordered = sorted(missing.items(), key=lambda item: (item[0][1], item[1], item[0][0]))
         alike = groupby(
@@ -214,24 +224,17 @@ class _Recorded:
             counts, exact = count(chunks, lacking, edges, since=since)
             for row, topic in enumerate(lacking):
                 for number, part in zip(own, np.split(counts[row], len(own)), strict=True):
-                    self._add((level, number, topic), part, is_exact=bool(exact[row]), parts=now)
-
-    def _add(
-        self, key: tuple[int, int, str], counts: NDArray[np.int64], *, is_exact: bool, parts: int
-    ) -> None:
-        before = self._blocks.pop(key, None)
-        if before is not None:
-            counts = counts + before.counts
-            is_exact = is_exact and before.exact
-            self._bytes -= before.counts.nbytes
-        small = counts.astype(np.min_scalar_type(int(counts.max())))
-        self._blocks[key] = _Block(small, is_exact, parts)
-        self._bytes += small.nbytes
-
-    def _make_room(self) -> None:
-        while self._bytes > _MOST_BYTES:
-            _, block = self._blocks.popitem(last=False)
-            self._bytes -= block.counts.nbytes
+                    block = _Block.of(part, is_exact=bool(exact[row]), parts=now)
+                    if (number, topic) in blocks:
+                        block = blocks[number, topic].with_more(block)
+                    blocks[number, topic] = block
+                    self._session.cache.put(
+                        "density",
+                        *(chunks, level, number, topic),
+                        value=block,
+                        size=block.counts.nbytes,
+                    )
+        return blocks
 
 
 def _edges(level: int, begin: int, end: int) -> NDArray[np.int64]:

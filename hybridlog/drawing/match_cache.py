@@ -1,11 +1,10 @@
-"""Matches that are kept in memory, so that a picture of them at any zoom reads nothing."""
+"""Matches in memory, so that a picture of them at any zoom reads nothing."""
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +16,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.query import Query
-
-MOST_BYTES: Final = 96 << 20
-"""Memory of all matches that are kept: 16 bytes each, and 16 an interval."""
-_QUESTIONS: Final = 8
+    from hybridlog_storage.cache import Cache
 
 
-class KeptMatches:
+class CachedMatches:
     """All matches of a question; see `Matches`.
 
     Args:
@@ -40,21 +36,21 @@ class KeptMatches:
         self._held = held
 
     @classmethod
-    def of(cls, query: Query) -> KeptMatches | None:
-        """The matches of a query; None if they are too many to be kept."""
+    def of(cls, query: Query, max_bytes: int) -> CachedMatches | None:
+        """The matches of a query; None if they take more bytes: 16 each, 16 an interval."""
         times, seqs = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         held = [np.empty((0, 2), np.int64)]
         size = 0
         for found in query.match_times():
             size += found.log_time.nbytes + found.seq.nbytes
-            if size > MOST_BYTES:
+            if size > max_bytes:
                 return None
             times.append(found.log_time)
             seqs.append(found.seq)
         for _, rows in query.held():
             held.append(rows[:, :2].copy())
             size += held[-1].nbytes
-            if size > MOST_BYTES:
+            if size > max_bytes:
                 return None
         return cls(np.concatenate(times), np.concatenate(seqs), np.concatenate(held))
 
@@ -80,16 +76,15 @@ class KeptMatches:
         return len(self._times) if end == END else int(np.searchsorted(self._times, end))
 
 
-_Answer = tuple[KeptMatches | None]
-"""The matches, or None if they are too many to be kept."""
-
-
 class MatchCache:
-    """Keeps the matches of the last questions. Thread safe."""
+    """Keeps the matches of questions in a cache. Thread safe.
 
-    def __init__(self) -> None:
-        self._kept: OrderedDict[Hashable, _Answer] = OrderedDict()
-        self._lock = threading.Lock()
+    Args:
+        cache: The cache; the matches of one question take half of it at most.
+    """
+
+    def __init__(self, cache: Cache) -> None:
+        self._cache = cache
         self._asking = threading.Lock()
 
     def matches(self, key: Hashable, ask: Callable[[], Query]) -> Matches:
@@ -99,23 +94,15 @@ class MatchCache:
             key: The question, and all that its answer depends on.
             ask: Makes the query, which has no time range.
         """
-        found = self._known(key)
+        found: tuple[CachedMatches | None] | None = self._cache.get("matches", key)
         if found is None:
             # A second client that asks the same waits, which takes no longer than to ask itself.
             with held(self._asking):
-                found = self._known(key) or (KeptMatches.of(ask()),)
-                with self._lock:
-                    self._kept[key] = found
-                    while len(self._kept) > _QUESTIONS or self._size() > MOST_BYTES:
-                        self._kept.popitem(last=False)
+                found = self._cache.made(
+                    "matches",
+                    key,
+                    make=lambda: (CachedMatches.of(ask(), self._cache.max_bytes // 2),),
+                    size_of=lambda made: made[0].size if made[0] is not None else 0,
+                )
         (kept,) = found
         return AskedMatches(ask()) if kept is None else kept
-
-    def _size(self) -> int:
-        return sum(kept.size for (kept,) in self._kept.values() if kept is not None)
-
-    def _known(self, key: Hashable) -> _Answer | None:
-        with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-            return self._kept.get(key)

@@ -70,7 +70,7 @@ class Context:
     @lazy
     def matches(self) -> MatchCache:
         """Matches of the last questions."""
-        return MatchCache()
+        return MatchCache(self.store.session.cache)
 
     @lazy
     def sql(self) -> SqlProcess:

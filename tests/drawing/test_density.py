@@ -22,6 +22,7 @@ from hybridlog.drawing import density_cache
 from hybridlog.drawing.chunk_parts import RecordedChunks
 from hybridlog.drawing.density import count, density, reading_work
 from hybridlog.drawing.density_cache import DensityCache
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
@@ -135,30 +136,25 @@ def test_the_ends_of_time(store: hl.Store) -> None:
             assert plain.counts.sum() == wanted
 
 
-def test_a_small_cache_forgets_and_stays_right(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(density_cache, "_MOST_BYTES", 20_000)
-    cache = DensityCache(store.session)
-    for begin in range(0, LENGTH, LENGTH // 16):
-        span = BASE + begin, BASE + begin + LENGTH // 16
-        found = cache.density(store.entry("a"), span, 500, sorted(TIMES))
-        for topic, counts in zip(found.topics, found.counts, strict=True):
-            assert (counts == _truth(topic, found.edges)).all()
-    (recorded,) = cache._recordings.values()
-    held = sum(block.counts.nbytes for block in recorded._blocks.values())
-    assert 0 < recorded._bytes == held <= 20_000
+def test_a_small_cache_forgets_and_stays_right(store: hl.Store) -> None:
+    session = store.session
+    before, session.cache = session.cache, Cache(20_000)
+    try:
+        cache = DensityCache(session)
+        for begin in range(0, LENGTH, LENGTH // 16):
+            span = BASE + begin, BASE + begin + LENGTH // 16
+            found = cache.density(store.entry("a"), span, 500, sorted(TIMES))
+            for topic, counts in zip(found.topics, found.counts, strict=True):
+                assert (counts == _truth(topic, found.edges)).all()
+    finally:
+        session.cache = before
 
 
-def test_what_is_added_to_an_estimate_is_one(store: hl.Store) -> None:
-    recorded = density_cache._Recorded(store.session)
-    key = 30, 0, "/steady"
+def test_what_is_added_to_an_estimate_is_one() -> None:
     ones = np.ones(4, np.int64)
-    recorded._add(key, ones, is_exact=False, parts=1)
-    recorded._add(key, 300 * ones, is_exact=True, parts=2)
-    block = recorded._blocks[key]
+    before = density_cache._Block.of(ones, is_exact=False, parts=1)
+    block = before.with_more(density_cache._Block.of(300 * ones, is_exact=True, parts=2))
     assert (block.counts.tolist(), block.exact, block.parts) == ([301] * 4, False, 2)
-    assert recorded._bytes == block.counts.nbytes
 
 
 class Reads:
@@ -187,6 +183,8 @@ class Reads:
 def test_the_cost_is_that_of_the_span(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     reads = Reads(monkeypatch)
     cache = DensityCache(store.session)
+    store.session.cache.drop("recording")  # of other tests
+    store.session.cache.drop("density")
     whole = (BASE, BASE + LENGTH)
     narrow = (BASE + LENGTH // 3, BASE + LENGTH // 3 + 20 * MS)
     # A narrow span reads the chunks around it, wherever it is.

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.drawing import match_cache
-from hybridlog.drawing.match_cache import KeptMatches, MatchCache
+from hybridlog.drawing.match_cache import CachedMatches, MatchCache
 from hybridlog.drawing.matches import (
     AskedMatches,
     Match,
@@ -21,6 +20,7 @@ from hybridlog.drawing.matches import (
     matches_before,
     ticks,
 )
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import UsageError
 
 from .conftest import BASE, MS, Drive
@@ -38,7 +38,7 @@ Made = Callable[[hl.Query], Matches]
 
 
 def kept(query: hl.Query) -> Matches:
-    found = KeptMatches.of(query)
+    found = CachedMatches.of(query, 1 << 30)
     assert found is not None
     return found
 
@@ -127,8 +127,8 @@ def test_pictures_without_width_are_refused(drive: Drive) -> None:
             ticks(matches, span, pixels)
 
 
-def test_the_last_questions_are_kept(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache = MatchCache()
+def test_the_last_questions_are_kept(drive: Drive) -> None:
+    cache = MatchCache(Cache(2 * 2500 * 32))
     asked: list[str] = []
 
     def matches(text: str) -> Matches:
@@ -138,7 +138,6 @@ def test_the_last_questions_are_kept(drive: Drive, monkeypatch: pytest.MonkeyPat
 
         return cache.matches(text, ask)
 
-    monkeypatch.setattr(match_cache, "MOST_BYTES", 2 * 2500 * 32)
     assert matches("on == true") is matches("on == true")
     assert matches("on == true").count_until(BASE + 10**12) == 2500
     matches("on == false")
@@ -148,7 +147,7 @@ def test_the_last_questions_are_kept(drive: Drive, monkeypatch: pytest.MonkeyPat
     matches("on == true")
     assert asked[3:] == ["on == true"]
     # A match and its interval take 32 bytes.
-    monkeypatch.setattr(match_cache, "MOST_BYTES", 2500 * 32 - 1)
+    cache = MatchCache(Cache(2 * (2500 * 32 - 1)))
     asked.clear()
     for _ in range(2):  # too many, which is known the second time
         found = matches("ticks != 0 and on == true")

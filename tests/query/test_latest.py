@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.query.query import Query
-from hybridlog.query.recent_chunks import RecentChunks
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
-from hybridlog_storage.messages import Batch
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -169,89 +165,6 @@ def test_who_changes_a_message_does_not_change_what_is_kept(
 
 
 # What is kept.
-
-
-def chunk(number: int, size: int) -> StoredChunk:
-    one = np.zeros(1, np.int64)
-    batch = Batch(
-        bytearray(size), one, one + size, np.zeros(1, np.int32), one, one, one.astype(np.uint32)
-    )
-    return StoredChunk(
-        segment=0,
-        number=number,
-        offset=1000 * number,
-        length=size,
-        trailer=0,
-        crc=0,
-        trailer_crc=0,
-        batch=batch,
-        seq=one,
-        compressed_size=size,
-    )
-
-
-class Reading:
-    """Counts what is read."""
-
-    def __init__(self, chunks: RecentChunks) -> None:
-        self._chunks = chunks
-        self.read: list[int] = []
-
-    def get(self, number: int, size: int = 1000) -> StoredChunk:
-        def read() -> StoredChunk:
-            self.read.append(number)
-            return chunk(number, size)
-
-        return self._chunks.get(("a", 0, number), read)
-
-
-def test_those_that_were_not_asked_for_longest_go_first() -> None:
-    reading = Reading(RecentChunks(3500))
-    for number in (1, 2, 3, 1, 4, 1, 2):
-        assert reading.get(number).number == number
-    assert reading.read == [1, 2, 3, 4, 2]  # 2 had to go for 4
-
-
-def test_a_chunk_without_room_is_given_and_not_kept() -> None:
-    reading = Reading(RecentChunks(3500))
-    reading.get(1)
-    assert len(reading.get(2, size=4000).batch.buffer) == 4000
-    assert reading.get(2, size=4000).number == 2
-    assert reading.get(1).number == 1
-    assert reading.read == [1, 2, 2]
-
-
-def test_nothing_is_kept_of_what_could_not_be_read() -> None:
-    chunks = RecentChunks()
-
-    def damaged() -> StoredChunk:
-        raise SegmentError("damaged")
-
-    for _ in range(2):
-        with pytest.raises(SegmentError):
-            chunks.get(("a", 0, 1), damaged)
-    assert Reading(chunks).get(1).number == 1
-
-
-def test_several_threads_ask_for_the_same_chunks() -> None:
-    chunks = RecentChunks(5500)
-    wrong: list[int] = []
-
-    def ask(seed: int) -> None:
-        reading = Reading(chunks)
-        numbers = np.random.default_rng(seed).integers(0, 10, 2000).tolist()
-        wrong.extend(number for number in numbers if reading.get(number).number != number)
-
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
-    kept = Reading(chunks)
-    for number in range(10):
-        kept.get(number)
-    assert len(kept.read) >= 5  # no more than five had room
 
 
 def test_a_segment_is_read_where_its_chunk_lies(

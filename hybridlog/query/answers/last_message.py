@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
 
 
+_ROW_BYTES = 44  # of a message's columns
+
+
 def message_at(
     session: Session, question: Question, counters: Counters, moment: TimeLike
 ) -> Message | None:
@@ -101,11 +104,13 @@ def _last_of(
         chunk = session.segment(recording.id, entry.segment).read_chunk(entry.place)
         counters.chunks_read += 1
         counters.bytes_read += chunk.length + chunk.trailer
+        # Arrays of messages share the buffer: changes to them must not change the cache.
+        chunk.batch.buffer = memoryview(chunk.batch.buffer).toreadonly()
         return chunk
 
     def read(entry: Chunk) -> StoredChunk:
         key = recording.id, entry.segment, entry.number
-        return session.recent_chunks.get(key, partial(load, entry))
+        return session.cache.made("chunk", *key, make=partial(load, entry), size_of=_size_of)
 
     chunks = session.chunks_before(recording, list(channels), span[1])
     found = last_message(chunks, channels, span[1], read)
@@ -185,3 +190,7 @@ def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> in
         return None
     # Rows are in order of arrival: of equal times, the last one is wanted.
     return int(rows[-1 - batch.log_time[rows][::-1].argmax()])
+
+
+def _size_of(chunk: StoredChunk) -> int:
+    return len(chunk.batch.buffer) + _ROW_BYTES * len(chunk.batch)

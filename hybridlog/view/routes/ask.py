@@ -103,7 +103,7 @@ def _matches(context: Context, question: PageQuestion) -> Matches:
     if recording.status == "open":
         return AskedMatches(question.query())
     asked = question.topics, question.where, question.within
-    key = recording.id, recording.status, recording.messages, recording.span, asked
+    key = recording.id, recording.status, frozenset(recording.digests.items()), asked
     return context.matches.matches(key, question.query)
 
 

@@ -1,0 +1,80 @@
+"""A cache of what was read or worked out, bounded in bytes."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Any, Final, Literal, TypeAlias, TypeVar, cast
+
+MAX_BYTES: Final = 224 << 20
+
+Kind: TypeAlias = Literal["chunk", "density", "matches", "recording"]
+Value = TypeVar("Value")
+
+
+class Cache:
+    """Values that can be made again. Thread safe; so must be the values.
+
+    A key is the kind of value and all that the value depends on, such as a digest.
+    Those that were not used for longest make room for others.
+
+    Args:
+        max_bytes: Bytes of all values together.
+    """
+
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self.max_bytes = max_bytes
+        self._values: OrderedDict[tuple[Hashable, ...], tuple[Any, int]] = OrderedDict()
+        self._size = 0
+        self._lock = threading.Lock()
+
+    def get(self, kind: Kind, *key: Hashable) -> Any:
+        """A value; None if it is not there."""
+        with self._lock:
+            if (kind, *key) not in self._values:
+                return None
+            self._values.move_to_end((kind, *key))
+            return self._values[kind, *key][0]
+
+    def put(self, kind: Kind, *key: Hashable, value: object, size: int) -> None:
+        """Keep a value, in place of the one of before; nothing if it is too large.
+
+        Args:
+            kind: Its kind.
+            key: All that it depends on.
+            value: The value.
+            size: Its bytes.
+        """
+        with self._lock:
+            self._remove((kind, *key))
+            if size > self.max_bytes:
+                return
+            self._values[kind, *key] = value, size
+            self._size += size
+            while self._size > self.max_bytes:
+                self._remove(next(iter(self._values)))
+
+    def made(
+        self,
+        kind: Kind,
+        *key: Hashable,
+        make: Callable[[], Value],
+        size_of: Callable[[Value], int],
+    ) -> Value:
+        """A value that is made where it is not there."""
+        found = self.get(kind, *key)
+        if found is None:
+            found = make()
+            self.put(kind, *key, value=found, size=size_of(found))
+        return cast("Value", found)
+
+    def drop(self, kind: Kind) -> None:
+        """Forget the values of a kind."""
+        with self._lock:
+            for key in [key for key in self._values if key[0] == kind]:
+                self._remove(key)
+
+    def _remove(self, key: tuple[Hashable, ...]) -> None:
+        if key in self._values:
+            self._size -= self._values.pop(key)[1]
