@@ -235,13 +235,13 @@ def test_a_name_that_is_taken(place: Path) -> None:
 def test_a_trusted_file_of_somebody_else_counts_for_nothing(place: Path) -> None:
     ann = User(place, 12345)
     script = (
-        "import sys; from hybridlog import consent\n"
+        "import sys; from hybridlog.index import consent\n"
         "consent.remember('a', 'mongodb://h/x')\n"
         "print(consent.is_trusted('a', 'mongodb://h/x'))"
     )
     assert ann.python("-c", script).lines == ["True"]
     (ann.home / "state").chmod(0o755)
-    ask = "from hybridlog import consent; print(consent.is_trusted('a', 'mongodb://h/x'))"
+    ask = "from hybridlog.index import consent; print(consent.is_trusted('a', 'mongodb://h/x'))"
     file = ann.home / "state/hybridlog/trusted.json"
     os.chown(file, 0, 0)
     file.chmod(0o644)

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tests.cli.fork_server import fork_server
+
 COMMAND = [sys.executable, "-m", "hybridlog"]
 BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
 """A wrapper: SIGINT is ignored, as for background jobs of scripts."""
@@ -52,11 +54,13 @@ def run(*arguments: object, store: Path | None = None, code: int | None = 0, **e
     """
     if store is not None:
         env["HYBRIDLOG_STORE"] = str(store)
-    ended = subprocess.run(
-        [*COMMAND, *(a if isinstance(a, bytes) else str(a) for a in arguments)],
+    words = [os.fsdecode(a) if isinstance(a, bytes) else str(a) for a in arguments]
+    variables = environment(**env)
+    ended = fork_server().run(words, variables, _LIMIT_S) or subprocess.run(
+        [*COMMAND, *words],
         stdin=subprocess.DEVNULL,
         capture_output=True,
-        env=environment(**env),
+        env=variables,
         timeout=_LIMIT_S,
         check=False,
     )
