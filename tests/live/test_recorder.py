@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from hybridlog.cli.live_options import recorder_options
-from hybridlog.cli.record import command as record_command
+from hybridlog.cli.record import record_command
 from hybridlog.cli.record_choices import RecordChoices
 from hybridlog.live import recorder as recorder_module
 from hybridlog.live.control_server import choose, request, running

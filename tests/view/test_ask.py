@@ -297,7 +297,7 @@ def test_odd_names(
         params = {"recording": label, **asked}
         told = client.get("export-command", params=params).json()
         done = CliRunner().invoke(
-            fetch.command, shlex.split(told["command"])[2:], catch_exceptions=False
+            fetch.fetch_command, shlex.split(told["command"])[2:], catch_exceptions=False
         )
         assert done.exit_code == 0, done.output
         sent = client.get("export", params=params).content
@@ -413,7 +413,7 @@ def test_the_command_line_writes_the_same_file(
     words = shlex.split(told["command"])
     assert words[:2] == ["hybridlog", "fetch"]
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(fetch.command, words[2:], catch_exceptions=False)
+    done = CliRunner().invoke(fetch.fetch_command, words[2:], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert (tmp_path / told["name"]).read_bytes() == sent.content
     assert told["count"] > 0
