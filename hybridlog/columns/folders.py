@@ -144,8 +144,10 @@ class TableFolders:
         place = self._root / TABLES / folder
         names = [n for n in files.names(place, depth=IN_TABLES) if n.endswith(SUFFIX)]
         shared = sorted(name for name in names if name.startswith(SHARED))
-        listed = shared_files(self._root, folder).get(self._recording)
-        self._is_listed, self._shared = listed is not None, listed or set()
+        is_new = goes is None  # and in no file yet
+        listed = None if is_new else shared_files(self._root, folder, self._recording)
+        self._is_listed = bool(listed)
+        self._shared = set() if not listed else listed[self._recording]
         waiting, old = addition, []
         if goes is not None:
             old = self._own_files(place, names, goes)
@@ -289,7 +291,7 @@ class TableFolders:
         schema = tables[0].schema
         table = pa.concat_tables(
             [one if one.schema.equals(schema) else one.cast(schema) for one in tables]
-        )
+        ).combine_chunks()
         kept = None if before is None else before.kept()
         in_front = False
         if kept is not None and before is not None:
@@ -365,19 +367,24 @@ def _folders(root: Path) -> list[str]:
     return sorted(name for name, about in found if "~" in name and S_ISDIR(about.st_mode))
 
 
-def shared_files(root: Path, folder: str) -> dict[str, set[str]]:
+def shared_files(root: Path, folder: str, recording: str = "") -> dict[str, set[str]]:
     """Names of the shared files of a folder, by the recordings in its list.
 
     A recording that is not listed may be in any of them.
+
+    Args:
+        root: The store.
+        folder: Name of the folder.
+        recording: Only this one; empty for all.
     """
     found: dict[str, set[str]] = {}
-    path = _list_of(root / TABLES / folder)
+    path, wanted = _list_of(root / TABLES / folder), recording.encode()
     with suppress(OSError):
         for line in files.read_file(path, _MAX_LIST_BYTES, depth=IN_TABLES).splitlines():
             content, _, checksum = line.rpartition(b" ")
-            if checksum == _checksum(content):
-                recording, *names = content.decode().split(" ")
-                found.setdefault(recording, set()).update(names)
+            if line.startswith(wanted) and checksum == _checksum(content):
+                known, *names = content.decode().split(" ")
+                found.setdefault(known, set()).update(names)
     return found
 
 

@@ -419,12 +419,13 @@ def _chunks(
     before = 0
     path = directory.recording(entry.label)
     contents = RecordingPayloads(path)
+    in_tables = tables.channels_of(entry, topics)
     for number, _, _ in entry.spans:
         with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
             summary = reader.summary()
-            is_in_tables = tables.chunks_with(entry, summary.table, topics)
             for place in summary.chunks:
-                if (number, place.number) not in missing and not is_in_tables[place.number]:
+                is_in_tables = not in_tables.isdisjoint(place.channels)
+                if (number, place.number) not in missing and not is_in_tables:
                     continue
                 try:
                     chunk = reader.read_chunk(place)

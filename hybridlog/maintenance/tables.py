@@ -8,8 +8,6 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog_storage.disk import files
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.chunk_table import ChunkTable
 
 
 def missing(
@@ -139,24 +136,20 @@ def _chunks(
     """Chunks with messages of some topics, in order; damaged ones are left out."""
     path = directory.recording(entry.label)
     contents = RecordingPayloads(path)
+    wanted = channels_of(entry, topics)
     for number, _, _ in entry.spans:
         with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
             summary = reader.summary()
-            is_wanted = chunks_with(entry, summary.table, topics)
             for place in summary.chunks:
-                if is_wanted[place.number]:
+                if not wanted.isdisjoint(place.channels):
                     with suppress(SegmentError):
                         yield reader.read_chunk(place), summary.channels
         writer.cut(number, entry.digests[str(number)])
 
 
-def chunks_with(entry: RecordingEntry, table: ChunkTable, topics: Collection[str]) -> list[bool]:
-    """For each chunk of a segment, True if it has messages of some topics."""
-    ids = [c.id for c in entry.channels if c.topic in topics]
-    chunk_of = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-    found = np.zeros(len(table.chunks), np.bool_)
-    found[chunk_of[np.isin(table.parts["channel"], ids)]] = True
-    return found.tolist()
+def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:
+    """Ids of the channels of some topics."""
+    return {channel.id for channel in entry.channels if channel.topic in topics}
 
 
 class TableChecker:
