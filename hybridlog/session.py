@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
-from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.entries import channels_of, summary_of, take_inventory
 from hybridlog.index.connection import Connection
 from hybridlog.maintenance.opening import (

@@ -21,7 +21,7 @@ from hybridlog_storage.errors import StoreError
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import ColumnCache
     from hybridlog.columns.payload_rows import Rebuilt
     from hybridlog.query.question import RecordedChannel
-    from hybridlog.sql.counts import ScanCounts
     from hybridlog_storage.journal import PayloadFile
 
 _MAX_REBUILT: Final = 3  # row groups of messages in memory: neighbouring chunks share one
@@ -179,7 +178,7 @@ class ArrayTable(TopicTable):
         place: tuple[int, int],
         offset: NDArray[np.int64],
         paths: Collection[str] | None,
-        counts: ScanCounts,
+        tell: Callable[[Path, int], None],
     ) -> Any:
         """Fields of some messages of a chunk.
 
@@ -187,7 +186,7 @@ class ArrayTable(TopicTable):
             place: Numbers of the segment and the chunk.
             offset: int64[n], where each lies in the content of the chunk.
             paths: Dotted paths of the fields; None for all.
-            counts: Count what is read.
+            tell: Called with the file and the number of each row group that is read.
 
         Returns:
             n rows, typed as the codec's; None if the columns do not have all of it.
@@ -200,7 +199,7 @@ class ArrayTable(TopicTable):
             if found is None:
                 continue
             part = TablePart(reader, *found, FIRST, LAST)
-            counts.add_group(reader.path, part.group)
+            tell(reader.path, part.group)
             try:
                 own, records = self.read(part, paths, {"ref"})
                 fields = self._fitted(records, kind)

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.columns import payload_files
-from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of, topic_folder
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog.maintenance.opening import put_entry

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.contents import open_segment
+from hybridlog.columns.payload_files import open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.opening import put_entry

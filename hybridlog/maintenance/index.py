@@ -10,7 +10,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again

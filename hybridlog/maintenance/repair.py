@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.contents import open_segment
+from hybridlog.columns.payload_files import open_segment
 from hybridlog.entries import journal_from_segments, take_inventory, unlisted_lines
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, rebuild

@@ -8,8 +8,8 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.columns import payload_files
-from hybridlog.columns.contents import RecordingPayloads, open_segment
 from hybridlog.columns.layout import thinned_name
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.report import CompactedTopic
 from hybridlog_storage import journal

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables

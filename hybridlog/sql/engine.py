@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.session import Session
-    from hybridlog.sql.counts import ScanCounts
+    from hybridlog.sql.pieces import ScanCounts
     from hybridlog.sql.topic_view import Remarks
 
 Params = Sequence[Any] | Mapping[str, Any] | None

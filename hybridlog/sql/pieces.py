@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -20,11 +21,12 @@ from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
 from hybridlog.sql.columns import whole_message
-from hybridlog.sql.counts import Paths, ScanCounts
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.columns.column_file import TablePart
     from hybridlog.columns.payload_reader import ArrayTable
     from hybridlog.columns.topic_table import TopicTable
@@ -36,6 +38,36 @@ if TYPE_CHECKING:
 _FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""
 _MAX_CHUNKS: Final = 4  # read chunks that are kept
+
+Paths = Collection[str] | None
+"""Dotted paths of fields to read; None for all."""
+
+
+@dataclass(slots=True)
+class ScanCounts:
+    """Counts of what was read for a query.
+
+    Attributes:
+        files: Paths of the files of tables, and of payloads, that were read.
+        groups: Files and numbers of the row groups that were read.
+        chunks: Chunks that were read.
+        payload_bytes: Bytes of payloads that were decoded.
+    """
+
+    files: set[str] = field(default_factory=set)
+    groups: set[tuple[str, int]] = field(default_factory=set)
+    chunks: int = 0
+    payload_bytes: int = 0
+
+    @property
+    def row_groups(self) -> int:
+        """Number of row groups that were read."""
+        return len(self.groups)
+
+    def add_group(self, path: Path, group: int) -> None:
+        """Count a row group."""
+        self.files.add(str(path))
+        self.groups.add((str(path), group))
 
 
 class Rows(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.record.marks import MARKS
-from hybridlog.sql.counts import ScanCounts
+from hybridlog.sql.pieces import ScanCounts
 from hybridlog_storage.catalog import ChannelStats
 
 if TYPE_CHECKING:

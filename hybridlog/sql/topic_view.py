@@ -26,8 +26,7 @@ from hybridlog.sql.columns import (
     summary_values,
     view_columns,
 )
-from hybridlog.sql.counts import ScanCounts
-from hybridlog.sql.pieces import Rows, RowSource, TopicOfRecording
+from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
 
 if TYPE_CHECKING:
@@ -467,7 +466,7 @@ def _from_payloads(
         good = np.arange(len(group))
         arrays, records = recording.arrays, None
         if arrays is not None:
-            records = arrays.at(place, ref["off"][group], paths, counts)
+            records = arrays.at(place, ref["off"][group], paths, counts.add_group)
         if records is None:
             chunk = recording.chunk(*place, counts)
             buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.columns.contents import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog_storage import journal
