@@ -1029,14 +1029,14 @@ SILENT = [
         ),
         (
             "what-nobody-knows-is-nothing",
-            "missing = sum(known) if len(known) == len(late) else None",
-            "missing = sum(known)",
+            "            missing = None\n",
+            "            pass\n",
             UNWRITTEN,
         ),
         (
             "unwritten-messages-of-all-topics-count",
-            "for t in question.topics)",
-            "for t in taken)",
+            "sum(late.get(topic, 0) for topic in asked)",
+            "sum(late.values())",
             UNWRITTEN,
         ),
         (

@@ -536,8 +536,8 @@ def documented_classes() -> list[type]:
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
+    from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.field_statistics import FieldStatistics
-    from hybridlog.query.answers.lost import Lost
     from hybridlog.query.counters import Counters
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.record.recorder import RecordReport
@@ -547,7 +547,7 @@ def documented_classes() -> list[type]:
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
-    answers = [Rehearsal, Lost, FieldStatistics, Aligned, Synced, Intervals, Interval]
+    answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]

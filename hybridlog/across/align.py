@@ -16,7 +16,8 @@ from hybridlog.across.match import HOWS, UNKNOWN, How, match
 from hybridlog.across.regular_times import RegularTimes
 from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, together
 from hybridlog.frames.names import free_name
-from hybridlog.query.answers.remarks import about_names, completeness, remarks
+from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.remarks import about_names, remarks
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
@@ -166,8 +167,9 @@ class Aligned:
         if len(lines) > _SHOWN:
             found.append(f"{counted(len(lines) - _SHOWN, 'more column')} are empty in some rows.")
         for stream in streams:
-            found += remarks(self._session, stream.question, stream.counters, (), is_empty=False)
-        found += completeness(self._session, *(stream.question for stream in streams))
+            found += remarks(self._session, stream.question, (), is_empty=False)
+        asked_for = [(stream.question, stream.counters) for stream in streams]
+        found += completeness_of(self._session, *asked_for[0], *asked_for[1:]).sentences
         return [*dict.fromkeys(found)]
 
     def __repr__(self) -> str:

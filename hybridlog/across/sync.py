@@ -12,7 +12,7 @@ import numpy as np
 from hybridlog.across.approximate_time import approximate_sets
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
-from hybridlog.query.answers.remarks import completeness
+from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
@@ -128,7 +128,7 @@ class Synced(Sequence[tuple["Message", ...]]):
         """Sentences about the sets: messages that are in none, and what the topics may lack."""
         session, found = self._opened(), list(self._why_left_out)
         for topic in self._topics:
-            found += completeness(session, topic.question)
+            found += completeness_of(session, topic.question).sentences
         return [*dict.fromkeys(found)]
 
     def __len__(self) -> int:

@@ -115,7 +115,7 @@ def align_command(
             queries[0] = queries[0].between(*between)
         if strict:
             for query in queries:
-                query.check_complete()
+                query.completeness().check()
         aligned = opened.align(
             queries[0],
             queries[1:],

@@ -527,9 +527,9 @@ def latched(counters: Counters) -> str:
 
 def print_lost(query: Query, count: int) -> None:
     """Print the limits of a count of messages, if any of the range are lost."""
-    lost = query.lost()
-    if lost:
-        output.note(lost.describe(count, query.question.limit))
+    found = query.completeness()
+    if found.has_losses:
+        output.note(found.describe(count, query.question.limit))
 
 
 def print_remarks(query: Query, topics: Sequence[str], *, is_empty: bool | None = None) -> None:

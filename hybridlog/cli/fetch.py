@@ -146,7 +146,7 @@ def fetch_command(**parameters: Any) -> None:
                 raise
         count = None
         if choices.strict:
-            query.check_complete(payloads=not choices.count)
+            query.completeness().check(payloads=not choices.count)
         if choices.count:
             count = query.count()
             output.say(str(count))

@@ -14,12 +14,12 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
-from hybridlog.cli.losses import describe_coverage
 from hybridlog.cli.ls import print_sizes, recording_dict, size_dict, status_text, with_misfits
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
+from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.choice import Choice
-from hybridlog.record.losses import line_of, losses_of
+from hybridlog.record.losses import losses_of
 from hybridlog.wording import MOST_LISTED
 from hybridlog_storage.errors import SegmentError, StoreError
 
@@ -132,7 +132,7 @@ def _as_dict(
     return {
         **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
-        "coverage": describe_coverage(entry, losses_of(entry)),
+        "coverage": coverage(entry, losses_of(entry)),
         "losses": losses_of(entry),
         "notes": entry.notes,
         "marks": entry.marks,
@@ -210,7 +210,7 @@ def _print_recording(
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
         ("messages", str(entry.messages)),
         ("stored", held),
-        *_coverage(entry, describe_coverage(entry, losses)),
+        *_coverage(entry, coverage(entry, losses)),
         *(("", line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
@@ -262,7 +262,7 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
     if entry.span is None or not sys.stdout.isatty():
         return [("coverage", words)]
     from hybridlog.cli.sparkline import bar
-    from hybridlog.drawing.coverage import lost_parts
+    from hybridlog.query.answers.lost import lost_parts
     from hybridlog.record.losses import extent_of
 
     return [("coverage", bar(lost_parts(entry, extent_of(entry), _LETTERS))), ("", words)]

@@ -10,7 +10,8 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.live_table import closing_rows
-from hybridlog.record.losses import Cause, line_of
+from hybridlog.query.answers.completeness import line_of
+from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,

@@ -1,4 +1,4 @@
-"""`hybridlog losses`, and how complete a recording is in words."""
+"""`hybridlog losses`: what is missing from recordings."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
-from hybridlog.record.losses import Cause, in_words, losses_of
-from hybridlog.wording import counted
+from hybridlog.record.losses import losses_of
 
 if TYPE_CHECKING:
     from hybridlog.query.choice import Choice
@@ -92,33 +91,3 @@ def _cells(row: dict[str, Any]) -> list[str]:
         "" if begin is None or end is None else output.short_duration(end - begin),
         f"{file}{row.get('reason') or ''}",
     ]
-
-
-_NOT_LOST = {Cause.THROTTLE: "left out by a throttle", Cause.DEGRADE: "without their payload"}
-
-
-def describe_coverage(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
-    """The completeness of a recording in words: `complete`, or the number of missing messages."""
-    found = _completeness(entry, [loss for loss in losses if loss["cause"] not in _NOT_LOST])
-    for cause, what in _NOT_LOST.items():
-        messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
-        found += f"; {counted(messages, 'message')} {what}" if messages else ""
-    return found
-
-
-def _completeness(entry: RecordingEntry, losses: list[dict[str, Any]]) -> str:
-    if not losses:
-        if entry.status == "open":
-            return "being recorded"
-        if entry.status == "unproven":
-            return "not known: its journal was lost, so a segment may be missing"
-        # An empty log is complete; a robot that sent nothing may not have been reached.
-        is_live = not entry.source["bytes"]
-        return "nothing was received" if is_live and not entry.messages else "complete"
-    lost = sum(loss["count"] or 0 for loss in losses)
-    if any(loss["count"] is None for loss in losses):
-        return in_words(losses)
-    if not lost:
-        return f"complete, although its source was damaged in {counted(len(losses), 'place')}"
-    share = min(100 * entry.messages / (entry.messages + lost), 99.99)
-    return f"{in_words(losses)} ({share:.2f} % there)"

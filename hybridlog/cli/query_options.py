@@ -73,7 +73,7 @@ def asked(
     if fields is not None:
         query = query.fields(*parse_fields(fields))
     if strict:
-        query.check_complete()
+        query.completeness().check()
     return query
 
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.losses import describe_coverage
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
 from hybridlog.cli.signals import if_stopped
+from hybridlog.query.answers.completeness import coverage
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import (
     AlreadyRecordedError,
@@ -590,7 +590,7 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
         losses = losses_of(report.entry)
         output.note(
             f"{path} is damaged: {output.stored(report.entry.messages)}; "
-            f"{describe_coverage(report.entry, losses)}."
+            f"{coverage(report.entry, losses)}."
         )
         problems.append(SourceDamagedError(str(path)))
     return problems

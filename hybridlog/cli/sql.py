@@ -62,7 +62,7 @@ def sql_command(
             known = set(opened.topics())
             topics = [topic for topic in connection.topics(text) if topic in known]
             if strict and topics:
-                opened.query(topics).check_complete()
+                opened.query(topics).completeness().check()
 
         if is_prompt:
             from hybridlog.cli.sql_prompt import run_prompt

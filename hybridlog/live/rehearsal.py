@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog.live.snapshots import Trigger
-from hybridlog.query.answers.remarks import completeness
+from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.latching import depth_of, publisher_of
@@ -128,7 +128,7 @@ def rehearse(
         messages, size = _kept(session, counters, asked, spans)
         payload += int(size.sum())
         parts.append((entry.id, np.column_stack([spans, messages])))
-    remarks += completeness(session, everything)
+    remarks += completeness_of(session, everything).sentences
     counters.elapsed_s = time.monotonic() - started
     return Rehearsal(
         text,

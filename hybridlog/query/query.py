@@ -32,7 +32,6 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
-    IncompleteError,
     PayloadError,
     TopicError,
     UsageError,
@@ -49,17 +48,16 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.attachments import Extras
     from hybridlog.message import Message
+    from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.answers.interval_queries import IntervalQueries
-    from hybridlog.query.answers.lost import Lost
     from hybridlog.query.answers.match_times import MatchTimes
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.summary import RecordingSummary
 
@@ -920,57 +918,15 @@ class Query:
         return {channel.channel.message_encoding for channel in spoken or examples}
 
     @of_one_moment
-    def doubtful(self) -> list[RecordingEntry]:
-        """The recordings that have losses, have not ended, or are not proved to be whole."""
-        return self.session.doubtful(self.question)
-
-    @of_one_moment
-    def lost(self) -> Lost:
-        """The messages that are missing from the asked range, as the loss ledger knows.
+    def completeness(self) -> Completeness:
+        """What the last answer lacks, or, without one, an answer that would be given now.
 
         Losses of topics in conditions count as an unknown number.
-
-        Raises:
-            TimeError: the range is empty, or outside all recordings.
         """
-        from hybridlog.query.answers.lost import lost_in
+        from hybridlog.query.answers.lost import completeness_of
 
-        found = lost_in(self.session, self.question)
-        if any(lost_in(self.session, one.question) for one in self.conditions):
-            found = replace(found, is_exact=False)
-        return found
-
-    @of_one_moment
-    def check_complete(self, *, payloads: bool = False) -> None:
-        """Check that no message of the asked range is lost, or not written yet.
-
-        Args:
-            payloads: True to check that no payload is missing, too.
-
-        Raises:
-            IncompleteError: some are.
-            TimeError: the range is empty, or outside all recordings.
-        """
-        from hybridlog.query.answers.lost import unindexed, unwritten
-
-        found = self.lost()
-        if found:
-            raise IncompleteError(
-                f"{found.told} in this range; `hybridlog losses` says where. Without --strict the "
-                "rest is given."
-            )
-        for question in (self.question, *(one.question for one in self.conditions)):
-            late = [told for _, told in unwritten(self.session, question)]
-            if question.predicate is not None and question.predicate.needs_index:
-                planner = Planner(self.session, question, Counters())
-                late += map(unindexed, filter(None, [planner.count_unindexed(planner.parts())]))
-            if late:
-                raise IncompleteError(" ".join(late))
-        if payloads and found.reduced:
-            raise IncompleteError(
-                f"Of {found.reduced} messages in this range only the fields are stored. Without "
-                "--strict the rest is given."
-            )
+        others = ((one.question, one.counters) for one in self.conditions)
+        return completeness_of(self.session, self.question, self.counters, *others)
 
     @of_one_moment
     def remarks(self, *names: str, is_empty: bool | None = None) -> list[str]:
@@ -984,17 +940,15 @@ class Query:
             names: The topics as they were written; further topics may end with a short name.
             is_empty: Whether the answer was empty; without, if `counters` has no messages.
         """
-        from hybridlog.query.answers.remarks import completeness, remarks
+        from hybridlog.query.answers.remarks import remarks
 
         if is_empty is None:
             is_empty = not self.counters.messages
-        found: list[str] = []
+        found = [*self.completeness().sentences]
         for one in self.conditions:
             nothing = self.question.during is not None and not self.question.during
-            found += remarks(self.session, one.question, one.counters, (), is_empty=nothing)
-        found += remarks(self.session, self.question, self.counters, names, is_empty=is_empty)
-        asked = (self.question, *(one.question for one in self.conditions))
-        found += completeness(self.session, *asked, counters=self.counters)
+            found += remarks(self.session, one.question, (), is_empty=nothing)
+        found += remarks(self.session, self.question, names, is_empty=is_empty)
         return [*dict.fromkeys(found)]
 
     @of_one_moment

@@ -8,12 +8,11 @@ hour therefore costs at most one row for each flush. Readers join successive row
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.wording import counted
 from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
@@ -171,28 +170,6 @@ def _uncounted(cause: str, reason: str) -> dict[str, Any]:
     """A loss of an unknown number of messages."""
     row: dict[str, Any] = {"cause": cause, "file": "", "offset": None, "reason": reason}
     return row | {"count": None, "topic": None}
-
-
-def in_words(losses: Collection[Mapping[str, Any]]) -> str:
-    """The number of lost messages: `at least 4 messages lost in 2 places`."""
-    lost = sum(loss["count"] or 0 for loss in losses)
-    known = counted(lost, "message")
-    if any(loss["count"] is None for loss in losses):
-        known = f"at least {known}" if lost else "an unknown number of messages"
-    return f"{known} lost in {counted(len(losses), 'place')}"
-
-
-def line_of(loss: Mapping[str, Any]) -> str:
-    """A row of the ledger in words."""
-    count = "messages" if loss["count"] is None else counted(loss["count"], "message")
-    place = f" at byte {loss['offset']}" if loss.get("offset") is not None else ""
-    file = f" {loss['file']}{place}:" if loss.get("file") else ""
-    topic = f" on {loss['topic']}" if loss.get("topic") else ""
-    if loss["cause"] == Cause.THROTTLE:
-        return f"{count}{topic} left out by a throttle"
-    said = f"{file} {loss['reason']}".rstrip()
-    lost = "" if loss["count"] == 0 else f"{count}{topic} lost, "
-    return f"{lost}{loss['cause']}{':' if said else ''}{said}"
 
 
 def was_cut_short(entry: RecordingEntry) -> bool:

@@ -290,7 +290,7 @@ class SqlAnswer:
 
     def told(self) -> list[str]:
         """What it may lack, in sentences; it has been computed."""
-        from hybridlog.query.answers.remarks import completeness
+        from hybridlog.query.answers.lost import completeness_of
 
         found = self.remarks
         lines = []
@@ -304,7 +304,7 @@ class SqlAnswer:
                 f"{topic}: {counted(count, 'message')} {have} no fields: reduced under pressure."
             )
         question = Question(tuple(found.topics), tuple(found.recordings))
-        return [*lines, *completeness(self._connection.engine.session, question)]
+        return [*lines, *completeness_of(self._connection.engine.session, question).sentences]
 
     def run(self) -> None:
         """Compute a statement that changes something; the answer is its result."""

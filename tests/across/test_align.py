@@ -489,7 +489,7 @@ def test_losses_of_an_unknown_time_explain_no_row(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store") as store:
         aligned = store.align("/a", "/b")
         aligned.to_arrow()
-        assert store.topic("/b").lost()
+        assert store.topic("/b").completeness().has_losses
         assert aligned.remarks() == [
             "/b: 1 of 1 row is empty: no message came before.",
             "now has lost its journal, so this answer may not be complete.",

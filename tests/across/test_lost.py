@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.query.answers.lost import Lost
+from hybridlog.query.answers.completeness import Completeness
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.messages import Channel
@@ -67,29 +67,32 @@ def test_counts_have_limits(damaged: Damaged) -> None:
         (damaged.store.topic("n").in_recording("whole"), 0),
         (topic.during(topic.between("+6s", "+7s").windows("1s", "500ms")), 1),
     ):
-        found = query.lost()
-        assert (found.messages, found.is_exact, bool(found)) == (lost, True, lost > 0)
+        found = query.completeness()
+        assert (found.messages, found.is_exact, found.has_losses) == (lost, True, lost > 0)
         assert len(found.rows) == lost
         count = query.count()
         assert found.limits(count) == (count, count + lost)
-    assert topic.lost().describe(9) == "9; 3 lost in this range: 9 to 12"
-    assert topic.limit(2).lost().describe(2, 2) == "2; 3 lost in this range: 2 to 2"
+    assert topic.completeness().describe(9) == "9; 3 lost in this range: 9 to 12"
+    assert topic.limit(2).completeness().describe(2, 2) == "2; 3 lost in this range: 2 to 2"
     # A condition on a topic with losses may hold at other times, too.
     near = damaged.store.topic("other").where("n: v == 1", within="2s")
-    assert (near.lost().messages, near.lost().is_exact) == (0, False)
+    assert (near.completeness().messages, near.completeness().is_exact) == (0, False)
 
 
 def test_numbers_that_nobody_knows() -> None:
-    assert Lost(4, False, 0, ()).describe(297) == "297; at least 4 lost in this range: 297 or more"
-    unknown = Lost(0, False, 0, ())
+    assert (
+        Completeness(4, is_exact=False).describe(297)
+        == "297; at least 4 lost in this range: 297 or more"
+    )
+    unknown = Completeness(0, is_exact=False)
     assert unknown.describe(1) == "1; an unknown number lost in this range: 1 or more"
     assert unknown.limits(3, 7) == (3, 7)
-    assert Lost(4, True, 0, ()).limits(297) == (297, 301)
-    assert not Lost(0, True, 9, ())
-    assert Lost(1, True, 0, ()).told == "1 message is lost"
-    assert Lost(1, False, 0, ()).told == "at least 1 messages are lost"
-    assert unknown.told == "an unknown number of messages are lost"
-    assert Lost(0, True, 5, ()).told == "no message is lost"
+    assert Completeness(4, is_exact=True).limits(297) == (297, 301)
+    assert not Completeness(0, is_exact=True, reduced=9).has_losses
+    assert str(Completeness(1, is_exact=True)) == "1 message is lost"
+    assert str(Completeness(1, is_exact=False)) == "at least 1 messages are lost"
+    assert str(unknown) == "an unknown number of messages are lost"
+    assert str(Completeness(0, is_exact=True, reduced=5)) == "no message is lost"
 
 
 def seconds(found: Intervals) -> list[tuple[float, float, int]]:
@@ -136,9 +139,9 @@ def test_the_three_states_share_out_the_time(damaged: Damaged) -> None:
 
 def test_an_answer_that_must_be_complete(damaged: Damaged) -> None:
     topic = damaged.store.topic("n")
-    topic.between("+0s", "+4s").check_complete(payloads=True)
+    topic.between("+0s", "+4s").completeness().check(payloads=True)
     with pytest.raises(IncompleteError, match="3 messages are lost in this range"):
-        topic.check_complete()
+        topic.completeness().check()
     assert IncompleteError.exit_code == 11
 
 
@@ -190,10 +193,13 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
         ("+8s", "+9s", [lack.format("1 message lost in 1 place (segment)")]),
     ):
         asked = topic.between(begin, end)
-        assert (asked.remarks(is_empty=False), bool(asked.lost())) == (said, bool(said))
+        assert (asked.remarks(is_empty=False), asked.completeness().has_losses) == (
+            said,
+            bool(said),
+        )
     # The message that was lost may have been the current one.
     assert topic.at_time("+4.5s").remarks() == [lack.format("1 message lost in 1 place (segment)")]
-    assert topic.at_time("+4.5s").lost()
+    assert topic.at_time("+4.5s").completeness().has_losses
     assert topic.at_time("+3.5s").remarks() == []
     with pytest.raises(IncompleteError):
-        topic.at_time("+4.5s").check_complete()
+        topic.at_time("+4.5s").completeness().check()

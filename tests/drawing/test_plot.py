@@ -13,11 +13,11 @@ import pytest
 from PIL import Image
 
 from hybridlog.cli.sparkline import bar, densities, sparkline
-from hybridlog.drawing.coverage import lost_parts
 from hybridlog.drawing.figure import figure
 from hybridlog.drawing.lines import MOST, Line, lines
 from hybridlog.drawing.page import increasing
 from hybridlog.drawing.series import Series
+from hybridlog.query.answers.lost import lost_parts
 from hybridlog.record.losses import Cause
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError

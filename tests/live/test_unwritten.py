@@ -40,14 +40,14 @@ def test_the_number_is_that_of_the_topics_asked(tmp_path: Path) -> None:
         assert query.count() == 2
         expected = "live is being recorded: 3 messages not written yet, nor in this answer."
         assert query.remarks() == [expected]
-        assert query.lost().unwritten == 3
-        assert not query.lost()
+        assert query.completeness().unwritten == 3
+        assert not query.completeness().has_losses
         with pytest.raises(IncompleteError, match="3 messages not written yet"):
-            query.check_complete()
+            query.completeness().check()
         quiet = store.topic("/quiet")
         assert quiet.remarks() == []
-        assert quiet.lost().unwritten == 0
-        quiet.check_complete()
+        assert quiet.completeness().unwritten == 0
+        quiet.completeness().check()
 
 
 def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Pa
             (query.during(early), 0),
             (query.between(None, 2 * SECOND).clock("header"), 3),
         ):
-            assert part.lost().unwritten == unwritten, part
+            assert part.completeness().unwritten == unwritten, part
             assert len(part.remarks(is_empty=False)) == (unwritten > 0)
         options = ["fetch", "-t", "/a", "--count", "--strict", "--between", "start"]
         done = run(*options, "2000000000ns", store=path)
@@ -146,16 +146,16 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
         assert query.remarks(is_empty=False) == [
             "own is being recorded: up to 0.5 s not written yet, nor in this answer."
         ]
-        assert query.lost().unwritten is None
-        assert not query.lost()
+        assert query.completeness().unwritten is None
+        assert not query.completeness().has_losses
         with pytest.raises(IncompleteError, match=r"up to 0\.5 s not written yet"):
-            query.check_complete()
-        query.between(None, 2 * SECOND).check_complete()
+            query.completeness().check()
+        query.between(None, 2 * SECOND).completeness().check()
         assert "up to 0.5 s not written yet" in run("fetch", "-t", "/a", "--count", store=path).err
         recording.close()
         assert query.remarks(is_empty=False) == []
-        assert query.lost().unwritten == 0
-        query.check_complete()
+        assert query.completeness().unwritten == 0
+        query.completeness().check()
 
 
 def test_what_the_index_lacks_is_told_where_mongodb_answers(
@@ -176,7 +176,7 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(
         assert raw.count() == len(documents)
         assert any(late in line for line in raw.remarks(is_empty=False))
         with pytest.raises(IncompleteError, match=late):
-            raw.between(None, 5 * SECOND + 1).check_complete()
+            raw.between(None, 5 * SECOND + 1).completeness().check()
         # What others answer is whole.
         same = query.where("data == 'x'")
         assert same.count() == len(list(same)) == 5

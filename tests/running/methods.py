@@ -322,8 +322,10 @@ def _second(known: Known, *topics: str) -> list[Sent]:
 
 
 def _lost(store: hl.Store) -> Any:
-    said, arm = store.topic("said").lost(), store.topic("arm").lost()
-    return (said.messages, said.is_exact, bool(arm)), said.told
+    said, arm = (store.topic(name).completeness() for name in ("said", "arm"))
+    strict = store.topic("arm").between(FIRST_S, LAST_S).completeness()
+    refused = refusal(said.check), refusal(strict.check)
+    return (said.messages, said.is_exact, arm.has_losses), str(said), refused
 
 
 METHODS: dict[str, Rule] = {
@@ -423,13 +425,6 @@ METHODS: dict[str, Rule] = {
         lambda s: sorted(c.channel.topic for c in s.all_topics().channels()),
         lambda _: sorted(CHANNELS),
     ),
-    "check_complete": Rule(
-        lambda s: (
-            refusal(s.topic("said").check_complete),
-            refusal(s.topic("arm").between(FIRST_S, LAST_S).check_complete),
-        ),
-        lambda _: (IncompleteError.__name__, ""),
-    ),
     "check_range": Rule(
         lambda s: (
             refusal(s.topic("said").between(0, SECOND).check_range),
@@ -438,6 +433,14 @@ METHODS: dict[str, Rule] = {
         lambda _: (TimeError.__name__, ""),
     ),
     "clock": Rule(_clocks, _right_clocks),
+    "completeness": Rule(
+        _lost,
+        lambda _: (
+            (3, True, False),
+            "3 messages are lost",
+            (IncompleteError.__name__, ""),
+        ),
+    ),
     "copy": Rule(lambda s: s.topic("arm").copy().count(), lambda k: len(k.of("/arm"))),
     "count": Rule(
         lambda s: (
@@ -463,9 +466,6 @@ METHODS: dict[str, Rule] = {
         ),
     ),
     "directory": Rule(lambda s: s.topic("arm").directory == s.directory.path, lambda _: True),
-    "doubtful": Rule(
-        lambda s: [entry.label for entry in s.topic("arm").doubtful()], lambda _: [LABEL]
-    ),
     "during": Rule(
         lambda s: _thrice(s.topic("said", "cam").during(_during(s))),
         lambda k: _right_thrice(_second(k, "/said", "/cam")),
@@ -540,7 +540,6 @@ METHODS: dict[str, Rule] = {
         lambda k: [in_force(k, FIRST_S), in_force(k, k.span[1] + 1 - 200 * MS)],
     ),
     "limit": Rule(lambda s: seqs(s.all_topics().limit(23)), lambda k: seqs(k.of()[:23])),
-    "lost": Rule(_lost, lambda _: ((3, True, False), "3 messages are lost")),
     "match_times": Rule(
         lambda s: sorted(
             pair

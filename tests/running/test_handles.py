@@ -72,7 +72,7 @@ def test_a_segment_that_cannot_be_read_any_more_is_told(
             while not store.topics() or store.topic("said").count() < 1:
                 assert time.monotonic() < deadline
                 time.sleep(0.02)
-            assert not store.topic("said").lost()
+            assert not store.topic("said").completeness().has_losses
             before = recording.stored
             recording.write(SAID, b'{"n": 2}', log_time=START + 1)
             while recording.stored == before:
@@ -84,9 +84,9 @@ def test_a_segment_that_cannot_be_read_any_more_is_told(
 
             with monkeypatch.context() as patch:
                 patch.setattr(SegmentReader, "read", fail)
-                assert store.topic("said").lost()
+                assert store.topic("said").completeness().has_losses
             assert store.topic("said").count() == 2
-            assert not store.topic("said").lost()
+            assert not store.topic("said").completeness().has_losses
 
 
 def test_entries_belong_to_their_moment(tmp_path: Path) -> None:

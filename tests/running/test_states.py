@@ -25,7 +25,7 @@ from tests.running.sequence import SAID, START, Known, messages
 from tests.running.stores import copy_of
 from tests.scale.cost import cost_of
 
-ABOUT_LOSSES = {"lost", "check_complete", "remarks"}
+ABOUT_LOSSES = {"completeness", "remarks"}
 """What a crash has cost is lost, too."""
 
 
@@ -53,8 +53,8 @@ def test_a_copy_that_cannot_be_written(
     with hl.open(copied, mongo=NO_MONGODB) as store:
         assert store.entry(LABEL).status == "unfinished"
         check(store, known)
-        lost = store.topic("arm").lost()
-        assert (bool(lost), lost.is_exact) == (True, False)
+        found = store.topic("arm").completeness()
+        assert (found.has_losses, found.is_exact) == (True, False)
         assert list(copied.glob("recordings/live/*.open"))
 
 

@@ -316,7 +316,7 @@ def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]
     client = asking(odd)
     asked = {"recording": DAMAGED, "topic": "/large", "where": "_meta.seq >= 0"}
     query = odd.topic("/large").in_recording(DAMAGED)
-    lost = query.lost()
+    lost = query.completeness()
     assert 0 < lost.messages < 60
     want = lost.describe(query.count())
     assert "lost in this range" in want

@@ -1,19 +1,29 @@
-"""Messages that are missing from the range of a question: lost, or not written yet."""
+"""Finds what an answer lacks: messages that are lost, not written or not indexed yet."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlog.query.answers.completeness import (
+    JOURNAL_LOST,
+    NOT_LOST,
+    Completeness,
+    about_losses,
+    left_out,
+    not_indexed,
+    not_written,
+)
+from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
+from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
-from hybridlog.wording import counted
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import HybridlogError, TimeError
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
@@ -24,104 +34,82 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
-JOURNAL_LOST = "journal lost"
-"""Cause of a row for what may have been lost with a journal."""
 _INTERVAL_S = 1.0  # flush interval of recorders that do not say it
 _EVERYTHING = np.array([[BEGIN, END]], np.int64)
 
 
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """Messages that are missing from the range of a question.
+def completeness_of(
+    session: Session,
+    question: Question,
+    counters: Counters | None = None,
+    *others: tuple[Question, Counters | None],
+) -> Completeness:
+    """How complete an answer is.
 
-    Attributes:
-        messages: Number of messages that are known to be lost; of a loss that reaches out of
-            the range, all of it.
-        is_exact: False if an unknown number is lost besides.
-        reduced: Messages of which only the fields are stored.
-        rows: Rows of the loss ledger, with the label of their `recording`.
-        unwritten: Messages that a running recorder has taken and not written yet, which are not
-            lost; None for an unknown number.
+    Args:
+        session: The open store.
+        question: The question.
+        counters: Of the answer; None before there is one. An answer that was limited lacks
+            nothing that comes later.
+        others: Questions that the answer depends on. What they have lost counts as an unknown
+            number.
     """
-
-    messages: int
-    is_exact: bool
-    reduced: int
-    rows: tuple[Mapping[str, Any], ...]
-    unwritten: int | None = 0
-
-    def __bool__(self) -> bool:
-        """True if any message is lost."""
-        return bool(self.messages) or not self.is_exact
-
-    @property
-    def told(self) -> str:
-        """The losses in words: `4 messages are lost`."""
-        if not self:
-            return "no message is lost"
-        if not self.messages:
-            return "an unknown number of messages are lost"
-        is_one = self.messages == 1 and self.is_exact
-        number = f"{'' if self.is_exact else 'at least '}{self.messages}"
-        return f"{number} message is lost" if is_one else f"{number} messages are lost"
-
-    def limits(self, count: int, limit: int | None = None) -> tuple[int, int | None]:
-        """Least and greatest number of messages if none had been lost; None for any number.
-
-        Args:
-            count: Number of messages that are there.
-            limit: Greatest number that was asked for; None for any.
-        """
-        most = count + self.messages if self.is_exact else limit
-        return count, most if limit is None or most is None else min(most, limit)
-
-    def describe(self, count: int, limit: int | None = None) -> str:
-        """A count with its limits in words: `297; 4 lost in this range: 297 to 301`."""
-        least, most = self.limits(count, limit)
-        known = str(self.messages) if self.messages else "an unknown number"
-        if self.messages and not self.is_exact:
-            known = f"at least {self.messages}"
-        limits = f"{least} or more" if most is None else f"{least} to {most}"
-        return f"{count}; {known} lost in this range: {limits}"
+    asked = [(question, counters), *others]
+    ledgers = [_rows_of(session, one) for one, _ in asked]
+    lost = [row for row in ledgers[0] if row["cause"] not in NOT_LOST]
+    given = 0 if counters is None else counters.messages
+    is_full = question.limit is not None and given >= question.limit and not question.reverse
+    unwritten, late = (0, []) if is_full else _unwritten(session, [one for one, _ in asked])
+    sentences: list[str] = []
+    unindexed = 0
+    for one, cost in asked:
+        lacks = _unindexed(session, one, cost)
+        unindexed += lacks
+        late += [not_indexed(lacks)] if lacks else []
+        sentences += () if cost is None else left_out(one, cost)
+    by_recording: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+    known: set[tuple[Any, ...]] = set()
+    for rows in ledgers:  # a loss of unknown topics is in several
+        keys = [tuple(row.items()) for row in rows]
+        for key, row in zip(keys, rows, strict=True):
+            if key not in known:
+                by_recording[row["recording"]].append(row)
+        known.update(keys)
+    sentences += late
+    for label, rows in by_recording.items():
+        sentences += about_losses(label, rows)
+    return Completeness(
+        sum(row["count"] or 0 for row in lost),
+        is_exact=not any(row["count"] is None for row in lost)
+        and all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows),
+        reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE),
+        rows=tuple(lost),
+        unwritten=unwritten,
+        unindexed=unindexed,
+        late=tuple(dict.fromkeys(late)),
+        sentences=tuple(dict.fromkeys(sentences)),
+    )
 
 
-def lost_in(session: Session, question: Question) -> Lost:
-    """The messages that are missing from the range of a question.
-
-    Raises:
-        TimeError: the range is empty, or outside all recordings.
-    """
-    messages = reduced = 0
-    is_exact = True
-    found = []
-    for entry, row in losses_in(session, question):
-        count = row["count"]
-        if row["cause"] == Cause.THROTTLE:
-            continue  # the user wished it
-        if row["cause"] == Cause.DEGRADE:
-            reduced += count or 0
-            continue
-        is_exact = is_exact and count is not None
-        messages += count or 0
-        found.append({"recording": entry.label, **row})
-    late = [count for count, _ in unwritten(session, question)]
-    known = [count for count in late if count is not None]
-    missing = sum(known) if len(known) == len(late) else None
-    return Lost(messages, is_exact, reduced, tuple(found), missing)
+def _rows_of(session: Session, question: Question) -> list[Mapping[str, Any]]:
+    """Rows of the ledger about a question, with the label of their recording."""
+    with suppress(TimeError):  # nothing is in the range
+        return [{"recording": e.label, **row} for e, row in _losses_in(session, question)]
+    return []
 
 
 def lost_times(session: Session, question: Question) -> Intervals:
     """Log time in which messages were lost, cut to nothing; ends are included."""
     parts = []
-    for entry, row in losses_in(session, question):
-        if row["cause"] in {Cause.DEGRADE, Cause.THROTTLE}:
+    for entry, row in _losses_in(session, question):
+        if row["cause"] in NOT_LOST:
             continue
         low, end = span_of(*(_span_of(entry, row) or (BEGIN, END)))
         parts.append((entry.id, np.array([[low, end, 0]], np.int64)))
     return Intervals.of(parts)
 
 
-def losses_in(
+def _losses_in(
     session: Session, question: Question
 ) -> Iterator[tuple[RecordingEntry, Mapping[str, Any]]]:
     """Rows of the ledger about topics and times of a question, those of a recording together.
@@ -169,32 +157,49 @@ def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
     return int(row["from"]), int(row["to"])
 
 
-def unwritten(session: Session, question: Question) -> list[tuple[int | None, str]]:
-    """What running recordings have not written, if a question reaches past the last flush.
+def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | None, list[str]]:
+    """What running recordings have not written, if questions reach past the last flush.
 
     Returns:
-        For each, the number of messages, None if its recorder does not answer, and a sentence.
+        The number of messages of the first question, None if a recorder does not answer; and
+        a sentence for each recording.
     """
-    places = session.chosen(question)
     snapshot = session.snapshot()
-    found: list[tuple[int | None, str]] = []
-    for place in places[snapshot.is_open[places]].tolist():
+    topics: dict[int, dict[str, bool]] = {}  # by place: whether the first question asks for them
+    for question in questions:
+        places = session.chosen(question)
+        for place in places[snapshot.is_open[places]].tolist():
+            one = snapshot.summaries[place]
+            if one.status == "open" and _reaches_past(session, question, one):
+                known = topics.setdefault(place, {})
+                for topic in question.topics:
+                    known.setdefault(topic, question is questions[0])
+    missing: int | None = 0
+    sentences: list[str] = []
+    for place, asked in topics.items():
         one = snapshot.summaries[place]
-        if one.status != "open" or not _reaches_past(session, question, one):
+        late = _taken(session, one)
+        if late is None:
+            missing = None
+            sentences.append(not_written(one.label, None, flush_interval_ns(one)))
             continue
-        from hybridlog.live.control_server import request
+        if missing is not None:
+            missing += sum(late.get(topic, 0) for topic, is_own in asked.items() if is_own)
+        messages = sum(late.get(topic, 0) for topic in asked)
+        if messages:
+            sentences.append(not_written(one.label, messages, flush_interval_ns(one)))
+    return missing, sentences
 
-        messages: int | None = None
-        with suppress(HybridlogError, KeyError):  # no socket, or it has just begun or ended
-            taken = request(session.directory.path, one.label, "state")["taken"]
-            written = session.entry_of(one).messages_by_topic()
-            messages = sum(max(taken.get(t, 0) - written[t], 0) for t in question.topics)
-        what = f"up to {flush_interval_ns(one) / 1e9:g} s"
-        what = what if messages is None else counted(messages, "message")
-        if messages != 0:
-            told = f"{one.label} is being recorded: {what} not written yet, nor in this answer."
-            found.append((messages, told))
-    return found
+
+def _taken(session: Session, recording: RecordingSummary) -> dict[str, int] | None:
+    """Messages that a recorder has taken and not written, by topic; None if it does not answer."""
+    from hybridlog.live.control_server import request
+
+    with suppress(HybridlogError, KeyError):  # no socket, or it has just begun or ended
+        taken = request(session.directory.path, recording.label, "state")["taken"]
+        written = session.entry_of(recording).messages_by_topic()
+        return {topic: max(count - written[topic], 0) for topic, count in taken.items()}
+    return None
 
 
 def flush_interval_ns(recording: RecordingSummary) -> int:
@@ -214,7 +219,36 @@ def _reaches_past(session: Session, question: Question, one: RecordingSummary) -
     return end > (begin if one.span is None else max(begin, one.span[1]))
 
 
-def unindexed(messages: int) -> str:
-    """What an answer of MongoDB lacks, in words."""
-    are = "is" if messages == 1 else "are"
-    return f"{counted(messages, 'message')} {are} not indexed yet, nor in this answer of MongoDB."
+def _unindexed(session: Session, question: Question, counters: Counters | None) -> int:
+    """Messages that the index lacks, where MongoDB has answered or must answer."""
+    if counters is not None and counters.unindexed:
+        return counters.unindexed
+    if question.predicate is None or not question.predicate.needs_index:
+        return 0
+    planner = Planner(session, question, Counters())
+    return planner.count_unindexed(planner.parts())
+
+
+def lost_parts(entry: RecordingEntry, span: tuple[int, int], parts: int) -> NDArray[np.bool_]:
+    """Parts of a span of time in which messages were lost.
+
+    Losses whose time is unknown are in none; messages that the user did not want are no loss.
+
+    Args:
+        entry: The recording.
+        span: Log time `[begin, end)`, ns.
+        parts: Number of parts of equal length.
+
+    Returns:
+        bool[parts].
+    """
+    begin, length = span[0], max(span[1] - span[0], 1)
+    found = np.zeros(parts, np.bool_)
+    for loss in losses_of(entry):
+        first, last = loss.get("from"), loss.get("to")
+        is_lost = loss["count"] != 0 and loss["cause"] != Cause.THROTTLE
+        if first is None or last is None or not is_lost or last < begin or first >= span[1]:
+            continue
+        low = max(first - begin, 0) * parts // length
+        found[low : (last - begin) * parts // length + 1] = True
+    return found

@@ -1,17 +1,14 @@
-"""Remarks on an answer: messages that it lacks, and likely causes of an empty one."""
+"""Remarks on a question: names, fields and stamps, and likely causes of an empty answer."""
 
 from __future__ import annotations
 
 import difflib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import groupby, islice
-from operator import itemgetter
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.query.answers.lost import JOURNAL_LOST, losses_in, unindexed, unwritten
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
@@ -19,8 +16,7 @@ from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time, is_relative
 from hybridlog.query.topics import namesakes
-from hybridlog.record.losses import Cause, in_words, line_of
-from hybridlog.wording import counted, listed, unfit
+from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
@@ -33,96 +29,22 @@ _APART_NS = 86_400 * 10**9  # header stamps and log times this far apart have ot
 
 
 def remarks(
-    session: Session,
-    question: Question,
-    counters: Counters,
-    names: Sequence[str],
-    *,
-    is_empty: bool,
+    session: Session, question: Question, names: Sequence[str], *, is_empty: bool
 ) -> Iterator[str]:
-    """Sentences about an answer, for people; `completeness` has those about its recordings.
+    """Sentences about an answer, for people; its `Completeness` has those about what it lacks.
 
     Args:
         session: The open store.
         question: The question.
-        counters: Of its answer.
         names: The topics as they were written.
         is_empty: The answer has no messages or intervals.
     """
-    if counters.unreadable:
-        yield _unreadable(counters.unreadable, question)
-    if counters.reduced:
-        has = "has" if counters.reduced == 1 else "have"
-        yield (
-            f"{counted(counters.reduced, 'message')} {has} no payload, which was dropped under "
-            "pressure: not in this answer; --where and --fields find the fields."
-        )
-    if counters.unindexed:
-        yield unindexed(counters.unindexed)
     yield from about_names(session, question, names)
     if question.clock == "header" and question.bounds is not None:
         yield from _about_stamps(session, question)
     yield from _missing_fields(session, question, is_empty=is_empty)
     if is_empty and question.limit != 0:
         yield from _causes(session, question)
-
-
-def completeness(
-    session: Session, *questions: Question, counters: Counters | None = None
-) -> Iterator[str]:
-    """Sentences about what the recordings of questions may lack in their ranges.
-
-    Args:
-        session: The open store.
-        questions: The questions; what concerns several topics of a range is said once.
-        counters: Of the answer; an answer that was limited lacks nothing that comes later.
-    """
-    topics: dict[Question, list[str]] = defaultdict(list)
-    for one in questions:
-        plain = Question((), one.recordings, one.bounds, one.clock, during=one.during)
-        topics[plain] += one.topics
-    limit = questions[0].limit
-    is_full = counters is not None and limit is not None and counters.messages >= limit
-    for plain, names in topics.items():
-        question = replace(plain, topics=tuple(dict.fromkeys(names)))
-        if not is_full or questions[0].reverse:
-            yield from (told for _, told in unwritten(session, question))
-        with suppress(TimeError):  # nothing is in the range
-            for entry, rows in groupby(losses_in(session, question), itemgetter(0)):
-                yield from _about_losses(entry.label, [row for _, row in rows])
-
-
-def _about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    if any(row["cause"] == JOURNAL_LOST for row in rows):
-        yield f"{label} has lost its journal, so this answer may not be complete."
-    for row in rows:
-        if row["cause"] == Cause.THROTTLE:
-            yield f"{label}: {line_of(row)} while it was recorded."
-    others = {JOURNAL_LOST, Cause.THROTTLE, Cause.DEGRADE}
-    lost = [row for row in rows if row["cause"] not in others]
-    if lost:
-        causes = listed(dict.fromkeys(row["cause"] for row in lost), _SHOWN)
-        yield (
-            f"{label} is not complete, so this answer may not be: {in_words(lost)} ({causes}); "
-            f"`hybridlog info {label}` says where."
-        )
-
-
-def _unreadable(messages: int, question: Question) -> str:
-    """A number of messages whose fields could not be read."""
-    one, predicate = messages == 1, question.predicate
-    if predicate is None or not predicate.asks_fields:
-        return (
-            f"{unfit(messages)} and {'is' if one else 'are'} not in this answer; --format raw, "
-            "mcap or bag gives the payloads."
-        )
-    if predicate.is_opaque:  # only documents were asked
-        why = "it has no fields there" if one else "they have no fields there"
-    elif one:
-        why = "it does not fit its definition, or has none"
-    else:
-        why = "they do not fit their definition, or have none"
-    return f"{counted(messages, 'message')} could not be asked: {why}."
 
 
 def about_names(session: Session, question: Question, names: Sequence[str]) -> Iterator[str]:

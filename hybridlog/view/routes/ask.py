@@ -55,10 +55,10 @@ def ask(context: Context, asked: Asked) -> dict[str, Any]:
     question = question_of(context, asked)
     query = question.query()
     count = query.count()
-    lost = query.lost()
+    found = query.completeness()
     return {
         "count": count,
-        "lost": lost.describe(count) if lost else None,
+        "lost": found.describe(count) if found.has_losses else None,
         "remarks": query.remarks(*query.topics),
         "python": question.python(),
         "command": question.command(),

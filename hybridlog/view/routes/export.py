@@ -36,13 +36,13 @@ def command(context: Context, asked: Asked) -> dict[str, Any]:
     question = _question(context, asked)
     query = question.query()
     count = query.count()
-    lost = query.lost()
+    found = query.completeness()
     return {
         "command": question.command(),
         "python": question.python(),
         "count": count,
         "name": question.file_name(),
-        "lost": lost.describe(count) if lost else None,
+        "lost": found.describe(count) if found.has_losses else None,
     }
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.drawing.coverage import lost_parts
+from hybridlog.query.answers.lost import lost_parts
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
 from hybridlog.view.context import Context, extent, route, start_of

@@ -1,0 +1,215 @@
+"""How complete an answer is: its value, and everything that is said about it.
+
+An answer may lack messages that are lost, not written or not indexed yet, or that it could
+not read. `lost.py` finds them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.record.losses import Cause
+from hybridlog.wording import counted, listed, unfit
+from hybridlog_storage.errors import IncompleteError
+
+if TYPE_CHECKING:
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Question
+    from hybridlog_storage.catalog import RecordingEntry
+
+JOURNAL_LOST = "journal lost"
+"""Cause of a row for what may have been lost with a journal."""
+NOT_LOST = {Cause.THROTTLE: "left out by a throttle", Cause.DEGRADE: "without their payload"}
+"""Causes of rows about messages that are no loss: not wanted, or with their fields kept."""
+_MAX_NAMES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Completeness:
+    """How complete an answer is in its range.
+
+    Attributes:
+        messages: Number of messages that are known to be lost; of a loss that reaches out of
+            the range, all of it.
+        is_exact: False if an unknown number is lost besides.
+        reduced: Messages of which only the fields are stored.
+        rows: Rows of the loss ledger, with the label of their `recording`.
+        unwritten: Messages that a running recorder has taken and not written yet, which are not
+            lost; None for an unknown number.
+        unindexed: Messages that the index lacks, where MongoDB must answer.
+        late: Sentences about messages that are not written or not indexed yet.
+        sentences: Everything that the answer lacks, in sentences, those of `late` included.
+    """
+
+    messages: int
+    is_exact: bool
+    reduced: int = 0
+    rows: tuple[Mapping[str, Any], ...] = ()
+    unwritten: int | None = 0
+    unindexed: int = 0
+    late: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+
+    @property
+    def has_losses(self) -> bool:
+        """True if any message is lost."""
+        return bool(self.messages) or not self.is_exact
+
+    def __str__(self) -> str:
+        """The losses in words: `4 messages are lost`."""
+        if not self.has_losses:
+            return "no message is lost"
+        if not self.messages:
+            return "an unknown number of messages are lost"
+        is_one = self.messages == 1 and self.is_exact
+        number = f"{'' if self.is_exact else 'at least '}{self.messages}"
+        return f"{number} message is lost" if is_one else f"{number} messages are lost"
+
+    def limits(self, count: int, limit: int | None = None) -> tuple[int, int | None]:
+        """Least and greatest number of messages if none had been lost; None for any number.
+
+        Args:
+            count: Number of messages that are there.
+            limit: Greatest number that was asked for; None for any.
+        """
+        most = count + self.messages if self.is_exact else limit
+        return count, most if limit is None or most is None else min(most, limit)
+
+    def describe(self, count: int, limit: int | None = None) -> str:
+        """A count with its limits in words: `297; 4 lost in this range: 297 to 301`."""
+        least, most = self.limits(count, limit)
+        known = str(self.messages) if self.messages else "an unknown number"
+        if self.messages and not self.is_exact:
+            known = f"at least {self.messages}"
+        limits = f"{least} or more" if most is None else f"{least} to {most}"
+        return f"{count}; {known} lost in this range: {limits}"
+
+    def check(self, *, payloads: bool = False) -> None:
+        """Check that no message of the range is lost, or not written or indexed yet.
+
+        Args:
+            payloads: True to check that no payload is missing, too.
+
+        Raises:
+            IncompleteError: some are.
+        """
+        if self.has_losses:
+            raise IncompleteError(
+                f"{self} in this range; `hybridlog losses` says where. Without --strict the "
+                "rest is given."
+            )
+        if self.late:
+            raise IncompleteError(" ".join(self.late))
+        if payloads and self.reduced:
+            raise IncompleteError(
+                f"Of {self.reduced} messages in this range only the fields are stored. Without "
+                "--strict the rest is given."
+            )
+
+
+def not_written(label: str, messages: int | None, interval_ns: int) -> str:
+    """What a running recording has not written; None for an unknown number of messages."""
+    what = f"up to {interval_ns / 1e9:g} s" if messages is None else counted(messages, "message")
+    return f"{label} is being recorded: {what} not written yet, nor in this answer."
+
+
+def not_indexed(messages: int) -> str:
+    """Messages that the index lacks."""
+    are = "is" if messages == 1 else "are"
+    return f"{counted(messages, 'message')} {are} not indexed yet, nor in this answer of MongoDB."
+
+
+def left_out(question: Question, counters: Counters) -> Iterator[str]:
+    """Messages that an answer could not read or has no payload of."""
+    if counters.unreadable:
+        yield _unreadable(counters.unreadable, question)
+    if counters.reduced:
+        has = "has" if counters.reduced == 1 else "have"
+        yield (
+            f"{counted(counters.reduced, 'message')} {has} no payload, which was dropped under "
+            "pressure: not in this answer; --where and --fields find the fields."
+        )
+
+
+def _unreadable(messages: int, question: Question) -> str:
+    """A number of messages whose fields could not be read."""
+    one, predicate = messages == 1, question.predicate
+    if predicate is None or not predicate.asks_fields:
+        return (
+            f"{unfit(messages)} and {'is' if one else 'are'} not in this answer; --format raw, "
+            "mcap or bag gives the payloads."
+        )
+    if predicate.is_opaque:  # only documents were asked
+        why = "it has no fields there" if one else "they have no fields there"
+    elif one:
+        why = "it does not fit its definition, or has none"
+    else:
+        why = "they do not fit their definition, or have none"
+    return f"{counted(messages, 'message')} could not be asked: {why}."
+
+
+def about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Rows of the ledger of a recording."""
+    if any(row["cause"] == JOURNAL_LOST for row in rows):
+        yield f"{label} has lost its journal, so this answer may not be complete."
+    for row in rows:
+        if row["cause"] == Cause.THROTTLE:
+            yield f"{label}: {line_of(row)} while it was recorded."
+    lost = [row for row in rows if row["cause"] not in {JOURNAL_LOST, *NOT_LOST}]
+    if lost:
+        causes = listed(dict.fromkeys(row["cause"] for row in lost), _MAX_NAMES)
+        yield (
+            f"{label} is not complete, so this answer may not be: {in_words(lost)} ({causes}); "
+            f"`hybridlog info {label}` says where."
+        )
+
+
+def in_words(losses: Collection[Mapping[str, Any]]) -> str:
+    """The number of lost messages: `at least 4 messages lost in 2 places`."""
+    lost = sum(loss["count"] or 0 for loss in losses)
+    known = counted(lost, "message")
+    if any(loss["count"] is None for loss in losses):
+        known = f"at least {known}" if lost else "an unknown number of messages"
+    return f"{known} lost in {counted(len(losses), 'place')}"
+
+
+def line_of(loss: Mapping[str, Any]) -> str:
+    """A row of the ledger in words."""
+    count = "messages" if loss["count"] is None else counted(loss["count"], "message")
+    place = f" at byte {loss['offset']}" if loss.get("offset") is not None else ""
+    file = f" {loss['file']}{place}:" if loss.get("file") else ""
+    topic = f" on {loss['topic']}" if loss.get("topic") else ""
+    if loss["cause"] == Cause.THROTTLE:
+        return f"{count}{topic} left out by a throttle"
+    said = f"{file} {loss['reason']}".rstrip()
+    lost = "" if loss["count"] == 0 else f"{count}{topic} lost, "
+    return f"{lost}{loss['cause']}{':' if said else ''}{said}"
+
+
+def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
+    """The completeness of a recording in words: `complete`, or the number of missing messages."""
+    found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
+    for cause, what in NOT_LOST.items():
+        messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
+        found += f"; {counted(messages, 'message')} {what}" if messages else ""
+    return found
+
+
+def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
+    if not losses:
+        if entry.status == "open":
+            return "being recorded"
+        if entry.status == "unproven":
+            return "not known: its journal was lost, so a segment may be missing"
+        # An empty log is complete; a robot that sent nothing may not have been reached.
+        is_live = not entry.source["bytes"]
+        return "nothing was received" if is_live and not entry.messages else "complete"
+    lost = sum(loss["count"] or 0 for loss in losses)
+    if any(loss["count"] is None for loss in losses):
+        return in_words(losses)
+    if not lost:
+        return f"complete, although its source was damaged in {counted(len(losses), 'place')}"
+    share = min(100 * entry.messages / (entry.messages + lost), 99.99)
+    return f"{in_words(losses)} ({share:.2f} % there)"
