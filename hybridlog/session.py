@@ -1144,14 +1144,14 @@ class Session:
         channel = next((c for c in self.channels(recording) if c.channel.topic == topic), None)
         if not readers or channel is None:
             return None
-        return ArrayTable(channel, readers, self.tables.cache)
+        return ArrayTable(channel, readers, self.tables.opened)
 
     def _contents_of(self, recording: Path) -> RecordingPayloads:
         """The content of moved chunks, shared by the segments of a recording."""
         found = self._contents.get(recording)
         if found is None:
             _make_room(self._contents)
-            found = self._contents[recording] = RecordingPayloads(recording)
+            found = self._contents[recording] = RecordingPayloads(recording, cache=self.cache)
         return found
 
     @lazy
@@ -1159,7 +1159,7 @@ class Session:
         """Parquet tables of topics; pyarrow is loaded for them."""
         from hybridlog.columns.tables import Tables
 
-        return Tables(self.directory.path)
+        return Tables(self.directory.path, self.cache)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic, created again if it is missing; None if there can be none."""

@@ -1,4 +1,4 @@
-"""One file of columns, the columns to read for some fields, and a cache of what was read."""
+"""One file of columns, the columns to read for some fields, and what is open."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from hybridlog.columns.zones import Zone
+    from hybridlog_storage.cache import Cache
 
 _OPEN_FILES: Final = 256
 _MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
@@ -177,34 +178,28 @@ class ColumnFile(ParquetFileReader):
         ]
 
 
-class ColumnCache:
-    """A cache of the most recently used decoded columns. Thread safe."""
+class OpenFiles:
+    """The files that were read last, and their decoded columns. Thread safe.
 
-    def __init__(self, most_bytes: int) -> None:
-        self.most_bytes = most_bytes
-        self._columns: OrderedDict[tuple[int, int, str, tuple[int, ...]], Any] = OrderedDict()
+    Args:
+        cache: Keeps the columns.
+    """
+
+    def __init__(self, cache: Cache) -> None:
+        self._cache = cache
         self._open: OrderedDict[int, ColumnFile] = OrderedDict()
-        self._size = 0
         self._lock = threading.Lock()
 
-    def get(self, file: ColumnFile, group: int, top: str, leaves: tuple[int, ...]) -> Any:
+    def column(self, file: ColumnFile, group: int, top: str, leaves: tuple[int, ...]) -> Any:
         """A column of a row group, or the requested parts of it."""
+
+        def read() -> Any:
+            self.opened(file)
+            found = file.read(group, leaves).column(0).combine_chunks()
+            return pa.concat_arrays(found.chunks) if isinstance(found, pa.ChunkedArray) else found
+
         key = file.number, group, top, leaves
-        with self._lock:
-            if key in self._columns:
-                self._columns.move_to_end(key)
-                return self._columns[key]
-        self.opened(file)
-        column = file.read(group, leaves).column(0).combine_chunks()
-        if isinstance(column, pa.ChunkedArray):
-            column = pa.concat_arrays(column.chunks)
-        with self._lock:
-            if key not in self._columns and column.nbytes <= self.most_bytes:
-                self._columns[key] = column
-                self._size += column.nbytes
-                while self._size > self.most_bytes:
-                    self._size -= self._columns.popitem(last=False)[1].nbytes
-        return column
+        return self._cache.made("column", *key, make=read, size_of=lambda one: int(one.nbytes))
 
     def opened(self, file: ColumnFile) -> None:
         """Close files that were not read lately, if too many are open."""
@@ -216,10 +211,9 @@ class ColumnCache:
 
     def clear(self) -> None:
         """Forget all columns and files."""
+        self._cache.drop("column")
         with self._lock:
-            self._columns.clear()
             self._open.clear()
-            self._size = 0
 
 
 def names_of(path: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
 from hybridlog_storage import journal
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import PAYLOADS, payload_names
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 """Name of a segment that is about to replace the whole one."""
+_REBUILT_BYTES: Final = 32 << 20  # messages in memory: neighbouring chunks share a row group
 
 
 def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
@@ -117,6 +119,7 @@ class RecordingPayloads:
         recording: The recording's directory.
         listed: The files; None for those that its journal lists.
         folder: Name of the folder that holds them.
+        cache: Keeps messages that were rebuilt.
     """
 
     def __init__(
@@ -124,10 +127,12 @@ class RecordingPayloads:
         recording: Path,
         listed: Sequence[PayloadFile] | None = None,
         folder: str = PAYLOADS,
+        cache: Cache | None = None,
     ) -> None:
         self._recording = recording
         self._given = listed
         self._folder = recording / folder
+        self._cache = cache or Cache(_REBUILT_BYTES)
         self._readers: dict[str, PayloadReader] = {}
         self._places: dict[tuple[int, int], list[PayloadReader]] | None = None
         self._problem = ""  # of a file that cannot be read
@@ -156,7 +161,9 @@ class RecordingPayloads:
             if found is None:
                 from hybridlog.columns.payload_reader import PayloadReader
 
-                found = self._readers[listed.file] = PayloadReader(self._folder, listed)
+                found = self._readers[listed.file] = PayloadReader(
+                    self._folder, listed, self._cache
+                )
             return found
 
     def ordered(self, topic: str) -> list[PayloadReader]:

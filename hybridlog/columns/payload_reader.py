@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +15,7 @@ from hybridlog.columns.payload_rows import NEEDED, Rebuilder, rows_of
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog.columns.zones import Zone
 from hybridlog.schema.arrow_types import converted, has_empty
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.stopping import check_wanted
 
@@ -26,12 +25,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import ColumnCache
+    from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.payload_rows import Rebuilt
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.journal import PayloadFile
 
-_MAX_REBUILT: Final = 3  # row groups of messages in memory: neighbouring chunks share one
 _RESTORE = "Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
@@ -55,6 +53,7 @@ class PayloadReader(ColumnFile):
     Args:
         folder: Folder that its name counts from.
         listed: The file as the journal lists it.
+        cache: Keeps messages that were rebuilt.
 
     Attributes:
         listed: As above.
@@ -65,8 +64,9 @@ class PayloadReader(ColumnFile):
         StoreError: It is missing, damaged, or another file than the listed one.
     """
 
-    def __init__(self, folder: Path, listed: PayloadFile) -> None:
+    def __init__(self, folder: Path, listed: PayloadFile, cache: Cache | None = None) -> None:
         self.listed = listed
+        self._cache = cache or Cache()
         path = folder / listed.file
         try:
             super().__init__(path, depth=IN_PAYLOADS)
@@ -95,8 +95,6 @@ class PayloadReader(ColumnFile):
                 raise ValueError("its row groups and its zones differ")
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
-        self._rebuilt: OrderedDict[int, Rebuilt] = OrderedDict()
-        self._rebuilding = threading.Lock()
 
     def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
         found: dict[tuple[int, int], Place] = {}
@@ -122,22 +120,21 @@ class PayloadReader(ColumnFile):
         Raises:
             StoreError: It is damaged.
         """
-        with self._rebuilding:
-            found = self._rebuilt.get(group)
-            if found is not None:
-                self._rebuilt.move_to_end(group)
-                return found
+        return self._cache.made(
+            "rebuilt",
+            self.number,
+            group,
+            make=lambda: self._rebuild(group),
+            size_of=lambda one: int(one.data.nbytes + one.offset.nbytes),
+        )
+
+    def _rebuild(self, group: int) -> Rebuilt:
         check_wanted()
         try:
             table = self.read(group, self.choose(self._order, NEEDED))
-            found = self._rebuilder.records(*rows_of(table))
+            return self._rebuilder.records(*rows_of(table))
         except (ValueError, pa.ArrowException) as error:
             raise StoreError(f"The payload file {self.path} is invalid: {error}.") from error
-        with self._rebuilding:
-            self._rebuilt[group] = found
-            while len(self._rebuilt) > _MAX_REBUILT:
-                self._rebuilt.popitem(last=False)
-        return found
 
 
 class ArrayTable(TopicTable):
@@ -146,15 +143,15 @@ class ArrayTable(TopicTable):
     Args:
         channel: A channel of the topic.
         readers: Its files.
-        cache: Cache of decoded columns.
+        opened: Reads the columns.
     """
 
     def __init__(
-        self, channel: RecordedChannel, readers: Sequence[PayloadReader], cache: ColumnCache
+        self, channel: RecordedChannel, readers: Sequence[PayloadReader], opened: OpenFiles
     ) -> None:
         parts = [part for reader in readers for part in reader.parts(0, reader.listed.messages)]
         counts = TopicCounts(sum(part.rows for part in parts))
-        super().__init__(channel.channel.topic, parts, counts, cache)
+        super().__init__(channel.channel.topic, parts, counts, opened)
         self._channel = channel
         self._readers = readers
 

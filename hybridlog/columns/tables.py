@@ -21,7 +21,7 @@ from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.columns.column_file import ColumnCache, ColumnFile, TablePart
+from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
 from hybridlog.columns.fields import UnfitError
 from hybridlog.columns.folders import Listing, shared_files
 from hybridlog.columns.layout import (
@@ -38,14 +38,13 @@ from hybridlog.columns.layout import (
     type_prefix,
 )
 from hybridlog.columns.topic_table import TopicTable
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
-MAX_BYTES: Final = 64 << 20
-"""Maximum memory of decoded columns."""
 _MAX_RUNNING: Final = 16  # recordings in progress whose tables are kept open
 _MAX_FOUND: Final = 65_536  # tables that are kept
 
@@ -81,13 +80,13 @@ class _Folder:
     Args:
         path: The folder.
         depth: Parts of its path that lie inside the store.
-        cache: Knows the open files.
+        opened: Knows the open files.
     """
 
-    def __init__(self, path: Path, depth: int, cache: ColumnCache) -> None:
+    def __init__(self, path: Path, depth: int, opened: OpenFiles) -> None:
         self._path = path
         self._depth = depth
-        self._cache = cache
+        self._opened = opened
         self._listing = Listing(path, depth)
         self._shared: list[str] = []
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
@@ -153,7 +152,7 @@ class _Folder:
         file: ColumnFile | None = None
         with suppress(FileNotFoundError, StoreError):
             file = ColumnFile(self._path / name, depth=self._depth + 1)
-            self._cache.opened(file)
+            self._opened.opened(file)
         if file is not None and not is_of_folder(self._path.name, file.schema):
             file = None
         self._files[name] = _identity(status), file
@@ -175,13 +174,13 @@ class _Folders:
     Args:
         place: Where they are.
         depth: Parts of its path that lie inside the store.
-        cache: Knows the open files.
+        opened: Knows the open files.
     """
 
-    def __init__(self, place: Path, depth: int, cache: ColumnCache) -> None:
+    def __init__(self, place: Path, depth: int, opened: OpenFiles) -> None:
         self._place = place
         self._depth = depth
-        self._cache = cache
+        self._opened = opened
         self._listing = Listing(place, depth)
         self._known: dict[str, _Folder] = {}
         self._by_type: dict[str, list[_Folder]] = {}
@@ -192,7 +191,7 @@ class _Folders:
             return
         before = self._known
         self._known = {
-            name: before.get(name) or _Folder(self._place / name, self._depth + 1, self._cache)
+            name: before.get(name) or _Folder(self._place / name, self._depth + 1, self._opened)
             for name, about in sorted(self._listing.names.items())
             if S_ISDIR(about.st_mode)
         }
@@ -215,24 +214,19 @@ class Tables:
 
     Args:
         root: The store.
-        most_bytes: Maximum memory of decoded columns.
+        cache: Keeps decoded columns.
     """
 
-    def __init__(self, root: Path, *, most_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, root: Path, cache: Cache | None = None) -> None:
         self._root = root
-        self._cache = ColumnCache(most_bytes)
+        self.opened = OpenFiles(cache or Cache())
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
-        self._folders = _Folders(root / TABLES, IN_TABLES - 1, self._cache)
+        self._folders = _Folders(root / TABLES, IN_TABLES - 1, self.opened)
         self._looked_at: set[str] = set()  # types whose folders were looked at
         self._sealed: OrderedDict[str, _Folders] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
         self._generation = 0
         self._lock = threading.RLock()
-
-    @property
-    def cache(self) -> ColumnCache:
-        """The cache of decoded columns, for tables that are not in `tables/`."""
-        return self._cache
 
     def invalidate(self) -> None:
         """Forget all files, columns and invalid tables."""
@@ -240,10 +234,10 @@ class Tables:
             self._generation += 1
             self._found.clear()
             self._looked_at.clear()
-            self._folders = _Folders(self._root / TABLES, IN_TABLES - 1, self._cache)
+            self._folders = _Folders(self._root / TABLES, IN_TABLES - 1, self.opened)
             self._sealed.clear()
             self._channels = None
-        self._cache.clear()
+        self.opened.clear()
 
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic in a recording; None without one that the catalog confirms.
@@ -291,7 +285,7 @@ class Tables:
 
     def whole(self, file: ColumnFile) -> TopicTable:
         """All rows of a file, as if they were of one topic."""
-        return TopicTable("", file.all_parts(), file.counts, self._cache)
+        return TopicTable("", file.all_parts(), file.counts, self.opened)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording.
@@ -374,7 +368,7 @@ class Tables:
                 return None
             counts = counts.plus(rows.section.topics[topic])
             parts += rows.of(topic)
-        table = TopicTable(topic, parts, counts, self._cache)
+        table = TopicTable(topic, parts, counts, self.opened)
         if len(table.files) > 1:
             try:
                 table.fields()
@@ -401,7 +395,7 @@ class Tables:
         with self._lock:
             place = parts_folder(self._root, recording.id)
             known = self._sealed.setdefault(
-                recording.id, _Folders(place, IN_PARTS - 2, self._cache)
+                recording.id, _Folders(place, IN_PARTS - 2, self.opened)
             )
             known.look()
             folders = known.of({channel.type for channel in channels})

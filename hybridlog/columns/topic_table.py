@@ -24,7 +24,7 @@ from hybridlog_storage.times import placed, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import ColumnCache, ColumnFile, Key, TablePart
+    from hybridlog.columns.column_file import ColumnFile, Key, OpenFiles, TablePart
     from hybridlog.columns.layout import TopicCounts
     from hybridlog.query.intervals import Span
     from hybridlog.query.predicate.tree import Node
@@ -91,7 +91,7 @@ class TopicTable:
         topic: Full name.
         parts: Its rows.
         counts: Numbers of its rows.
-        cache: Cache of decoded columns.
+        opened: Reads the columns.
 
     Attributes:
         topic: Full name.
@@ -102,12 +102,12 @@ class TopicTable:
     """
 
     def __init__(
-        self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, cache: ColumnCache
+        self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, opened: OpenFiles
     ) -> None:
         self.topic = topic
         self.rows, self.unreadable, self.reduced = counts
         self.files = list({part.file.number: part.file for part in parts}.values())
-        self._cache = cache
+        self._opened = opened
         self._parts = parts
         self._types: dict[frozenset[str] | None, Any] = {}
         self._summarised: dict[tuple[str, ...], bool] = {}
@@ -263,7 +263,7 @@ class TopicTable:
         return ours, self._records(part.file, columns, part.rows)
 
     def _column(self, part: TablePart, top: str, leaves: tuple[int, ...]) -> Any:
-        column = self._cache.get(part.file, part.group, top, leaves)
+        column = self._opened.column(part.file, part.group, top, leaves)
         return column.slice(part.begin, part.rows)
 
     def _records(self, file: ColumnFile, columns: Mapping[str, Any], rows: int) -> Any:

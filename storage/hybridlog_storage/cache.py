@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar, cast
 
 MAX_BYTES: Final = 224 << 20
 
-Kind: TypeAlias = Literal["chunk", "density", "matches", "recording"]
+Kind: TypeAlias = Literal["chunk", "column", "density", "matches", "recording", "rebuilt"]
 Value = TypeVar("Value")
 
 

@@ -24,6 +24,7 @@ from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable, _merged
 from hybridlog.maintenance import tables as making
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from tests.tables import ask
 from tests.tables.conftest import SMALL_CHUNKS
@@ -349,13 +350,13 @@ def test_what_is_found_is_remembered(
 
 def test_memory_of_columns_is_bounded(recorded: hl.Store) -> None:
     (entry,) = recorded.recordings()
-    tables = Tables(recorded.directory.path, most_bytes=30_000)
+    cache = Cache(30_000)
+    tables = Tables(recorded.directory.path, cache)
     table = tables.of(entry, "/large")
     assert table is not None
     for name in ("i8", "f64", "t", "nine", "covariance", "many"):
         list(table.scan([name]))
-        assert tables._cache._size <= 30_000
-        assert tables._cache._size == sum(c.nbytes for c in tables._cache._columns.values())
+        assert 0 < cache._size <= 30_000
 
 
 def test_files_are_closed_when_they_are_forgotten(recorded: hl.Store, tables: Tables) -> None:
