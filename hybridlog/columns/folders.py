@@ -15,6 +15,7 @@ import logging
 import os
 import re
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,7 @@ from hybridlog.columns.layout import (
     SUFFIX,
     TABLES,
     Section,
+    TopicCounts,
     is_of_folder,
     parts_folder,
 )
@@ -52,6 +54,8 @@ _SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{6,}}){re.escape(SUFFIX)}", re.A
 _MAX_LIST_BYTES: Final = 256 << 20
 _SETTLED_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 _log = logging.getLogger(__name__)
+_Piece = tuple[Section, Any]
+"""Rows of a recording, and what they are."""
 
 
 @dataclass(slots=True)
@@ -225,7 +229,7 @@ class TableFolders:
                 self._rewrite(path, reader, addition, lambda _: False)
                 return
         path = place / f"{SHARED}{number:06d}{SUFFIX}"
-        self._write(path, [addition.section], [addition.rows])
+        self._write(path, [(addition.section, addition.rows)])
 
     def _rewrite(
         self,
@@ -242,55 +246,55 @@ class TableFolders:
             _log.info("%s", error)
             files.unlink(path, depth=IN_TYPE)
             if addition.section is not None:
-                self._write(path, [addition.section], [addition.rows])
+                self._write(path, [(addition.section, addition.rows)])
             return
-        sections: list[Section] = []
-        tables: list[Any] = []
+        pieces: list[_Piece] = []
         before = 0
-        section, rows = addition.section, addition.rows
-        for one in reader.about.recordings:
-            own = table.slice(before, one.rows)
-            before += one.rows
-            if one.id == self._recording:
-                is_stale = not one.segments.items() <= self._digests.items()
-                one, own = _without(one, own, _all if is_stale else goes)  # noqa: PLW2901
-                if section is not None:
-                    one, own = _joined(one, own, section, rows)  # noqa: PLW2901
-                    section = None
-                if not one.topics:
-                    continue
-            elif section is not None and section.place < one.place:
-                sections.append(section)
-                tables.append(rows)
-                section = None
-            sections.append(one)
-            tables.append(own)
-        if section is not None:
-            sections.append(section)
-            tables.append(rows)
-        if sections:
-            self._write(path, sections, tables, reader)
+        for section in reader.about.recordings:
+            piece = section, table.slice(before, section.rows)
+            before += section.rows
+            if section.id != self._recording:
+                pieces.append(piece)
+            elif section.segments.items() <= self._digests.items():  # else it is stale
+                pieces += (one for one in _by_topic(*piece) if not goes(*one[0].topics))
+        if addition.section is not None:
+            new = addition.section
+            is_replaced = new.topics.__contains__
+            pieces = [
+                (replace(section, begin=new.begin) if section.id == new.id else section, rows)
+                for section, rows in pieces
+                if section.id != new.id or not any(map(is_replaced, section.topics))
+            ]
+            pieces += _by_topic(new, addition.rows)
+        if pieces:
+            self._write(path, pieces, reader)
         else:
             files.unlink(path, depth=IN_TYPE)
 
     def _write(
-        self,
-        path: Path,
-        sections: Sequence[Section],
-        tables: Sequence[Any],
-        before: ParquetFileReader | None = None,
+        self, path: Path, pieces: Iterable[_Piece], before: ParquetFileReader | None = None
     ) -> None:
         """Write a shared file, and give it its name by one rename.
 
         Args:
             path: The file.
-            sections: What it has.
-            tables: The rows of each.
+            pieces: What it has, in any order.
             before: The file that it replaces.
         """
-        schema = tables[0].schema
+        pieces = sorted(pieces, key=lambda piece: (piece[0].place, *piece[0].topics))
+        sections = {section.id: section for section, _ in pieces}
+        segments: defaultdict[str, dict[str, str]] = defaultdict(dict)
+        topics: defaultdict[str, dict[str, TopicCounts]] = defaultdict(dict)
+        for section, _ in pieces:
+            segments[section.id] |= section.segments
+            topics[section.id] |= section.topics
+        found = [
+            replace(section, segments=segments[name], topics=topics[name])
+            for name, section in sections.items()
+        ]
+        schema = pieces[0][1].schema
         table = pa.concat_tables(
-            [one if one.schema.equals(schema) else one.cast(schema) for one in tables]
+            [rows if rows.schema.equals(schema) else rows.cast(schema) for _, rows in pieces]
         ).combine_chunks()
         kept = None if before is None else before.kept()
         in_front = False
@@ -298,11 +302,10 @@ class TableFolders:
             size = len(kept.data) * table.num_rows / max(before.about.rows, 1)
             in_front = size < kept.offset
         try:
-            part = self._part(sections, table, kept, in_front=in_front)
+            part = self._part(found, table, kept, in_front=in_front)
         except NoRoomError:
-            part = self._part(sections, table, kept, in_front=False)
-        is_own = any(section.id == self._recording for section in sections)
-        if is_own and not (self._is_listed and path.name in self._shared):
+            part = self._part(found, table, kept, in_front=False)
+        if self._recording in sections and not (self._is_listed and path.name in self._shared):
             self._list(path.parent, path.name)
         files.rename(part, path, depth=files.IN_RECORDING, new_depth=IN_TYPE)
 
@@ -478,32 +481,9 @@ def _all(_: str) -> bool:
     return True
 
 
-def _without(section: Section, rows: Any, goes: Callable[[str], bool]) -> tuple[Section, Any]:
-    """The rows of a recording without those of some topics."""
-    kept, tables, before = {}, [], 0
+def _by_topic(section: Section, rows: Any) -> Iterator[_Piece]:
+    """Rows of a recording, those of each topic on their own."""
+    before = 0
     for topic, counts in section.topics.items():
-        if not goes(topic):
-            kept[topic] = counts
-            tables.append(rows.slice(before, counts.rows))
+        yield replace(section, topics={topic: counts}), rows.slice(before, counts.rows)
         before += counts.rows
-    # Without rows it is of no segments.
-    one = replace(section, segments=section.segments if kept else {}, topics=kept)
-    return one, pa.concat_tables([rows.slice(0, 0), *tables])
-
-
-def _joined(one: Section, rows: Any, other: Section, others: Any) -> tuple[Section, Any]:
-    """Rows of one recording, of other topics each, by topic."""
-    pieces: dict[str, Any] = {}
-    for section, table in ((one, rows), (other, others)):
-        before = 0
-        for topic, counts in section.topics.items():
-            pieces[topic] = counts, table.slice(before, counts.rows)
-            before += counts.rows
-    order = sorted(pieces)
-    section = replace(
-        one,
-        segments={**one.segments, **other.segments},
-        topics={topic: pieces[topic][0] for topic in order},
-    )
-    schema = others.schema
-    return section, pa.concat_tables([pieces[topic][1].cast(schema) for topic in order])

@@ -216,7 +216,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     reader = ParquetFileReader(path)
     (section,) = reader.about.recordings
     folders = TableFolders(few.directory.path, entry.id, entry.digests)
-    folders._write(path, [replace(section, segments=stale)], [reader.table()])
+    folders._write(path, [(replace(section, segments=stale), reader.table())])
     assert not making.TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
     assert making.make(few.directory, entry, ["/a"])
