@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
+    from hybridlog.tf.tree import FrameTree
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
@@ -422,6 +423,21 @@ class Store:
         if isinstance(topics, str):
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
         return Query(self.session, Question(*self.session.having(topics, recordings)))
+
+    @of_one_moment
+    def tf(self, recording: Texts = None, *, topics: Sequence[str] = ()) -> FrameTree:
+        """The coordinate frames of a recording, and the transforms between them.
+
+        Args:
+            recording: Its label, name or id; None if the store has one alone.
+            topics: Topics with transforms; empty for all of types of tf, tf2 and Foxglove.
+
+        Raises:
+            TopicError: No such recording, or several; no topic has transforms.
+        """
+        from hybridlog.tf.reader import frame_tree
+
+        return frame_tree(self.recordings(recording), topics)
 
     @of_one_moment
     def align(

@@ -73,6 +73,10 @@ class TopicError(UsageError):
     """An unknown topic, recording or field, or an ambiguous name."""
 
 
+class TransformError(UsageError):
+    """No transform between two frames at a time."""
+
+
 class SourceError(HybridlogError):
     """An input file of which nothing can be read: missing, unreadable, empty, of the wrong kind."""
 

@@ -1,0 +1,1 @@
+"""Transforms between the coordinate frames of a robot, as tf2 gives them."""

@@ -1,0 +1,232 @@
+"""Reads the transforms of a recording: messages of tf, tf2 and Foxglove."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hybridlog.tf.transform import Transform
+from hybridlog.tf.tree import Frame, FrameTree
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TopicError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.recordings import Recordings
+
+TYPES: Final = (
+    "tf2_msgs/TFMessage",
+    "tf/tfMessage",
+    "geometry_msgs/TransformStamped",
+    "foxglove.FrameTransform",
+    "foxglove.FrameTransforms",
+    "foxglove_msgs/FrameTransform",
+    "foxglove_msgs/FrameTransforms",
+)
+"""Message types with transforms, without the `msg` of ROS 2."""
+_STATIC: Final = "tf_static"
+_MAX_NORM_ERROR: Final = 1e-2
+"""How far the norm of a quaternion may be from 1; that of tf2."""
+
+
+def is_of_transforms(type_name: str) -> bool:
+    """True for a type of `TYPES`, as ROS 1, ROS 2 or Foxglove name it."""
+    return type_name.replace("/msg/", "/") in TYPES
+
+
+def frame_tree(recordings: Recordings, topics: Sequence[str] = ()) -> FrameTree:
+    """The frames of one recording.
+
+    Args:
+        recordings: The recording.
+        topics: Names of topics with transforms; empty for all topics of such types. Those
+            whose names end in `tf_static` hold at all times.
+
+    Raises:
+        TopicError: Several recordings are chosen, or none; no topic has transforms.
+    """
+    if len(recordings.check()) > 1:
+        raise TopicError(
+            f"Frames belong to one recording: name one of {listed(recordings.labels)}."
+        )
+    query = recordings.topic(*topics) if topics else recordings.all_topics()
+    types = {
+        one.channel.topic: one.channel.schema.name for one in query.channels() if one.channel.schema
+    }
+    names = [topic for topic, name in types.items() if is_of_transforms(name)]
+    if not names:
+        raise TopicError(
+            "No topic has transforms: they are messages of tf2_msgs/TFMessage or "
+            "foxglove.FrameTransform."
+        )
+    builder, remarks = _Builder(), dict.fromkeys(query.remarks(*names))
+    for topic in names:
+        for table in recordings.topic(topic).to_tables():
+            builder.add(table, is_static=topic.endswith(_STATIC))
+    summary = recordings.summaries[0]
+    return FrameTree(builder.frames(), summary.extent, dict(builder.invalid), [*remarks])
+
+
+class _Builder:
+    """Collects transforms by their child frame."""
+
+    def __init__(self) -> None:
+        self.invalid: Counter[str] = Counter()
+        self._parts: list[tuple[pa.Table, bool]] = []
+
+    def add(self, table: pa.Table, *, is_static: bool) -> None:
+        """Add the messages of a table."""
+        rows = _transforms_of(table)
+        if rows.num_rows:
+            self._parts.append((rows, is_static))
+
+    def frames(self) -> dict[str, Frame]:
+        """All frames with a parent."""
+        if not self._parts:
+            return {}
+        rows = pa.concat_tables([rows for rows, _ in self._parts])
+        static = np.repeat(
+            [is_static for _, is_static in self._parts],
+            [part.num_rows for part, _ in self._parts],
+        )
+        order = np.argsort(rows["log_time"].to_numpy(), kind="stable")
+        rows, static = rows.take(pa.array(order)), static[order]
+        pose = Transform(
+            np.stack([rows[name].to_numpy() for name in ("tx", "ty", "tz")], axis=1),
+            np.stack([rows[name].to_numpy() for name in ("rx", "ry", "rz", "rw")], axis=1),
+        )
+        names = pc.utf8_ltrim(rows["child"], "/").combine_chunks().dictionary_encode()
+        parents = pc.utf8_ltrim(rows["parent"], "/").combine_chunks().dictionary_encode()
+        child, parent = names.indices.to_numpy(), parents.indices.to_numpy()
+        known, above = names.dictionary.to_pylist(), parents.dictionary.to_pylist()
+        good = self._valid(
+            np.asarray(known, object)[child], np.asarray(above, object)[parent], pose
+        )
+        stamps = rows["stamp"].to_numpy()
+        made: dict[str, Frame] = {}
+        by_child = np.argsort(child, kind="stable")
+        starts = np.searchsorted(child[by_child], np.arange(len(known) + 1))
+        for place, name in enumerate(known):
+            own = by_child[starts[place] : starts[place + 1]]
+            own = own[good[own]]
+            if len(own):
+                made[name] = self._frame(name, own, stamps, parent, above, pose, static)
+        return made
+
+    def _valid(
+        self, child: NDArray[np.object_], parent: NDArray[np.object_], pose: Transform
+    ) -> NDArray[np.bool_]:
+        """Where a transform is one; others are counted by reason, once each."""
+        with np.errstate(all="ignore"):
+            norm = np.linalg.norm(pose.rotation, axis=1)
+            finite = np.isfinite(pose.translation).all(axis=1) & np.isfinite(norm)
+            reasons = {
+                "a frame without a name": (child == "") | (parent == ""),
+                "a frame that is its own parent": child == parent,
+                "numbers that are not finite": ~finite,
+                "a rotation that is no unit quaternion": np.abs(norm - 1) > _MAX_NORM_ERROR,
+            }
+        good = np.ones(len(child), np.bool_)
+        for why, bad in reasons.items():
+            if number := int((good & bad).sum()):
+                self.invalid[why] += number
+            good &= ~bad
+        with np.errstate(all="ignore"):
+            pose.rotation[:] /= norm[:, None]
+        return good
+
+    def _frame(
+        self,
+        name: str,
+        own: NDArray[np.intp],
+        stamps: NDArray[np.int64],
+        parent: NDArray[np.int32],
+        above: list[str],
+        pose: Transform,
+        static: NDArray[np.bool_],
+    ) -> Frame:
+        # As in tf2, the first transform decides whether a frame is static.
+        is_static = bool(static[own[0]])
+        if other := int((static[own] != is_static).sum()):
+            here, there = ("static", "moving") if is_static else ("moving", "static")
+            self.invalid[f"{there}, while {name} is {here}"] += other
+            own = own[static[own] == is_static]
+        repeated = 0
+        if is_static:
+            own = own[-1:]
+        else:
+            own = own[np.argsort(stamps[own], kind="stable")]
+            is_first = np.concatenate(([True], np.diff(stamps[own]) != 0))
+            repeated = int((~is_first).sum())
+            own = own[is_first]
+        codes = list(dict.fromkeys(parent[own][::-1].tolist()))[::-1]
+        place_of = {code: place for place, code in enumerate(codes)}
+        return Frame(
+            name,
+            tuple(above[code] for code in codes),
+            is_static,
+            stamps[own],
+            np.array([place_of[code] for code in parent[own].tolist()], np.intp),
+            Transform(pose.translation[own], pose.rotation[own]),
+            repeated,
+        )
+
+
+def _transforms_of(table: pa.Table) -> pa.Table:
+    """The transforms of messages as rows: log_time, stamp, parent, child and seven numbers."""
+    times = table["log_time"].combine_chunks().cast(pa.int64())
+    if "transforms" in table.column_names:
+        lists = table["transforms"].combine_chunks()
+        times = times.take(pc.list_parent_indices(lists))
+        one = lists.flatten()
+    else:
+        names = [name for name in table.column_names if name != "recording"]
+        one = pa.StructArray.from_arrays(
+            [table[name].combine_chunks() for name in names], names=names
+        )
+    if "parent_frame_id" in _names(one):  # Foxglove
+        stamp, parent, pose = _field(one, "timestamp"), _field(one, "parent_frame_id"), one
+    else:
+        header = _field(one, "header")
+        stamp, parent = _field(header, "stamp"), _field(header, "frame_id")
+        pose = _field(one, "transform")
+    moved, turned = _field(pose, "translation"), _field(pose, "rotation")
+    numbers = {
+        **{f"t{axis}": _field(moved, axis) for axis in "xyz"},
+        **{f"r{axis}": _field(turned, axis) for axis in "xyzw"},
+    }
+    columns = {
+        "log_time": times,
+        "stamp": _nanoseconds(stamp),
+        "parent": parent.cast(pa.string()),
+        "child": _field(one, "child_frame_id").cast(pa.string()),
+        **{name: column.cast(pa.float64()) for name, column in numbers.items()},
+    }
+    return pa.table(columns).drop_null()
+
+
+def _names(rows: pa.StructArray) -> list[str]:
+    return [one.name for one in rows.type] if pa.types.is_struct(rows.type) else []
+
+
+def _field(rows: pa.StructArray, name: str) -> pa.Array:
+    if name not in _names(rows):
+        raise TopicError(f"A message of transforms has no {name}.")
+    return pc.struct_field(rows, name)
+
+
+def _nanoseconds(stamps: pa.Array) -> pa.Array:
+    """Times in ns, from Arrow's own or from seconds and nanoseconds."""
+    if not pa.types.is_struct(stamps.type):
+        return stamps.cast(pa.timestamp("ns", "UTC")).cast(pa.int64())
+    seconds, rest = (
+        next(_field(stamps, name) for name in names if name in _names(stamps)).cast(pa.int64())
+        for names in (("sec", "seconds"), ("nsec", "nanos", "nanosec"))
+    )
+    return pc.add(pc.multiply(seconds, 10**9), rest)

@@ -1,0 +1,316 @@
+"""The tree of frames: which frame hangs on which, when, and how one gets from one to another.
+
+The rules are those of tf2. A frame has one parent at a time, named by its latest transform.
+Between two transforms the pose is interpolated; before the first and after the last there is
+none. Static transforms hold at all times. Stamps are those of the headers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from hybridlog.query.times import format_time, parse_duration
+from hybridlog.tf.transform import Transform, identity, interpolated
+from hybridlog.wording import counted, listed
+from hybridlog_storage.errors import TopicError, TransformError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.times import DurationLike
+
+    Times = NDArray[np.int64]
+    Places = NDArray[np.intp]
+
+_S: Final = 1e9
+_BLOCK: Final = 1 << 13  # times looked up together, so that they stay in the processor's cache
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A frame, and its transforms to its parent.
+
+    Attributes:
+        name: Its name, without a leading slash.
+        parents: Its parents, the latest last; usually one.
+        is_static: True if its transform holds at all times.
+        stamps: int64[n], ascending without repetition, ns; of a static frame int64[1].
+        parent: intp[n], the place in `parents` of each.
+        poses: The n transforms from the frame to its parent.
+        repeated: Transforms that were left out because of an equal stamp.
+    """
+
+    name: str
+    parents: tuple[str, ...]
+    is_static: bool
+    stamps: Times
+    parent: Places
+    poses: Transform
+    repeated: int = 0
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Transforms a second; None of less than two, and of a static frame."""
+        if self.is_static or len(self.stamps) < 2:
+            return None
+        return float((len(self.stamps) - 1) / ((self.stamps[-1] - self.stamps[0]) / _S))
+
+    def longest_gap(self) -> tuple[int, int] | None:
+        """The longest time between two transforms, ns: where it begins, and where it ends."""
+        if self.is_static or len(self.stamps) < 2:
+            return None
+        place = int(np.diff(self.stamps).argmax())
+        return int(self.stamps[place]), int(self.stamps[place + 1])
+
+    def parent_at(self, times: Times) -> Places:
+        """The place in `parents` at each time: that of the latest transform, or the first."""
+        if len(self.parents) == 1 or self.is_static:
+            return np.broadcast_to(self.parent[-1], times.shape)
+        return self.parent[np.maximum(self.stamps.searchsorted(times, "right") - 1, 0)]
+
+    def pose_at(self, times: Times, extrapolate_ns: int) -> Transform:
+        """The transforms to the parent at some times; NaN where there are none."""
+        if self.is_static:
+            shape = len(times)
+            return Transform(
+                np.broadcast_to(self.poses.translation[-1], (shape, 3)),
+                np.broadcast_to(self.poses.rotation[-1], (shape, 4)),
+            )
+        stamps = self.stamps
+        last = len(stamps) - 1
+        before = np.clip(stamps.searchsorted(times, "right") - 1, 0, last)
+        after = np.minimum(before + 1, last)
+        # As integers, since times of today are no exact doubles. A new parent begins anew.
+        step = np.maximum(stamps[after] - stamps[before], 1)
+        share = np.clip((times - stamps[before]) / step, 0, 1)
+        share[self.parent[before] != self.parent[after]] = 0
+        translation, rotation = self.poses.translation, self.poses.rotation
+        found = interpolated(
+            Transform(translation[before], rotation[before]),
+            Transform(translation[after], rotation[after]),
+            share,
+        )
+        early, late = self._outside(times, extrapolate_ns)
+        found.translation[early | late] = found.rotation[early | late] = np.nan
+        return found
+
+    def _outside(
+        self, times: Times, extrapolate_ns: int
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Where a time is before the first transform, and after the last one."""
+        begin, end = int(self.stamps[0]) - extrapolate_ns, int(self.stamps[-1]) + extrapolate_ns
+        limits = np.iinfo(np.int64)
+        return times < max(begin, limits.min), times > min(end, limits.max)
+
+    def why_not(self, times: Times, extrapolate_ns: int) -> Iterator[tuple[str, int]]:
+        """Reasons why there is no transform at some of the times, with their number."""
+        if self.is_static:
+            return
+        early, late = self._outside(times, extrapolate_ns)
+        edge = f"from {self.name} to its parent"
+        for where, word, stamp in (
+            (early, "first", self.stamps[0]),
+            (late, "last", self.stamps[-1]),
+        ):
+            if where.any():
+                side = "before" if word == "first" else "after"
+                yield (
+                    f"{side} the {word} transform {edge}, {format_time(int(stamp))}",
+                    int(where.sum()),
+                )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lookup(Transform):
+    """Transforms at many times; NaN where there is none.
+
+    Attributes:
+        times: int64[n], ns.
+        missing: Number of times without a transform, by reason.
+    """
+
+    times: Times
+    missing: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTree:
+    """The frames of a recording.
+
+    Attributes:
+        frames: The frames that have a parent, by name, in the order of their first transforms.
+        span: Log time `[begin, end)` of the recording, ns: the origin of relative times.
+        invalid: Transforms that were left out, by reason.
+        remarks: What the transforms lack, such as lost messages.
+    """
+
+    frames: Mapping[str, Frame]
+    span: tuple[int, int] = (0, 0)
+    invalid: Mapping[str, int] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """All frames: roots first, then each below its parent."""
+        return [name for name, _ in self.walk()]
+
+    @property
+    def roots(self) -> list[str]:
+        """Frames without a parent."""
+        parents = dict.fromkeys(name for one in self.frames.values() for name in one.parents)
+        return [name for name in parents if name not in self.frames]
+
+    def walk(self) -> Iterator[tuple[str, int]]:
+        """Each frame once with its depth, parents before children; a loop is entered at a frame."""
+        below: dict[str, list[str]] = {}
+        for one in self.frames.values():
+            below.setdefault(one.parents[-1], []).append(one.name)
+        seen: set[str] = set()
+        for start in (*self.roots, *self.frames):
+            ahead = [(start, 0)]
+            while ahead:
+                name, depth = ahead.pop()
+                if name not in seen:
+                    seen.add(name)
+                    yield name, depth
+                    ahead += [(child, depth + 1) for child in reversed(below.get(name, ()))]
+
+    def problems(self) -> list[str]:
+        """What is odd: loops, several trees, frames of two parents, and transforms left out."""
+        found = [
+            f"{counted(number, 'transform')} left out: {why}."
+            for why, number in self.invalid.items()
+        ]
+        for one in self.frames.values():
+            if len(one.parents) > 1:
+                found.append(f"{one.name} has several parents: {listed(one.parents)}.")
+            if one.repeated:
+                found.append(
+                    f"{one.name} has {counted(one.repeated, 'further transform')} of stamps that "
+                    "it has already; the first of each counts."
+                )
+        loops: set[frozenset[str]] = set()
+        for name in self.frames:
+            path = [name]
+            while path[-1] in self.frames and path[-1] not in path[:-1]:
+                path.append(self.frames[path[-1]].parents[-1])
+            loop = path[path.index(path[-1]) :]
+            if len(loop) > 1 and frozenset(loop) not in loops:
+                loops.add(frozenset(loop))
+                found.append(f"These frames are a loop: {listed(loop)}.")
+        if len(self.roots) > 1:
+            found.append(
+                f"The frames are {len(self.roots)} trees, with the roots {listed(self.roots)}."
+            )
+        return found
+
+    def lookup(
+        self,
+        target: str,
+        source: str,
+        times: Times,
+        *,
+        extrapolate: DurationLike | None = None,
+    ) -> Lookup:
+        """Transforms from one frame to another.
+
+        Args:
+            target: The frame of the results.
+            source: The frame in which points are given.
+            times: int64[n], ns since the epoch, by the stamps of headers.
+            extrapolate: How long before the first and after the last transform of a frame
+                that one holds; None for not at all.
+
+        Returns:
+            n transforms, NaN where none is known, with the reasons.
+
+        Raises:
+            TopicError: no such frame.
+            TimeError: `extrapolate` is no duration.
+        """
+        wanted, given = self._name(target), self._name(source)
+        times = np.ascontiguousarray(times, np.int64)
+        hold = 0 if extrapolate is None else parse_duration(extrapolate)
+        made = identity(len(times))
+        made.translation[:] = made.rotation[:] = np.nan
+        missing: Counter[str] = Counter()
+        for begin in range(0, len(times), _BLOCK):
+            block = np.arange(begin, min(begin + _BLOCK, len(times)))
+            for rows, upwards in self._paths(given, times, block, ()):
+                for own, downwards in self._paths(wanted, times, rows, ()):
+                    self._fill(made, missing, times, own, upwards, downwards, hold)
+        return Lookup(made.translation, made.rotation, times, dict(missing))
+
+    def transform(
+        self, target: str, source: str, time: int, *, extrapolate: DurationLike | None = None
+    ) -> Transform:
+        """The transform from one frame to another at one time; see `lookup`.
+
+        Raises:
+            TransformError: There is none at this time, or no way between the frames.
+        """
+        found = self.lookup(target, source, np.array([time]), extrapolate=extrapolate)
+        if found.missing:
+            raise TransformError(
+                f"No transform from {source} to {target} at {format_time(time)}: "
+                f"{next(iter(found.missing))}."
+            )
+        return Transform(found.translation[0], found.rotation[0])
+
+    def _name(self, name: str) -> str:
+        wanted = name.removeprefix("/")
+        if wanted not in self.frames and all(wanted not in f.parents for f in self.frames.values()):
+            raise TopicError(f"There is no frame {name}; there are {listed(self.names) or 'none'}.")
+        return wanted
+
+    def _paths(
+        self, name: str, times: Times, rows: Places, below: tuple[str, ...]
+    ) -> Iterator[tuple[Places, tuple[str, ...]]]:
+        """The way from a frame to its root, for each group of times that share it.
+
+        The last name of a way is the root, or the frame at which a loop closes.
+        """
+        way = (*below, name)
+        one = self.frames.get(name)
+        if one is None or name in below:
+            yield rows, way
+            return
+        parent = one.parent_at(times[rows])
+        for place in np.unique(parent):
+            yield from self._paths(one.parents[place], times, rows[parent == place], way)
+
+    def _fill(
+        self,
+        made: Transform,
+        missing: Counter[str],
+        times: Times,
+        rows: Places,
+        upwards: tuple[str, ...],
+        downwards: tuple[str, ...],
+        hold: int,
+    ) -> None:
+        """Work out the transforms of the times that share both ways."""
+        common = next((name for name in upwards if name in downwards), None)
+        if common is None:
+            missing[f"no way between {upwards[0]} and {downwards[0]}"] += len(rows)
+            return
+        at = times[rows]
+        parts = []
+        for way in (upwards, downwards):
+            part = identity(len(rows))
+            for name in way[: way.index(common)]:
+                part = self.frames[name].pose_at(at, hold) @ part
+            parts.append(part)
+        up, down = parts
+        found = down.inverse() @ up
+        made.translation[rows], made.rotation[rows] = found.translation, found.rotation
+        used = [*upwards[: upwards.index(common)], *downwards[: downwards.index(common)]]
+        unknown = at[~found.is_known]
+        for name in used:
+            for why, number in self.frames[name].why_not(unknown, hold):
+                missing[why] += number
