@@ -67,6 +67,7 @@ COMMANDS: Final = {
     "rate": "stats",
     "gaps": "intervals",
     "stats": "stats",
+    "tf": "tf",
     "plot": "plot",
     "sql": "sql",
     "view": "view",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from hybridlog_storage.errors import TopicError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.query.query import Query
     from hybridlog.recordings import Recordings
 
 TYPES: Final = (
@@ -73,6 +74,20 @@ def frame_tree(recordings: Recordings, topics: Sequence[str] = ()) -> FrameTree:
     return FrameTree(builder.frames(), summary.extent, dict(builder.invalid), [*remarks])
 
 
+def frames_and_stamps(query: Query) -> tuple[list[str], NDArray[np.int64]]:
+    """The frames that the headers of a topic name, and its times.
+
+    Returns:
+        Names of frames, and int64[n]: header stamps, or log times without headers; ns.
+    """
+    known = query.field_types() or {}
+    wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
+    table = query.fields(*wanted).to_arrow() if wanted else query.to_arrow()
+    time = table["header.stamp" if "header.stamp" in wanted else "log_time"]
+    frames = table["header.frame_id"].unique().to_pylist() if len(wanted) == 2 else []
+    return frames, time.cast(pa.int64()).to_numpy()
+
+
 class _Builder:
     """Collects transforms by their child frame."""
 
@@ -116,7 +131,15 @@ class _Builder:
             own = by_child[starts[place] : starts[place + 1]]
             own = own[good[own]]
             if len(own):
-                made[name] = self._frame(name, own, stamps, parent, above, pose, static)
+                made[name] = self._frame(
+                    name,
+                    own,
+                    stamps=stamps,
+                    parent=parent,
+                    above=above,
+                    pose=pose,
+                    static=static,
+                )
         return made
 
     def _valid(
@@ -145,6 +168,7 @@ class _Builder:
         self,
         name: str,
         own: NDArray[np.intp],
+        *,
         stamps: NDArray[np.int64],
         parent: NDArray[np.int32],
         above: list[str],
@@ -181,52 +205,51 @@ class _Builder:
 def _transforms_of(table: pa.Table) -> pa.Table:
     """The transforms of messages as rows: log_time, stamp, parent, child and seven numbers."""
     times = table["log_time"].combine_chunks().cast(pa.int64())
-    if "transforms" in table.column_names:
-        lists = table["transforms"].combine_chunks()
-        times = times.take(pc.list_parent_indices(lists))
-        one = lists.flatten()
-    else:
-        names = [name for name in table.column_names if name != "recording"]
-        one = pa.StructArray.from_arrays(
-            [table[name].combine_chunks() for name in names], names=names
-        )
-    if "parent_frame_id" in _names(one):  # Foxglove
-        stamp, parent, pose = _field(one, "timestamp"), _field(one, "parent_frame_id"), one
-    else:
-        header = _field(one, "header")
-        stamp, parent = _field(header, "stamp"), _field(header, "frame_id")
-        pose = _field(one, "transform")
-    moved, turned = _field(pose, "translation"), _field(pose, "rotation")
-    numbers = {
-        **{f"t{axis}": _field(moved, axis) for axis in "xyz"},
-        **{f"r{axis}": _field(turned, axis) for axis in "xyzw"},
-    }
-    columns = {
-        "log_time": times,
-        "stamp": _nanoseconds(stamp),
-        "parent": parent.cast(pa.string()),
-        "child": _field(one, "child_frame_id").cast(pa.string()),
-        **{name: column.cast(pa.float64()) for name, column in numbers.items()},
-    }
-    return pa.table(columns).drop_null()
-
-
-def _names(rows: pa.StructArray) -> list[str]:
-    return [one.name for one in rows.type] if pa.types.is_struct(rows.type) else []
-
-
-def _field(rows: pa.StructArray, name: str) -> pa.Array:
-    if name not in _names(rows):
-        raise TopicError(f"A message of transforms has no {name}.")
-    return pc.struct_field(rows, name)
-
-
-def _nanoseconds(stamps: pa.Array) -> pa.Array:
-    """Times in ns, from Arrow's own or from seconds and nanoseconds."""
-    if not pa.types.is_struct(stamps.type):
-        return stamps.cast(pa.timestamp("ns", "UTC")).cast(pa.int64())
-    seconds, rest = (
-        next(_field(stamps, name) for name in names if name in _names(stamps)).cast(pa.int64())
-        for names in (("sec", "seconds"), ("nsec", "nanos", "nanosec"))
+    columns = {name: table[name].combine_chunks() for name in table.column_names}
+    if "transforms" in columns:
+        times = times.take(pc.list_parent_indices(columns["transforms"]))
+        columns = _leaves("", columns["transforms"].flatten())
+    is_foxglove = "parent_frame_id" in columns
+    stamp, parent, pose = (
+        ("timestamp", "parent_frame_id", "")
+        if is_foxglove
+        else ("header.stamp", "header.frame_id", "transform.")
     )
+    names = {
+        "parent": parent,
+        "child": "child_frame_id",
+        **{f"t{axis}": f"{pose}translation.{axis}" for axis in "xyz"},
+        **{f"r{axis}": f"{pose}rotation.{axis}" for axis in "xyzw"},
+    }
+    if missing := [name for name in names.values() if name not in columns]:
+        raise TopicError(f"Messages of transforms lack {listed(missing)}.")
+    found = {"log_time": times, "stamp": _nanoseconds(columns, stamp)}
+    for own, name in names.items():
+        kind = pa.string() if own in {"parent", "child"} else pa.float64()
+        found[own] = columns[name].cast(kind)
+    return pa.table(found).drop_null()
+
+
+def _leaves(prefix: str, rows: pa.Array) -> dict[str, pa.Array]:
+    """The columns of nested rows, by path."""
+    if not pa.types.is_struct(rows.type):
+        return {prefix: rows}
+    found: dict[str, pa.Array] = {}
+    for one in rows.type:
+        path = f"{prefix}.{one.name}" if prefix else one.name
+        found |= _leaves(path, pc.struct_field(rows, one.name))
+    return found
+
+
+def _nanoseconds(columns: Mapping[str, pa.Array], name: str) -> pa.Array:
+    """Times in ns, from Arrow's own or from seconds and nanoseconds."""
+    if name in columns:
+        return columns[name].cast(pa.timestamp("ns", "UTC")).cast(pa.int64())
+    parts = [
+        next((f"{name}.{one}" for one in names if f"{name}.{one}" in columns), None)
+        for names in (("sec", "seconds"), ("nsec", "nanos", "nanosec"))
+    ]
+    if None in parts:
+        raise TopicError(f"Messages of transforms lack {name}.")
+    seconds, rest = (columns[str(part)].cast(pa.int64()) for part in parts)
     return pc.add(pc.multiply(seconds, 10**9), rest)

@@ -20,6 +20,7 @@ from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError, TransformError
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.query.times import DurationLike
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     Places = NDArray[np.intp]
 
 _S: Final = 1e9
+_TREE: Final = (
+    "frame", "parent", "depth", "is_static", "transforms", "rate_hz",
+    "first", "last", "longest_gap_ns", "longest_gap_begin",
+)  # fmt: skip
 _BLOCK: Final = 1 << 13  # times looked up together, so that they stay in the processor's cache
 
 
@@ -107,22 +112,13 @@ class Frame:
         limits = np.iinfo(np.int64)
         return times < max(begin, limits.min), times > min(end, limits.max)
 
-    def why_not(self, times: Times, extrapolate_ns: int) -> Iterator[tuple[str, int]]:
-        """Reasons why there is no transform at some of the times, with their number."""
-        if self.is_static:
-            return
-        early, late = self._outside(times, extrapolate_ns)
-        edge = f"from {self.name} to its parent"
-        for where, word, stamp in (
-            (early, "first", self.stamps[0]),
-            (late, "last", self.stamps[-1]),
-        ):
-            if where.any():
-                side = "before" if word == "first" else "after"
-                yield (
-                    f"{side} the {word} transform {edge}, {format_time(int(stamp))}",
-                    int(where.sum()),
-                )
+    def why_not(self, times: Times, extrapolate_ns: int) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+        """Reasons why there is no transform, and at which of the times."""
+        if not self.is_static:
+            early, late = self._outside(times, extrapolate_ns)
+            begin, end = (format_time(int(stamp)) for stamp in self.stamps[[0, -1]])
+            yield f"before the first transform of {self.name}, {begin}", early
+            yield f"after the last transform of {self.name}, {end}", late
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +132,23 @@ class Lookup(Transform):
 
     times: Times
     missing: Mapping[str, int] = field(default_factory=dict)
+
+    def to_arrow(self) -> pa.Table:
+        """A row for each time: translation (m), quaternion, and roll, pitch and yaw (rad)."""
+        import pyarrow as pa
+
+        columns = np.concatenate([self.translation, self.rotation, self.rpy()], axis=1)
+        unknown = ~self.is_known
+        names = ("x", "y", "z", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw")
+        return pa.table(
+            {
+                "time": pa.array(self.times, pa.timestamp("ns", "UTC")),
+                **{
+                    name: pa.array(column, mask=unknown)
+                    for name, column in zip(names, columns.T, strict=True)
+                },
+            }
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,8 +256,64 @@ class FrameTree:
             block = np.arange(begin, min(begin + _BLOCK, len(times)))
             for rows, upwards in self._paths(given, times, block, ()):
                 for own, downwards in self._paths(wanted, times, rows, ()):
-                    self._fill(made, missing, times, own, upwards, downwards, hold)
+                    self._fill(
+                        made,
+                        missing,
+                        times=times,
+                        rows=own,
+                        ways=(upwards, downwards),
+                        hold=hold,
+                    )
         return Lookup(made.translation, made.rotation, times, dict(missing))
+
+    def latest(self, target: str, source: str) -> int:
+        """The latest time with a transform from one frame to another, ns.
+
+        Raises:
+            TopicError: no such frame.
+            TransformError: No way between the frames, at no time a transform.
+        """
+        end = np.array([self.span[1] - 1])
+        ways = [
+            next(self._paths(self._name(name), end, np.arange(1), ()))[1]
+            for name in (source, target)
+        ]
+        common = next((name for name in ways[0] if name in ways[1]), None)
+        if common is None:
+            raise TransformError(f"There is no way between {source} and {target}.")
+        used = [self.frames[name] for way in ways for name in way[: way.index(common)]]
+        moving = [int(one.stamps[-1]) for one in used if not one.is_static]
+        return min(moving, default=int(end[0]))
+
+    def to_arrow(self) -> pa.Table:
+        """A row for each frame, parents first."""
+        import pyarrow as pa
+
+        stamp = pa.timestamp("ns", "UTC")
+        rows: dict[str, list[object]] = {name: [] for name in _TREE}
+        for name, depth in self.walk():
+            one = self.frames.get(name)
+            gap = None if one is None else one.longest_gap()
+            is_moving = one is not None and not one.is_static
+            values = (
+                name,
+                one and one.parents[-1],
+                depth,
+                one and one.is_static,
+                one and len(one.stamps),
+                one and one.rate_hz,
+                int(one.stamps[0]) if one and is_moving else None,
+                int(one.stamps[-1]) if one and is_moving else None,
+                gap and gap[1] - gap[0],
+                gap and gap[0],
+            )
+            for column, value in zip(rows.values(), values, strict=True):
+                column.append(value)
+        types = (
+            pa.string(), pa.string(), pa.int64(), pa.bool_(), pa.int64(), pa.float64(),
+            stamp, stamp, pa.int64(), stamp,
+        )  # fmt: skip
+        return pa.table([pa.array(c, t) for c, t in zip(rows.values(), types, strict=True)], _TREE)
 
     def transform(
         self, target: str, source: str, time: int, *, extrapolate: DurationLike | None = None
@@ -288,20 +357,21 @@ class FrameTree:
         self,
         made: Transform,
         missing: Counter[str],
+        *,
         times: Times,
         rows: Places,
-        upwards: tuple[str, ...],
-        downwards: tuple[str, ...],
+        ways: tuple[tuple[str, ...], tuple[str, ...]],
         hold: int,
     ) -> None:
         """Work out the transforms of the times that share both ways."""
+        upwards, downwards = ways
         common = next((name for name in upwards if name in downwards), None)
         if common is None:
             missing[f"no way between {upwards[0]} and {downwards[0]}"] += len(rows)
             return
         at = times[rows]
         parts = []
-        for way in (upwards, downwards):
+        for way in ways:
             part = identity(len(rows))
             for name in way[: way.index(common)]:
                 part = self.frames[name].pose_at(at, hold) @ part
@@ -310,7 +380,9 @@ class FrameTree:
         found = down.inverse() @ up
         made.translation[rows], made.rotation[rows] = found.translation, found.rotation
         used = [*upwards[: upwards.index(common)], *downwards[: downwards.index(common)]]
-        unknown = at[~found.is_known]
+        left = ~found.is_known
         for name in used:
-            for why, number in self.frames[name].why_not(unknown, hold):
-                missing[why] += number
+            for why, where in self.frames[name].why_not(at, hold):
+                if number := int((left & where).sum()):
+                    missing[why] += number
+                left &= ~where

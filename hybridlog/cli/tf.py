@@ -1,0 +1,176 @@
+"""`hybridlog tf`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from hybridlog.cli import options
+from hybridlog.cli.answers import SCREEN, Destination, answer_tables, table_options
+from hybridlog.cli.completion import complete_recording, complete_topic
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.output import notes, print_table, short_duration
+from hybridlog.query.times import format_time, parse_duration, parse_range, parse_time
+from hybridlog.wording import counted
+from hybridlog_storage.errors import IncompleteError, TransformError, UsageError
+
+_MAX_TIMES = 10_000_000
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.tf.tree import FrameTree
+
+
+@click.command()
+@click.argument("target", required=False, metavar="[TARGET", help="The frame of the results.")
+@click.argument(
+    "source",
+    required=False,
+    metavar="SOURCE]",
+    help="The frame to transform from; with -t, without, that of the topic's messages.",
+)
+@click.option("--at", multiple=True, metavar="TIME", help="At this time. Repeatable.")
+@click.option("--step", metavar="DURATION", help="At regular times, such as 100ms.")
+@click.option(
+    "--topic",
+    "-t",
+    metavar="TOPIC",
+    shell_complete=complete_topic,
+    help="At the header stamps of a topic, or the log times of one without.",
+)
+@click.option(
+    "--extrapolate",
+    metavar="DURATION",
+    help="So long before its first and after its last, a transform holds; without, it does not.",
+)
+@click.option(
+    "--recording",
+    "-r",
+    metavar="RECORDING",
+    shell_complete=complete_recording,
+    help="The recording; without, the only one.",
+)
+@options.store
+@options.between
+@table_options
+@options.verbose
+def tf_command(
+    *,
+    target: str | None,
+    source: str | None,
+    at: tuple[str, ...],
+    step: str | None,
+    topic: str | None,
+    extrapolate: str | None,
+    recording: str | None,
+    store: Path | None,
+    between: tuple[str, str] | None,
+    to: Destination,
+    strict: bool,
+    mongo: str | None,
+    quiet: bool,
+) -> None:
+    """Show the frames of a recording, or transforms from one frame to another.
+
+    Without frames, the tree: how often each frame moves, and where its longest gap is. With
+    two, where SOURCE is in TARGET: translation in m, rotation as quaternion and as roll,
+    pitch and yaw in rad; by default at the latest time that has a transform. Rows of times
+    without one are empty, and the reasons are printed.
+    """
+    if sum(map(bool, (at, step, topic))) > 1:
+        raise UsageError("--at, --step and --topic exclude each other.")
+    if target is None and (at or step or topic or between):
+        raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
+    from hybridlog.tf.reader import frames_and_stamps
+
+    with opened_store(store, mongo, quiet=quiet) as opened:
+        tree = opened.tf(recording)
+        if strict and tree.remarks:
+            raise IncompleteError(" ".join(tree.remarks))
+        if target is None:
+            _show_tree(tree, to, quiet=quiet)
+            return
+        if topic is None:
+            stamps = _times(tree, target, source, at=at, step=step, between=between)
+        else:
+            query = opened.recordings(recording).topic(topic)
+            frames, stamps = frames_and_stamps(
+                query if between is None else query.between(*between)
+            )
+            if source is None and len(frames) == 1:
+                source = frames[0]
+        if source is None:
+            raise UsageError("A transform has two frames: name TARGET and SOURCE.")
+        found = tree.lookup(target, source, stamps, extrapolate=extrapolate)
+        if len(found) == 1 and found.missing:
+            raise TransformError(
+                f"There is no transform from {source} to {target} at "
+                f"{format_time(int(stamps[0]))}: {next(iter(found.missing))}."
+            )
+        answer_tables([found.to_arrow()], lambda: None, to)
+        sys.stdout.flush()
+        if not quiet:
+            notes(
+                f"{counted(number, 'time')} without a transform: {why}."
+                for why, number in found.missing.items()
+            )
+            notes(tree.remarks)
+
+
+def _times(
+    tree: FrameTree,
+    target: str,
+    source: str | None,
+    *,
+    at: tuple[str, ...],
+    step: str | None,
+    between: tuple[str, str] | None,
+) -> NDArray[np.int64]:
+    """The times that are wanted, ns."""
+    start, end = tree.span
+    if step is not None:
+        low, high = parse_range(*(between or (None, None)), start=start, end=end)
+        length = parse_duration(step)
+        if not length or (high - low) // length >= _MAX_TIMES:
+            raise UsageError(f"--step {step} would be more than {_MAX_TIMES:,} times.")
+        return np.arange(low, high, length, dtype=np.int64)
+    if between is not None:
+        raise UsageError("--between needs --step or --topic.")
+    if at:
+        return np.array([parse_time(one, start=start, end=end) for one in at], np.int64)
+    return np.array([tree.latest(target, source or target)], np.int64)
+
+
+def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
+    if to.form != SCREEN:
+        answer_tables([tree.to_arrow()], lambda: None, to)
+        return
+    rows = []
+    for name, depth in tree.walk():
+        cells = ["", "", "", ""]
+        if (frame := tree.frames.get(name)) is not None:
+            rate, gap = frame.rate_hz, frame.longest_gap()
+            cells = [
+                "static" if frame.is_static else str(len(frame.stamps)),
+                "" if rate is None else f"{rate:.2f}",
+                "" if gap is None else short_duration(gap[1] - gap[0]),
+                "" if gap is None else format_time(gap[0]),
+            ]
+        rows.append(["  " * depth + name, *cells])
+    print_table(
+        [
+            ("frame", "left"),
+            ("transforms", "right"),
+            ("Hz", "right"),
+            ("longest gap", "right"),
+            ("from", "left"),
+        ],
+        rows,
+    )
+    if not quiet:
+        notes([*tree.problems(), *tree.remarks])
