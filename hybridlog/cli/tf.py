@@ -7,31 +7,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 from hybridlog.cli import options
 from hybridlog.cli.answers import SCREEN, Destination, answer_tables, table_options
 from hybridlog.cli.completion import complete_recording, complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.output import notes, print_table, short_duration
-from hybridlog.query.times import format_time, parse_duration, parse_range, parse_time
+from hybridlog.query.times import parse_duration, parse_range, parse_time
 from hybridlog.wording import counted
-from hybridlog_storage.errors import IncompleteError, TransformError, UsageError
+from hybridlog_storage.errors import IncompleteError, UsageError
 
 _MAX_TIMES = 10_000_000
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from hybridlog.tf.tree import FrameTree
 
 
 @click.command()
-@click.argument("target", required=False, metavar="[TARGET", help="The frame of the results.")
+@click.argument("target", required=False, metavar="[TARGET]", help="The frame of the results.")
 @click.argument(
     "source",
     required=False,
-    metavar="SOURCE]",
+    metavar="[SOURCE]",
     help="The frame to transform from; with -t, without, that of the topic's messages.",
 )
 @click.option("--at", multiple=True, metavar="TIME", help="At this time. Repeatable.")
@@ -108,10 +108,7 @@ def tf_command(
             raise UsageError("A transform has two frames: name TARGET and SOURCE.")
         found = tree.lookup(target, source, stamps, extrapolate=extrapolate)
         if len(found) == 1 and found.missing:
-            raise TransformError(
-                f"There is no transform from {source} to {target} at "
-                f"{format_time(int(stamps[0]))}: {next(iter(found.missing))}."
-            )
+            tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
         answer_tables([found.to_arrow()], lambda: None, to)
         sys.stdout.flush()
         if not quiet:
@@ -132,6 +129,8 @@ def _times(
     between: tuple[str, str] | None,
 ) -> NDArray[np.int64]:
     """The times that are wanted, ns."""
+    import numpy as np
+
     start, end = tree.span
     if step is not None:
         low, high = parse_range(*(between or (None, None)), start=start, end=end)
@@ -159,7 +158,7 @@ def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
                 "static" if frame.is_static else str(len(frame.stamps)),
                 "" if rate is None else f"{rate:.2f}",
                 "" if gap is None else short_duration(gap[1] - gap[0]),
-                "" if gap is None else format_time(gap[0]),
+                "" if gap is None else f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s",
             ]
         rows.append(["  " * depth + name, *cells])
     print_table(
@@ -168,7 +167,7 @@ def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
             ("transforms", "right"),
             ("Hz", "right"),
             ("longest gap", "right"),
-            ("from", "left"),
+            ("from", "right"),
         ],
         rows,
     )

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.query.times import format_time, parse_duration
+from hybridlog.query.times import format_time, parse_duration, parse_time
 from hybridlog.tf.transform import Transform, identity, interpolated
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import TopicError, TransformError
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
-    from hybridlog.query.times import DurationLike
+    from hybridlog.query.times import DurationLike, TimeLike
 
     Times = NDArray[np.int64]
     Places = NDArray[np.intp]
@@ -226,7 +226,7 @@ class FrameTree:
         self,
         target: str,
         source: str,
-        times: Times,
+        times: ArrayLike,
         *,
         extrapolate: DurationLike | None = None,
     ) -> Lookup:
@@ -235,7 +235,8 @@ class FrameTree:
         Args:
             target: The frame of the results.
             source: The frame in which points are given.
-            times: int64[n], ns since the epoch, by the stamps of headers.
+            times: n times on the clock of header stamps: integers, ns since the epoch, or
+                datetimes of numpy, pandas or Arrow.
             extrapolate: How long before the first and after the last transform of a frame
                 that one holds; None for not at all.
 
@@ -247,7 +248,7 @@ class FrameTree:
             TimeError: `extrapolate` is no duration.
         """
         wanted, given = self._name(target), self._name(source)
-        times = np.ascontiguousarray(times, np.int64)
+        times = _nanoseconds(times)
         hold = 0 if extrapolate is None else parse_duration(extrapolate)
         made = identity(len(times))
         made.translation[:] = made.rotation[:] = np.nan
@@ -316,17 +317,19 @@ class FrameTree:
         return pa.table([pa.array(c, t) for c, t in zip(rows.values(), types, strict=True)], _TREE)
 
     def transform(
-        self, target: str, source: str, time: int, *, extrapolate: DurationLike | None = None
+        self, target: str, source: str, time: TimeLike, *, extrapolate: DurationLike | None = None
     ) -> Transform:
-        """The transform from one frame to another at one time; see `lookup`.
+        """The transform from one frame to another at one time, such as `+3s`; see `lookup`.
 
         Raises:
             TransformError: There is none at this time, or no way between the frames.
         """
-        found = self.lookup(target, source, np.array([time]), extrapolate=extrapolate)
+        start, end = self.span
+        at = parse_time(time, start=start, end=end)
+        found = self.lookup(target, source, [at], extrapolate=extrapolate)
         if found.missing:
             raise TransformError(
-                f"No transform from {source} to {target} at {format_time(time)}: "
+                f"There is no transform from {source} to {target} at {format_time(at)}: "
                 f"{next(iter(found.missing))}."
             )
         return Transform(found.translation[0], found.rotation[0])
@@ -386,3 +389,11 @@ class FrameTree:
                 if number := int((left & where).sum()):
                     missing[why] += number
                 left &= ~where
+
+
+def _nanoseconds(times: ArrayLike) -> Times:
+    """Times as integers, ns."""
+    found = np.asarray(times)
+    if found.dtype == object or found.dtype.kind == "M":  # pandas keeps zones in objects
+        found = np.asarray(times, "datetime64[ns]")
+    return np.ascontiguousarray(found.reshape(-1), np.int64)
