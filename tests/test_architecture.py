@@ -70,7 +70,7 @@ ALLOWED = {
         "hybridlog.schema.stamps",
         "hybridlog.query",
         "hybridlog.sql",
-        "hybridlog.tf.reader",
+        "hybridlog.tf",
     ),
     "pymongo": ("hybridlog_storage.mongo.database",),
     "re2": ("hybridlog.query.predicate.regex",),

@@ -75,7 +75,7 @@ def tf_command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Show the frames of a recording, or transforms from one frame to another.
+    """Show coordinate frames, or transforms between them.
 
     Without frames, the tree: how often each frame moves, and where its longest gap is. With
     two, where SOURCE is in TARGET: translation in m, rotation as quaternion and as roll,
