@@ -110,7 +110,7 @@ SLOW = frozenset(
         "live/test_killed.py",
         "live/test_recording.py",
         "live/test_rehearsal.py",
-        "playback/test_server.py",
+        "view/playback/test_server.py",
         "query/test_chunk_counts.py",
         "query/test_counting.py",
         "query/test_engines.py",

@@ -81,7 +81,7 @@ ALLOWED = {
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.connection", "hybridlog.view.server"),
     "websockets": (
-        "hybridlog.playback.server",
+        "hybridlog.view.playback.server",
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",
     ),

@@ -17,9 +17,9 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    from hybridlog.playback.played import PlayedLog
-    from hybridlog.playback.server import PlaybackServer
     from hybridlog.query.choice import Choice
+    from hybridlog.view.playback.played import PlayedLog
+    from hybridlog.view.playback.server import PlaybackServer
 
 _MAX_SHOWN = 5  # topics
 
@@ -80,14 +80,14 @@ def serve_command(
     Ctrl-C ends it.
     """
     try:
-        from hybridlog.playback.server import PlaybackOptions, PlaybackServer
+        from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
     except ImportError as error:
         raise MissingDependencyError(
             "serve needs websockets: pip install 'hybridlog[foxglove]'"
         ) from error
     import asyncio
 
-    from hybridlog.playback.played import PlayedLog
+    from hybridlog.view.playback.played import PlayedLog
 
     with opened_store(store, mongo, quiet=quiet, is_lasting=True) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)

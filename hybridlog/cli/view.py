@@ -6,7 +6,6 @@ import os
 import sys
 from itertools import chain, islice
 from pathlib import Path
-from typing import Final
 
 import click
 
@@ -15,7 +14,6 @@ from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
 from hybridlog_storage.errors import UsageError
 
-_FOXGLOVE: Final = ("https://app.foxglove.dev", "https://embed.foxglove.dev")
 _MAX_FOLDERS = 1000
 
 
@@ -76,8 +74,7 @@ def view_command(
     if origins and not mcap:
         raise UsageError("--allow-origin is about --mcap: add that.")
     with opened_store(store, mongo, quiet=as_json, is_lasting=True) as opened:
-        allowed = (*_FOXGLOVE, *origins) if mcap else ()
-        server = ViewServer(opened, port, origins=allowed)
+        server = ViewServer(opened, port, viewers=mcap, origins=origins)
         url = server.url
         label = ""
         if recording is not None:

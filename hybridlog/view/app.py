@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -16,6 +15,7 @@ from hybridlog.view.guard import Guard
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
+    from hybridlog.view.loopback import Admission
 
 ROUTES: Final = (
     "ask",
@@ -34,21 +34,20 @@ ROUTES: Final = (
 _STATIC: Final = Path(__file__).parent / "static"
 
 
-def make_app(store: Store, token: str, port: int, *, origins: Collection[str] = ()) -> Guard:
+def make_app(store: Store, rules: Admission) -> Guard:
     """The application, behind its guard.
 
     Args:
         store: The store that is shown.
-        token: The first part of every path.
-        port: The port of the server.
-        origins: Origins of other pages that may read the routes below `mcap/`; without any,
-            these routes do not exist.
+        rules: Who may ask. Their guests may read the routes below `mcap/`; without any, these
+            routes do not exist.
     """
-    names = (*ROUTES, "mcap") if origins else ROUTES
+    has_guests = rules.viewers or bool(rules.origins)
+    names = (*ROUTES, "mcap") if has_guests else ROUTES
     routes = [
         route for name in names for route in import_module(f"hybridlog.view.routes.{name}").routes
     ]
     routes.append(Mount("/", StaticFiles(directory=_STATIC, html=True), name="page"))
     app = Starlette(routes=routes, exception_handlers={Exception: broken_response})
     app.state.context = Context(store)
-    return Guard(app, token, port, shared=("/mcap/",) if origins else (), origins=origins)
+    return Guard(app, rules, shared=("/mcap/",) if has_guests else ())

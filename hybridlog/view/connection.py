@@ -53,7 +53,7 @@ class BoundedConnection(H11Protocol):
         if self.cycle is not before:
             self._stop_waiting()
             guard: Any = self.config.app
-            self.is_stranger &= not guard.knows(self.scope["path"])
+            self.is_stranger &= not guard.rules.knows(self.scope["path"])
 
     def on_response_complete(self) -> None:
         """A request is answered."""

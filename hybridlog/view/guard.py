@@ -1,13 +1,11 @@
 """Keeps everyone but the user's own page away from the server.
 
-Other users of the machine, and pages of other sites in the user's browser, can reach a port of
-the loopback interface. So each request must carry the token in its path, name this server as
-its host, and come from no other origin.
+Each request must carry the token in its path, name this server as its host, and come from no
+other origin: see `loopback`.
 """
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Final
 
@@ -16,6 +14,8 @@ from starlette.responses import PlainTextResponse, Response
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+    from hybridlog.view.loopback import Admission
 
 HEADERS: Final = {
     "Content-Security-Policy": (
@@ -35,38 +35,26 @@ _PREFLIGHT: Final = "OPTIONS"
 _ONCE: Final = ("host", "origin")
 
 
-def new_token() -> str:
-    """A random token, 128 bits as text for a URL."""
-    return secrets.token_urlsafe(16)
-
-
 class Guard:
     """Refuses requests that are not the page's own.
 
     Args:
         app: The application behind it; it sees paths below the token.
-        token: The first part of every valid path.
-        port: The port of the server.
-        shared: Beginnings of paths below the token that pages of `origins` may read, too.
-        origins: Origins of these pages, such as `https://app.foxglove.dev`.
+        rules: Who may ask, with a token and the port.
+        shared: Beginnings of paths below the token that pages of guests may read, too.
     """
 
     def __init__(
         self,
         app: ASGIApp,
-        token: str,
-        port: int,
+        rules: Admission,
         *,
         shared: Collection[str] = (),
-        origins: Collection[str] = (),
     ) -> None:
         self._app = app
-        self._token = token.encode()
-        self._root = f"/{token}"
-        self._hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]")}
-        self._own = {f"http://{host}" for host in self._hosts}
+        self.rules = rules
+        self._root = f"/{rules.token}"
         self._shared = tuple(shared)
-        self._origins = frozenset(origins)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -93,37 +81,35 @@ class Guard:
                 answered = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     answered.setdefault(name, value)
-                if origin in self._origins:
+                if self._is_guest(origin):
                     _let_read(answered, str(origin))
             await send(message)
 
         await self._app({**scope, "root_path": self._root}, receive, guarded)
 
-    def knows(self, path: str) -> bool:
-        """True for a path that has the token."""
-        first = path.removeprefix("/").partition("/")[0]
-        return secrets.compare_digest(first.encode(), self._token)
+    def _is_guest(self, origin: str | None) -> bool:
+        return origin is not None and bool(self._shared) and self.rules.is_guest(origin)
 
     def _refusal(self, method: str, headers: Headers, path: str) -> tuple[int, str] | None:
         """Status and reason; None for a request of the page."""
         if any(len(headers.getlist(name)) > 1 for name in _ONCE):
             return 400, "A header occurs twice."
-        if headers.get("host") not in self._hosts:
+        if not self.rules.is_host(headers.get("host")):
             return 421, "This server answers to 127.0.0.1 only."
-        if not self.knows(path):
+        if not self.rules.knows(path):
             return 404, "Open the address that `hybridlog view` printed; it has a token."
         if not self._is_own(headers, path.removeprefix(self._root)):
             return 403, "Pages of other sites may not read this store."
-        preflight = method == _PREFLIGHT and headers.get("origin") in self._origins
+        preflight = method == _PREFLIGHT and self._is_guest(headers.get("origin"))
         if method not in _METHODS and not preflight:
             return 405, "This server only answers GET: it never changes the store."
         return None
 
     def _is_own(self, headers: Headers, below: str) -> bool:
         origin = headers.get("origin")
-        if origin is not None and origin in self._origins:
+        if self._is_guest(origin):
             return below.startswith(self._shared)
-        if origin is not None and origin not in self._own:
+        if origin is not None and not self.rules.is_own(origin):
             return False
         site = headers.get("sec-fetch-site", "same-origin")
         return site in {"same-origin", "none"} or headers.get("sec-fetch-mode") == "navigate"

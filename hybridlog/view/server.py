@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import errno
-import socket
 from collections.abc import Collection
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog_storage.errors import MissingDependencyError, UsageError
+from hybridlog.view.loopback import HOST, Admission, listen, new_token
+from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
@@ -22,7 +21,8 @@ class ViewServer:
     Args:
         store: The store that is shown.
         port: Port of 127.0.0.1; 0 for any that is free.
-        origins: Origins of other viewers that may read selections as MCAP; see `make_app`.
+        viewers: Foxglove may read selections as MCAP.
+        origins: So may pages of these origins.
 
     Attributes:
         url: The address of the page, with its token.
@@ -32,23 +32,25 @@ class ViewServer:
         UsageError: The port cannot be used.
     """
 
-    def __init__(self, store: Store, port: int = 0, *, origins: Collection[str] = ()) -> None:
+    def __init__(
+        self, store: Store, port: int = 0, *, viewers: bool = False, origins: Collection[str] = ()
+    ) -> None:
         try:
             import uvicorn
 
             from hybridlog.view.app import make_app
             from hybridlog.view.connection import BoundedConnection
-            from hybridlog.view.guard import new_token
         except ModuleNotFoundError as error:
             raise MissingDependencyError(
                 "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
             ) from error
-        self._socket = _listen(port)
+        self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
         token = new_token()
-        self.url = f"http://127.0.0.1:{self.port}/{token}/"
+        self.url = f"http://{HOST}:{self.port}/{token}/"
+        rules = Admission(port=self.port, token=token, viewers=viewers, origins=origins)
         config = uvicorn.Config(
-            make_app(store, token, self.port, origins=origins),
+            make_app(store, rules),
             log_level="critical",
             access_log=False,
             lifespan="off",
@@ -75,18 +77,3 @@ class ViewServer:
     def stop(self) -> None:
         """End `run` soon. May be called from any thread."""
         self._server.should_exit = True
-
-
-def _listen(port: int) -> socket.socket:
-    # With the protocol named, asyncio sends answers at once and not with the next acknowledgement.
-    listening = socket.socket(proto=socket.IPPROTO_TCP)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(("127.0.0.1", port))
-        listening.listen(128)  # from here on, a browser may come
-    except (OSError, OverflowError) as error:
-        listening.close()
-        taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        reason = "is in use" if taken else f"cannot be used: {error}"
-        raise UsageError(f"Port {port} {reason}. Without --port a free one is taken.") from error
-    return listening

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
 
 from tests.independent import Seen, read_bag
-from tests.playback.viewer import Viewer
+from tests.view.playback.viewer import Viewer
 
 from .running import run, started, wait_for
 
@@ -41,7 +41,7 @@ def test_wrong_ways(store: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = run("serve", "robot", "-t", "/map", "--port", port, store=store, code=2)
-    assert f"Port {port} cannot be used" in done.err
+    assert f"Port {port} is in use" in done.err
     assert done.out == ""
 
 

@@ -56,7 +56,7 @@ def test_a_port_that_is_taken_is_refused(store: Path) -> None:
         running = start("--store", store, "--port", str(other.getsockname()[1]))
         _, errors = running.communicate(timeout=20)
     assert running.returncode == 2
-    assert "is in use. Without --port a free one is taken." in errors
+    assert "is in use. Give another one with --port, or 0 for any." in errors
 
 
 def test_an_unknown_recording_is_refused_before_anything_is_served(store: Path) -> None:

@@ -401,7 +401,7 @@ EXEMPT: dict[str, str] = {
     "top": "it asks the recorder, not the store",
     "import": "it copies recordings that have ended, from a store",
     "view": "it serves until it is stopped; see tests/view",
-    "serve": "it serves until it is stopped; see tests/playback",
+    "serve": "it serves until it is stopped; see tests/view/playback",
     "open": "it opens a program with a slice, which `fetch -o` makes",
     "trust": "it is about servers",
     "demo": "it makes a recording",

@@ -17,6 +17,7 @@ import hybridlog as hl
 from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
 from hybridlog.view.app import make_app
+from hybridlog.view.loopback import Admission
 from hybridlog.view.server import ViewServer
 from tests.every_image import write_images
 from tests.odd_messages import write_odd
@@ -46,7 +47,7 @@ def asking() -> Asking:
     """Makes a client of the view of a store, without a server; paths are below the token."""
 
     def client(store: hl.Store) -> TestClient:
-        app = make_app(store, TOKEN, PORT)
+        app = make_app(store, Admission(token=TOKEN, port=PORT))
         return TestClient(app, base_url=f"http://127.0.0.1:{PORT}/{TOKEN}/")
 
     return client

@@ -22,6 +22,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.cli import fetch
 from hybridlog.view.app import make_app
+from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask, export
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -240,7 +241,7 @@ async def _asked_for(
 
 def test_sql_stops_when_the_client_goes(demo_store: hl.Store) -> None:
     """The server's answer ends although the query would not, and the next one is answered."""
-    app = make_app(demo_store, TOKEN, PORT)
+    app = make_app(demo_store, Admission(token=TOKEN, port=PORT))
     for _ in range(3):  # more than are answered at once
         said = asked_for(app, "sql", {"recording": "robot", "text": ENDLESS}, leaves_after=0.1)
         assert b"The query was stopped" in said[1]["body"]
@@ -374,7 +375,7 @@ def test_a_file_is_made_while_it_is_sent(odd: hl.Store, monkeypatch: pytest.Monk
             ended.append(True)
 
     monkeypatch.setattr(export, "pieces_of", counted)
-    app = make_app(odd, TOKEN, PORT)
+    app = make_app(odd, Admission(token=TOKEN, port=PORT))
     asked = {"recording": "x-1"}
     said = asked_for(app, "export", asked, leaves_after=9.0)
     whole = len(made)

@@ -18,6 +18,7 @@ from hybridlog.demo.write import write_bag
 from hybridlog.query import chunk_scan
 from hybridlog.view import context
 from hybridlog.view.app import make_app
+from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask
 from hybridlog_storage.messages import Channel
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
@@ -75,7 +76,7 @@ def assert_stops(
             assert self.wait(20)
             return True
 
-    app = make_app(store, TOKEN, PORT)
+    app = make_app(store, Admission(token=TOKEN, port=PORT))
     with monkeypatch.context() as patched:
         patched.setattr(context, "threading", SimpleNamespace(Event=Watched))
         said = asked_for(app, path, asked, leaves_after=leaves)
@@ -101,7 +102,7 @@ def test_reading_payloads_is_given_up(
 
 
 def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> None:
-    app = make_app(demo_store, TOKEN, PORT)
+    app = make_app(demo_store, Admission(token=TOKEN, port=PORT))
     shared: context.Context = app._app.state.context
     with ExitStack() as held:
         for _ in range(context.MAX_WORKING):

@@ -19,7 +19,7 @@ from urllib.parse import quote, urlencode, urlsplit
 import pytest
 
 import hybridlog as hl
-from hybridlog.view import server as server_module
+from hybridlog.view import loopback
 from hybridlog.view.app import ROUTES
 from hybridlog.view.connection import BoundedConnection
 from tests.view.conftest import served
@@ -27,7 +27,7 @@ from tests.view.conftest import served
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-STATIC = Path(server_module.__file__).parent / "static"
+STATIC = Path(loopback.__file__).parent / "static"
 
 
 class Answer(NamedTuple):
@@ -335,7 +335,7 @@ _READ = re.compile(r'asked\.[a-z]+\(\s*"(\w+)"')
 
 def asked_by_routes() -> list[tuple[str, list[str]]]:
     """Path of each route with the parameters that its module, or what it shares, reads."""
-    view = Path(server_module.__file__).parent
+    view = Path(loopback.__file__).parent
     common = {"recording", "topic", "at", "begin", "end", "pixels"}
     for path in view.glob("*.py"):
         common |= set(_READ.findall(path.read_text()))
@@ -519,7 +519,7 @@ def test_answers_do_not_wait_for_acknowledgements() -> None:
             found.append(peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
             writer.close()
 
-        listening = server_module._listen(0)
+        listening = loopback.listen(0)
         async with await asyncio.start_server(accept, sock=listening):
             reader, writer = await asyncio.open_connection(*listening.getsockname())
             await reader.read()

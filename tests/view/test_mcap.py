@@ -18,6 +18,7 @@ from starlette.testclient import TestClient
 import hybridlog as hl
 from hybridlog.formats.slices import SliceCache, write_mcap
 from hybridlog.view.app import make_app
+from hybridlog.view.loopback import Admission
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_bag, read_mcap
@@ -47,7 +48,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def app(demo_store: hl.Store) -> TestClient:
     """The view with MCAP, without a server."""
-    guarded = make_app(demo_store, TOKEN, PORT, origins=[FOXGLOVE])
+    guarded = make_app(demo_store, Admission(token=TOKEN, port=PORT, origins=[FOXGLOVE]))
     return TestClient(guarded, base_url=f"http://127.0.0.1:{PORT}/{TOKEN}/mcap/")
 
 

@@ -21,12 +21,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import hybridlog as hl
-from hybridlog.playback import server
-from hybridlog.playback.clock import PlaybackClock
-from hybridlog.playback.played import Covered, PlayedLog
+from hybridlog.view.playback import server
+from hybridlog.view.playback.played import Covered, PlaybackClock, PlayedLog
 from hybridlog_storage.errors import TimeError, UsageError
 from tests.independent import Seen, read_mcap
-from tests.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
+from tests.view.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
 
 S = 10**9
 BEGIN = 1_700_000_000 * S

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Self
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from hybridlog.playback.played import PlayedLog
-from hybridlog.playback.server import PlaybackOptions, PlaybackServer
+from hybridlog.view.playback.played import PlayedLog
+from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
 
 SDK = "foxglove.sdk.v1"
 WEBSOCKET = "foxglove.websocket.v1"

@@ -11,8 +11,8 @@ from struct import Struct, error
 from typing import Final
 
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, TIME
-from hybridlog.playback.played import PlayedChannel
 from hybridlog.schema.completion import with_nested
+from hybridlog.view.playback.played import PlayedChannel
 
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
 _DATA = Struct("<BIQ")  # opcode, subscription, log time

@@ -17,16 +17,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Final
-from urllib.parse import urlsplit
 
 import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from hybridlog.live.sources.foxglove.protocol import SUBPROTOCOLS
-from hybridlog.playback.clock import PlaybackClock
-from hybridlog.playback.played import Block
-from hybridlog.playback.protocol import (
+from hybridlog.view.loopback import Admission, listen
+from hybridlog.view.playback.played import Block, PlaybackClock
+from hybridlog.view.playback.protocol import (
     Control,
     Level,
     Request,
@@ -44,16 +43,15 @@ from hybridlog.playback.protocol import (
     status,
     time_now,
 )
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     from websockets.http11 import Request as HttpRequest
     from websockets.http11 import Response
     from websockets.typing import Subprotocol
 
-    from hybridlog.playback.played import PlayedLog
+    from hybridlog.view.playback.played import PlayedLog
 
-HOST: Final = "127.0.0.1"
 _WITH_PLAYBACK: Final = SUBPROTOCOLS[0]
 _MAX_CLIENTS: Final = 32
 _MAX_REQUEST: Final = 8 << 20  # bytes; subscriptions to 65,535 channels take 3 MB
@@ -64,8 +62,6 @@ _STEP_S: Final = 0.002  # of waiting, at least, so that many messages are sent a
 _LATE_S: Final = 0.1  # of playing; later than this, the clock waits for the clients
 _PING_S: Final = 10.0
 _CLOSE_S: Final = 1.0
-_OWN_HOSTS: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_VIEWERS: Final = ".foxglove.dev"
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +169,7 @@ class PlaybackServer:
         self._name = name
         self._options = options
         self._say = say
+        self._rules = Admission(origins=options.origins, viewers=True, local=True)
         self._session = secrets.token_hex(8)
         self._topics = {each.id: each.channel.topic for each in log.channels}
         self._clients: list[_Client] = []
@@ -202,13 +199,7 @@ class PlaybackServer:
         Raises:
             UsageError: The port is taken.
         """
-        try:
-            server = await self._listen()
-        except OSError as error:
-            raise UsageError(
-                f"Port {self._options.port} cannot be used: {error.strerror}. Choose another one "
-                "with --port, or 0 for any."
-            ) from error
+        server = await self._listen()
         playing = asyncio.create_task(self._play())
         stopping = asyncio.create_task(stop.wait())
         try:
@@ -228,8 +219,7 @@ class PlaybackServer:
         protocols: Sequence[Subprotocol] = SUBPROTOCOLS  # type: ignore[assignment]
         return await serve(
             self._serve,
-            HOST,
-            self._options.port,
+            sock=listen(self._options.port),
             subprotocols=protocols,
             process_request=self._check,
             compression=None,
@@ -244,9 +234,9 @@ class PlaybackServer:
     def _check(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
         """Refuse web pages that are no viewers, and more clients than are served."""
         origin = request.headers.get("Origin")
-        if not _is_own_host(request.headers.get("Host", "")):
+        if not self._rules.is_host(request.headers.get("Host", "")):
             return connection.respond(HTTPStatus.FORBIDDEN, "Only localhost is served.\n")
-        if origin is not None and not self._is_welcome(origin):
+        if origin is not None and not self._rules.is_guest(origin):
             if origin not in self._refused and len(self._refused) < _MAX_CLIENTS:
                 self._refused.add(origin)
                 self._say(f"Refused a page of {origin}: --allow-origin {origin} admits it.")
@@ -254,21 +244,6 @@ class PlaybackServer:
         if len(self._clients) >= _MAX_CLIENTS:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "Too many clients.\n")
         return None
-
-    def _is_welcome(self, origin: str) -> bool:
-        """True for desktop programs, pages of this computer, Foxglove, and allowed origins."""
-        try:
-            parts = urlsplit(origin)
-            host = parts.hostname or ""
-        except ValueError:
-            return False
-        if origin in self._options.origins:
-            return True
-        if parts.scheme == "https" and host.endswith(_VIEWERS):
-            return True
-        if parts.scheme in {"http", "https"}:
-            return host in _OWN_HOSTS
-        return bool(parts.scheme)  # such as file://; a page in a sandbox has "null"
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve a client until it goes."""
@@ -492,11 +467,3 @@ class PlaybackServer:
         if topics:
             blocks = self._log.after(sorted(topics), self._sent)
             self._reading = _Reading(blocks, self._executor)
-
-
-def _is_own_host(host: str) -> bool:
-    """True for names of this computer, with any port: a request may come through a tunnel."""
-    try:
-        return urlsplit(f"//{host}").hostname in _OWN_HOSTS
-    except ValueError:
-        return False
