@@ -295,7 +295,7 @@ class Tables:
             StoreError: the table is damaged, or has another number of rows.
         """
         channels = self._channels_of(recording, topic)
-        if recording.status == "open" or not has_one_definition(channels):
+        if recording.status == "open" or not self.can_have(recording, topic):
             raise FileNotFoundError
         rows, damaged = self._rows_of(recording, topic, channels)
         table = self._table(recording, topic, rows)
@@ -309,6 +309,15 @@ class Tables:
                 f"The tables of {topic} have {table.rows} messages, the segments {messages}."
             )
         return table
+
+    def can_have(self, recording: RecordingEntry, topic: str) -> bool:
+        """True if a topic has a table when all is well: only with one definition."""
+        found = {
+            table_schema(channel.message_encoding, channel.schema, channel.metadata)
+            for channel in self._channels_of(recording, topic)
+            if channel.stats.messages
+        }
+        return len(found) == 1
 
     def has_all(self, recording: RecordingEntry, topic: str) -> bool:
         """True if files have all messages of a topic, whatever their definitions are."""
@@ -390,7 +399,7 @@ class Tables:
             The table, and the segments of which it has all rows; None without a valid one.
         """
         channels = self._channels_of(recording, topic)
-        if not has_one_definition(channels):
+        if not self.can_have(recording, topic):
             return None
         with self._lock:
             place = parts_folder(self._root, recording.id)
@@ -428,13 +437,3 @@ class Tables:
 def _rows_in(section: Section, topic: str) -> int:
     counts = section.topics.get(topic)
     return 0 if counts is None else counts.rows
-
-
-def has_one_definition(channels: Sequence[ChannelEntry]) -> bool:
-    """True if the messages of some channels have one definition: only then do tables answer."""
-    found = {
-        table_schema(channel.message_encoding, channel.schema, channel.metadata)
-        for channel in channels
-        if channel.stats.messages
-    }
-    return len(found) == 1

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
@@ -41,24 +41,12 @@ def missing(
     from hybridlog.columns.tables import Tables
 
     tables = tables or Tables(directory.path)
-    possible = _possible(entry)
     return {
         topic
         for topic in topics_of(entry)
         if not tables.has_all(entry, topic)
-        or (topic in possible and tables.of(entry, topic) is None)
+        or (tables.can_have(entry, topic) and tables.of(entry, topic) is None)
     }
-
-
-def _possible(entry: RecordingEntry) -> set[str]:
-    """Topics that have a table when all is well: those with one definition."""
-    from hybridlog.columns.tables import has_one_definition
-
-    by_topic: dict[str, list[ChannelEntry]] = {topic: [] for topic in topics_of(entry)}
-    for channel in entry.channels:
-        if channel.topic in by_topic:
-            by_topic[channel.topic].append(channel)
-    return {topic for topic, channels in by_topic.items() if has_one_definition(channels)}
 
 
 def make(
@@ -116,7 +104,7 @@ def made_for(
     found = tables.of(entry, topic)
     if found is not None or entry.status == "open" or not directory.is_writable:
         return found
-    if topic not in _possible(entry) and tables.has_all(entry, topic):
+    if not tables.can_have(entry, topic) and tables.has_all(entry, topic):
         return None
     if not make(directory, entry, {topic}):
         return None
