@@ -296,13 +296,8 @@ class SqlAnswer:
         lines = []
         for topic, reason in found.undefined.items():
             lines.append(f"{topic} has no columns of fields: {reason}.")
-        for topic, count in found.unreadable.items():
-            lines.append(f"{topic}: {unfit(count)}; the fields are null, and error says why.")
-        for topic, count in found.reduced.items():
-            have = "has" if count == 1 else "have"
-            lines.append(
-                f"{topic}: {counted(count, 'message')} {have} no fields: reduced under pressure."
-            )
+        for (topic, state), count in found.absent.items():
+            lines.append(f"{topic}: {_absent(state, count)}.")
         question = Question(tuple(found.topics), tuple(found.recordings))
         return [*lines, *completeness_of(self._connection.engine.session, question).sentences]
 
@@ -468,6 +463,15 @@ class SqlAnswer:
                 shortage = shortage_of(error, self._connection.memory)
                 raise shortage or UsageError(str(error)) from error
             raise
+
+
+def _absent(state: str, messages: int) -> str:
+    """A number of messages without fields, and the cause."""
+    if state == "unreadable":
+        return f"{unfit(messages)}; the fields are null, and error says why"
+    have = "has" if messages == 1 else "have"
+    cause = {"reduced": "reduced under pressure"}.get(state, state)
+    return f"{counted(messages, 'message')} {have} no fields: {cause}"
 
 
 def _kind(statement: Any) -> str:

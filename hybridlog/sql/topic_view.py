@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isqrt
@@ -16,7 +17,7 @@ from pyarrow import acero, fs
 
 from hybridlog.columns.fields import without
 from hybridlog.columns.layout import STATES
-from hybridlog.columns.rows import REDUCED, UNREADABLE, WHOLE
+from hybridlog.columns.rows import WHOLE
 from hybridlog.sql.columns import (
     OWN,
     ViewColumn,
@@ -46,15 +47,13 @@ class Remarks:
     """Remarks about an answer: messages and topics that it may lack.
 
     Attributes:
-        unreadable: Messages without fields, because they do not fit their definition, by topic.
-        reduced: Messages without fields, because they were reduced under pressure, by topic.
+        absent: Messages without fields, by topic and `state`, which is the cause.
         undefined: Topics without fields, with the reason.
         recordings: Recordings that were read, by id.
         topics: Topics that were read.
     """
 
-    unreadable: dict[str, int] = field(default_factory=dict)
-    reduced: dict[str, int] = field(default_factory=dict)
+    absent: Counter[tuple[str, str]] = field(default_factory=Counter)
     undefined: dict[str, str] = field(default_factory=dict)
     recordings: dict[str, RecordingEntry] = field(default_factory=dict)
     topics: set[str] = field(default_factory=set)
@@ -354,13 +353,9 @@ class _Plan:
         states = rows.own.get("state")
         if states is None:
             return  # all are whole
-        for state, found in (
-            (UNREADABLE, self._reading.remarks.unreadable),
-            (REDUCED, self._reading.remarks.reduced),
-        ):
-            count = pc.sum(pc.equal(states, STATES[state])).as_py() or 0
-            if count:
-                found[topic] = found.get(topic, 0) + count
+        for found in pc.value_counts(states).to_pylist():
+            if found["values"] != STATES[WHOLE]:
+                self._reading.remarks.absent[topic, found["values"]] += found["counts"]
 
 
 def _mask(batch: pa.RecordBatch, where: Any) -> Any:

@@ -138,7 +138,7 @@ def test_unreadable_messages_are_told(tmp_path: Path, server: str) -> None:
         ((time, _, error, state),) = answer.rows()
         assert (time, state) == (BASE + 3, "unreadable")
         assert "does not fit" in error
-        assert answer.remarks.unreadable == {"/large": 1}
+        assert answer.remarks.absent == {("/large", "unreadable"): 1}
     done = run(tmp_path / "store", "select count(*) from large", "-F", "csv")
     assert done.stdout.splitlines()[1] == "6"
     assert "/large: 1 message does not fit its definition; the fields are null" in done.stderr

@@ -281,6 +281,10 @@ def test_reduced_messages_have_null_fields(store: hl.Store) -> None:
     query = "select state, i8 is null from read_parquet(?) order by t"
     rows = duckdb.execute(query, [glob_of(store)]).fetchall()
     assert rows == [("whole", False), ("reduced", True)]
+    answer = store.sql("select i8 from a")
+    assert [value is None for (value,) in answer.rows()] == [False, True]
+    assert answer.remarks.absent == {("/a", "reduced"): 1}
+    assert "/a: 1 message has no fields: reduced under pressure." in answer.told()
 
 
 def test_compacted_and_dropped_recordings_stay(many: hl.Store) -> None:
