@@ -519,7 +519,8 @@ def test_every_exit_code_and_variable_is_described() -> None:
 
 def public(thing: type) -> dict[str, Any]:
     """Public attributes of a class, fields of dataclasses included."""
-    found = {n: v for n, v in vars(thing).items() if not n.startswith("_")}
+    classes = [c for c in reversed(thing.__mro__) if c.__module__.startswith("hybridlog")]
+    found = {n: v for c in classes for n, v in vars(c).items() if not n.startswith("_")}
     found.update(
         {n: None for n in getattr(thing, "__dataclass_fields__", {}) if not n.startswith("_")}
     )

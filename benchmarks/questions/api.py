@@ -78,7 +78,7 @@ class ApiAsker(_Stored, Asker):
 
     def before_errors(self) -> int:
         errors = self.store.topic(ROSOUT).where(f"level == {ERROR}")
-        return self.store.all_topics().before(errors, "5min").count()
+        return self.store.all_topics().around(errors, before="5min").count()
 
 
 class IndexedApiAsker(ApiAsker):

@@ -20,7 +20,14 @@ from hybridlog.cli.options import VERBOSE
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
-from hybridlog.formats.slices import IN_FORCE, Front, add_extras, batches_of, profile_of
+from hybridlog.formats.slices import (
+    IN_FORCE,
+    Front,
+    add_extras,
+    batches_of,
+    payload_bytes,
+    profile_of,
+)
 from hybridlog_storage.disk.unfinished import is_published, undone
 from hybridlog_storage.errors import DefinitionError, HybridlogError, PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
@@ -287,7 +294,7 @@ def write_answer(
         yield from lines(Planner(query.session, query.question, query.counters))
 
     content = OUTPUTS[form].content
-    total = 0 if quiet else query.size_hint()
+    total = 0 if quiet else payload_bytes(query)
     with progress_bar(form, total, quiet=quiet) as bar:
         counters = query.counters
 
@@ -301,7 +308,7 @@ def write_answer(
             before = front if content == "log" else Front(latched=False)
             _write_messages(query, form, target, progress, front=before, extras=extras)
             return 0
-        columns = query.schema() if content == "table" else None
+        columns = _schema_of(query) if content == "table" else None
         rows = Rows(lines=objects, tables=query.to_tables, schema=lambda: columns)
         written = _write_rows(rows, form, target, progress)
     from hybridlog.frames.answer import json_columns
@@ -364,6 +371,16 @@ def _write_messages(
         for batch, channels in batches_of(query, front):
             log.write(batch, channels)
             progress()
+
+
+def _schema_of(query: Query) -> pa.Schema | None:
+    """Columns of the answer where only messages determine them; None where definitions do."""
+    from hybridlog.frames.answer import schema_of
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.planner import Planner
+
+    with query.session.at_one_moment():
+        return schema_of(Planner(query.session, query.question, Counters()))
 
 
 def _write_pictures(query: Query, form: str, target: Target, progress: Progress) -> None:

@@ -142,7 +142,9 @@ def _write_file(
 
 def _write_directory(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
     """Write one file a topic, except topics that fit no table or have no message in the range."""
-    query.check_range()  # refuses a range without any message
+    from hybridlog.query.ranges import RangeResolver
+
+    RangeResolver(query.session, query.question).resolve()  # refuses a range without any message
     if directory.exists():
         _write_tables(query, form, directory, force=force, quiet=quiet)
         return

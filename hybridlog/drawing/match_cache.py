@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.drawing.matches import AskedMatches, Matches, Rows
+from hybridlog.query.answers.interval_queries import IntervalQueries
+from hybridlog.query.answers.match_times import match_times
 from hybridlog_storage.stopping import held
 from hybridlog_storage.times import END
 
@@ -41,13 +43,13 @@ class CachedMatches:
         times, seqs = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         held = [np.empty((0, 2), np.int64)]
         size = 0
-        for found in query.match_times():
+        for found in match_times(query.session, query.question, query.counters):
             size += found.log_time.nbytes + found.seq.nbytes
             if size > max_bytes:
                 return None
             times.append(found.log_time)
             seqs.append(found.seq)
-        for _, rows in query.held():
+        for _, rows in IntervalQueries(query.session, query.question, query.counters).held(None):
             held.append(rows[:, :2].copy())
             size += held[-1].nbytes
             if size > max_bytes:

@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from hybridlog.query.answers.interval_queries import IntervalQueries
+from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.ranges import RangeResolver
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import earlier, placed, span_of
 
@@ -70,13 +73,17 @@ class AskedMatches:
         """See `Matches`."""
         query = self._between(begin, end)
         if query is not None:
-            yield from ((found.log_time, found.seq) for found in query.match_times())
+            yield from (
+                (found.log_time, found.seq)
+                for found in match_times(query.session, query.question, query.counters)
+            )
 
     def held(self, begin: int, end: int) -> Iterator[NDArray[np.int64]]:
         """See `Matches`."""
         query = self._between(begin, end)
         if query is not None:
-            yield from (rows[:, :2] for _, rows in query.held())
+            asked = IntervalQueries(query.session, query.question, query.counters)
+            yield from (rows[:, :2] for _, rows in asked.held(None))
 
     def count_until(self, end: int) -> int:
         """See `Matches`."""
@@ -88,7 +95,7 @@ class AskedMatches:
         low, high = max(begin or 0, 0), None if end is None else max(end, 0)
         bounded = self._query.between(low, high)
         try:
-            bounded.check_range()
+            RangeResolver(bounded.session, bounded.question).resolve()
         except TimeError:
             return None
         return bounded

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import pickle
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -44,7 +47,7 @@ def batches_of(query: Query, front: Front) -> Iterator[tuple[Batch, Sequence[Cha
         query: The query; its counters count the messages, those in front as `latched`.
         front: The latched messages in front of the answer.
     """
-    before = query.copy()
+    before = copy(query)
     if front.latched:
         for batch, channels in before.latched(original_times=front.original_times):
             yield batch, [c.channel for c in channels]
@@ -53,9 +56,35 @@ def batches_of(query: Query, front: Front) -> Iterator[tuple[Batch, Sequence[Cha
     query.counters.add(before.counters)
 
 
+def fingerprint(query: Query) -> str:
+    """A digest of a question and of the state of its recordings, in hexadecimal digits.
+
+    As long as it is the same, so is the answer.
+    """
+    states = [(o.id, o.look, o.status, o.messages, o.extent) for o in query.summaries()]
+    return hashlib.sha256(pickle.dumps((query.question, states), protocol=5)).hexdigest()
+
+
+def payload_bytes(query: Query) -> int:
+    """Bytes of payload of a slice, about."""
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.planner import Planner
+
+    question = query.question
+    if not question.is_by_log_time:
+        question = replace(question, bounds=None)
+    parts = Planner(query.session, question, Counters()).parts()
+    return int(sum(p.share * sum(s.payload_bytes for s in p.stats) for p in parts))
+
+
 def profile_of(query: Query) -> str:
     """The MCAP profile of a slice: `ros1` or `ros2`, empty for others and for a mixture."""
-    encodings = query.encodings()
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.planner import Planner
+
+    examples = Planner(query.session, query.question, Counters()).examples
+    spoken = [channel for channel in examples if channel.stats.messages] or examples
+    encodings = {channel.channel.message_encoding for channel in spoken}
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
 
 
@@ -127,7 +156,7 @@ class SliceCache:
             UsageError: The slice is larger than all files may be together, or the directory
                 cannot be used.
         """
-        path = self._directory / f"{name[:_NAME_LENGTH]}-{query.fingerprint()[:_NAME_DIGITS]}.mcap"
+        path = self._directory / f"{name[:_NAME_LENGTH]}-{fingerprint(query)[:_NAME_DIGITS]}.mcap"
         if not self._use(path):
             with self._writing:  # one at a time: they would compete for the disk
                 if not self._use(path):
@@ -143,7 +172,7 @@ class SliceCache:
         return True
 
     def _write(self, query: Query, path: Path, write: Callable[[Query, Path], None]) -> None:
-        size = query.size_hint()
+        size = payload_bytes(query)
         if size > self._max_bytes:
             raise UsageError(
                 f"This slice has about {size / 1e9:.0f} GB, and at most "

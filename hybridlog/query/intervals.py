@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -38,10 +38,21 @@ _AT_ONCE = 10_000  # intervals whose columns become Python numbers together
 
 
 class Events(Protocol):
-    """Messages at some times, such as those of a query."""
+    """Messages at some times: those of a query."""
 
-    def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Test which spans of log time of a recording contain any message."""
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Ids of their recordings."""
+
+    @property
+    def question(self) -> Any:
+        """What they answer."""
+
+    def during(self, intervals: Intervals) -> Events:
+        """Only those in some intervals."""
+
+    def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
+        """Time around each of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,11 +311,17 @@ class Intervals:
         Raises:
             UsageError: it has `limit` or `every`.
         """
+        if not events.question.returns_all:
+            raise UsageError("limit and every cannot be combined with a test for any message.")
+        known = set(events.recordings)
+        own = Intervals.of((n, self._rows_of(n)) for n in self._recordings if n in known)
         found = np.zeros(len(self), np.bool_)
-        for name in self._recordings:
-            rows = self._rows(name)
-            spans = np.stack([self._begin[rows], self._end[rows]], axis=1)
-            found[rows] = events.any_within(name, spans)
+        if len(own):
+            moments = events.during(own).windows(after="1ns")
+            for name in own.recordings:
+                rows, (begin, end) = self._rows(name), moments.of_recording(name).T
+                first = np.searchsorted(end, self._begin[rows], side="right")
+                found[rows] = first < np.searchsorted(begin, self._end[rows])
         return self._take(found)
 
     def within(self, spans: Mapping[str, Span]) -> Intervals:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -193,12 +194,12 @@ def test_before_and_after(logs: Logs) -> None:
     events = logs.store.topic("right/pose").where("state == 'stop'")
     base = logs.store.topic("base")
     assert base.where(text, within=("5ms", "9ms")) == base.around(events, "5ms", "9ms")
-    assert base.where(text, within=("5ms", 0)) == base.before(events, "5ms")
+    assert base.where(text, within=("5ms", 0)) == base.around(events, before="5ms")
 
 
 def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
     base = logs.store.topic("base").in_recording("b")
-    whole = base.copy()
+    whole = copy(base)
     list(whole)
     few = base.where("right/pose: header.seq < 440", within="2ms")
     assert few.spent.bytes_read > 0

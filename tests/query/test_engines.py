@@ -411,11 +411,12 @@ def check(world: World, question: dict[str, Any]) -> None:
                 (s.recording[:16], s.topic, s.log_time, s.seq) for s in want
             ], (way, question)
             if query.question.returns_all and question["clock"] == "log":
-                spans = np.array([[s.log_time, s.log_time + 1] for s in world.sent], np.int64)
+                spans = [[s.log_time, s.log_time + 1, 0] for s in world.sent]
                 for recording in query.recordings:
-                    inside = query.any_within(recording, spans)
+                    seconds = Intervals.of([(recording, np.array(spans, np.int64))])
                     times = {s.log_time for s in want if s.recording == recording}
-                    assert inside.tolist() == [s.log_time in times for s in world.sent], way
+                    found = [one.begin_ns for one in seconds.containing(query)]
+                    assert found == [s.log_time for s in world.sent if s.log_time in times], way
 
 
 relaxed = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]

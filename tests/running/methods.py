@@ -15,7 +15,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query.intervals import Intervals
-from hybridlog_storage.errors import HybridlogError, IncompleteError, TimeError
+from hybridlog_storage.errors import HybridlogError, IncompleteError
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
 
 LABEL = "live"
@@ -346,31 +346,9 @@ METHODS: dict[str, Rule] = {
         ),
         lambda _: True,
     ),
-    "any_within": Rule(
-        lambda s: (
-            s.topic("said")
-            .where("state == 'b'")
-            .any_within(
-                s.summaries()[0].id,
-                np.array([[START + n * SECOND, START + (n + 1) * SECOND] for n in range(20)]),
-            )
-            .tolist()
-        ),
-        lambda k: [
-            any(
-                START + n * SECOND <= m.log_time < START + (n + 1) * SECOND
-                for m in k.of("/said", where=lambda f: f["state"] == "b")
-            )
-            for n in range(20)
-        ],
-    ),
     "around": Rule(
         lambda s: seqs(s.topic("arm").around(s.topic("marks"), "0.3s", "0.1s")),
         lambda k: seqs(around(k, _marks(k), 300 * MS, 100 * MS, "/arm")),
-    ),
-    "before": Rule(
-        lambda s: seqs(s.topic("arm").before(s.topic("marks"), "0.3s")),
-        lambda k: seqs(around(k, _marks(k), 300 * MS, 0, "/arm")),
     ),
     "at": Rule(
         lambda s: [s.topic("said").at(t).seq for t in (FIRST_S, LAST_S + 1, "-0.3s", "end")],
@@ -382,10 +360,6 @@ METHODS: dict[str, Rule] = {
     "at_time": Rule(
         lambda s: rows(s.topic("arm").at_time("-0.1s")),
         lambda k: sent([current(k, "/arm", k.span[1] + 1 - 100 * MS)]),
-    ),
-    "at_all_times": Rule(
-        lambda s: s.topic("arm").between("+1s", "+2s").at_all_times().count(),
-        lambda k: len(k.of("/arm")),
     ),
     "batches": Rule(
         lambda s: batches(s.topic("said", "cam", "opaque").batches()),
@@ -425,13 +399,6 @@ METHODS: dict[str, Rule] = {
         lambda s: sorted(c.channel.topic for c in s.all_topics().channels()),
         lambda _: sorted(CHANNELS),
     ),
-    "check_range": Rule(
-        lambda s: (
-            refusal(s.topic("said").between(0, SECOND).check_range),
-            refusal(s.topic("said").between("+1s", "+2s").check_range),
-        ),
-        lambda _: (TimeError.__name__, ""),
-    ),
     "clock": Rule(_clocks, _right_clocks),
     "completeness": Rule(
         _lost,
@@ -441,7 +408,6 @@ METHODS: dict[str, Rule] = {
             (IncompleteError.__name__, ""),
         ),
     ),
-    "copy": Rule(lambda s: s.topic("arm").copy().count(), lambda k: len(k.of("/arm"))),
     "count": Rule(
         lambda s: (
             s.all_topics().count(),
@@ -470,9 +436,6 @@ METHODS: dict[str, Rule] = {
         lambda s: _thrice(s.topic("said", "cam").during(_during(s))),
         lambda k: _right_thrice(_second(k, "/said", "/cam")),
     ),
-    "encodings": Rule(
-        lambda s: s.all_topics().encodings(), lambda _: {"json", "cdr", "ros1", "cbor"}
-    ),
     "every": Rule(lambda s: seqs(s.topic("said").every(7)), lambda k: seqs(k.of("/said")[::7])),
     "extras": Rule(
         lambda s: (
@@ -493,9 +456,6 @@ METHODS: dict[str, Rule] = {
             for m in k.of("/arm")
         ],
     ),
-    "fingerprint": Rule(
-        lambda s: s.topic("said").fingerprint() == s.topic("said").fingerprint(), lambda _: True
-    ),
     "first": Rule(
         lambda s: (s.topic("arm").first().seq, s.topic("arm").reverse().first().seq),  # type: ignore[union-attr]
         lambda k: (k.of("/arm")[0].seq, k.of("/arm")[-1].seq),
@@ -509,14 +469,6 @@ METHODS: dict[str, Rule] = {
             between_messages(silent(k, "/said", 25 * MS)),
             between_messages(silent(k, "/cam", 100 * MS)),
         ),
-    ),
-    "held": Rule(
-        lambda s: [
-            tuple(row)
-            for _, found in s.topic("said").where("x > 50").held()
-            for row in found.tolist()
-        ],
-        lambda k: held(k, "/said", _is_high),
     ),
     "in_recording": Rule(
         lambda s: _thrice(s.topic("arm").in_recording(LABEL)),
@@ -540,14 +492,6 @@ METHODS: dict[str, Rule] = {
         lambda k: [in_force(k, FIRST_S), in_force(k, k.span[1] + 1 - 200 * MS)],
     ),
     "limit": Rule(lambda s: seqs(s.all_topics().limit(23)), lambda k: seqs(k.of()[:23])),
-    "match_times": Rule(
-        lambda s: sorted(
-            pair
-            for found in s.topic("said").where("x > 50").match_times()
-            for pair in zip(found.log_time.tolist(), found.seq.tolist(), strict=True)
-        ),
-        lambda k: [m.order for m in k.of("/said", where=_is_high)],
-    ),
     "plot": Rule(_plotted, _points),
     "rate": Rule(
         lambda s: (
@@ -577,11 +521,6 @@ METHODS: dict[str, Rule] = {
         lambda k: regular(k, "/said", SECOND // 10),
     ),
     "reverse": Rule(lambda s: rows(s.all_topics().reverse()), lambda k: sent(reversed(k.of()))),
-    "schema": Rule(lambda s: s.topic("arm").schema() is None, lambda _: True),
-    "size_hint": Rule(
-        lambda s: s.topic("arm").size_hint(),
-        lambda k: sum(len(m.raw) for m in k.of("/arm")),
-    ),
     "spans": Rule(
         lambda s: [*s.topic("arm").spans().values()],
         lambda k: [k.clock_span("log", ["/arm"])],

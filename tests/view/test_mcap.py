@@ -6,6 +6,7 @@ import base64
 import io
 import threading
 from collections.abc import Iterator
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import urlencode
@@ -16,7 +17,7 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.formats.slices import SliceCache, write_mcap
+from hybridlog.formats.slices import SliceCache, payload_bytes, write_mcap
 from hybridlog.view.app import make_app
 from hybridlog.view.loopback import Admission
 from hybridlog_storage.errors import UsageError
@@ -288,7 +289,7 @@ def test_the_oldest_slices_make_room(demo_store: hl.Store, tmp_path: Path) -> No
     room = SliceCache(tmp_path / "slices")
     first, second = (room.get(query, "a" * 300, write_mcap) for query in queries[:2])
     taken = first.stat().st_size + second.stat().st_size
-    small = SliceCache(tmp_path / "slices", max_bytes=taken + queries[2].size_hint() - 1)
+    small = SliceCache(tmp_path / "slices", max_bytes=taken + payload_bytes(queries[2]) - 1)
     assert small.get(queries[0], "a" * 300, write_mcap) == first, "it is used again, so newer"
     third = small.get(queries[2], "c", write_mcap)
     assert sorted((tmp_path / "slices").iterdir()) == sorted([first, third])
@@ -311,7 +312,7 @@ def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store, tmp_path: Path
 
     def get() -> None:
         together.wait()
-        slices.get(query.copy(), "odom", write)
+        slices.get(copy(query), "odom", write)
 
     threads = [threading.Thread(target=get) for _ in range(4)]
     for thread in threads:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.match_times import match_times
-from hybridlog.query.intervals import Changing, Holding, Intervals, clipped, joined
+from hybridlog.query.intervals import Changing, Holding, Intervals, clipped
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
@@ -128,7 +128,8 @@ class IntervalQueries:
             raise UsageError("A window needs a length: give before, after or both.")
         found = []
         for entry, times in self._times():
-            rows = np.stack([times, times, np.ones_like(times)], axis=1)
+            at = placed(times)
+            rows = np.stack([at, at, np.ones_like(at)], axis=1)
             found.append((entry.key, entry.id, rows))
         # Windows that begin together are in the order of the recordings' keys.
         ordered = sorted(found, key=lambda item: item[0])
@@ -137,44 +138,6 @@ class IntervalQueries:
         return wide.within(
             {name: _extent(snapshot.summaries[snapshot.by_id[name]]) for name in wide.recordings}
         )
-
-    def any_within(self, recording: str, spans: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Test which spans of log time of a recording contain any message.
-
-        Args:
-            recording: Id of the recording.
-            spans: int64[n, 2], begin and end, ns; they may overlap.
-
-        Returns:
-            bool[n].
-
-        Raises:
-            UsageError: the question has `limit` or `every`.
-        """
-        question = self._question
-        if not question.returns_all:
-            raise UsageError("limit and every cannot be combined with a test for any message.")
-        if not len(spans) or not self._asks(recording):
-            return np.zeros(len(spans), np.bool_)
-        rows = np.concatenate([spans, np.ones((len(spans), 1), np.int64)], axis=1)
-        covered = joined(rows[np.argsort(rows[:, 0], kind="stable")])
-        near = Intervals.of([(recording, covered)])
-        if question.during is not None:
-            near = question.during.common(near).merged()
-        part = replace(question, recordings=(recording,), during=near)
-        inner = IntervalQueries(self._session, part, self._planner.counters)
-        found = [np.empty(0, np.int64), *(times for _, times in inner._times())]
-        times = np.sort(placed(np.concatenate(found)))
-        first, end = np.searchsorted(times, spans[:, 0]), np.searchsorted(times, spans[:, 1])
-        inside: NDArray[np.bool_] = first < end
-        return inside
-
-    def _asks(self, recording: str) -> bool:
-        """True if a recording belongs to the question."""
-        places = self._session.chosen(self._question)
-        place = self._session.snapshot().by_id.get(recording, -1)
-        row = int(np.searchsorted(places, place))
-        return row < len(places) and int(places[row]) == place
 
     def _times(self) -> Iterator[tuple[RecordingEntry, NDArray[np.int64]]]:
         """Log times of the messages of the answer, by recording."""

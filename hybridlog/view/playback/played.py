@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.latching import depth_of
+from hybridlog.query.query import Query
 from hybridlog_storage.errors import TimeError, TopicError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch, Channel
 
@@ -95,7 +95,8 @@ class PlayedLog:
         times = np.array([(begin, end, 0) for begin, end in spans.values()], np.int64)
         self.begin = int(times[:, 0].min())
         self.end = int(times[:, 1].max()) - 1
-        self._whole = query.at_all_times()
+        whole = replace(query.question, bounds=None, during=None, clock="log")
+        self._whole = Query(query.session, whole, query.conditions)
         asked = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
         during = query.question.during
         self._during = asked if during is None else during.common(asked)

@@ -20,6 +20,7 @@ from hybridlog.drawing.matches import (
     ticks,
 )
 from hybridlog.query.answers.infer_fields import infer_fields
+from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
@@ -213,7 +214,7 @@ def _messages_in(
     query = context.store.query(sorted(own & {*topics} or own), [entry.id])
     asked = query.during(Intervals.of([(entry.id, bounds)]))
     by_topic: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-    for found in asked.match_times():
+    for found in match_times(asked.session, asked.question, asked.counters):
         by_topic[found.topic].append(found.log_time)
     first, last = np.array(ends, np.int64).reshape(-1, 2).T
     least, greatest = np.full(len(spans), END), np.full(len(spans), BEGIN)

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 
 from starlette.responses import FileResponse
 
-from hybridlog.formats.slices import write_mcap
+from hybridlog.formats.slices import fingerprint, write_mcap
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time
@@ -53,7 +53,7 @@ def manifest(context: Context, asked: Asked) -> dict[str, Any]:
     topics = [_topic(channel, schemas) for channel in query.channels() if not channel.is_reduced]
     source = {
         "url": f"data?{urlencode(_parameters(asked))}",
-        "id": query.fingerprint(),
+        "id": fingerprint(query),
         "topics": [dict(topic) for topic in dict.fromkeys(topics)],
         "schemas": [_schema(schema, number) for schema, number in schemas.items()],
         "startTime": format_time(min(begin for begin, _ in spans)),

@@ -1,0 +1,205 @@
+"""Answers of a question that are messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from hybridlog.query.planner import Planner
+from hybridlog.query.steps import Steps
+from hybridlog.query.times import parse_time
+from hybridlog.session import of_one_moment
+from hybridlog_storage.errors import (
+    DefinitionError,
+    PayloadError,
+    TopicError,
+    UsageError,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.attachments import Extras
+    from hybridlog.message import Message
+    from hybridlog.query.answers.follow import Following
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.query.times import TimeLike
+    from hybridlog_storage.messages import Batch
+
+
+class MessageAnswers(Steps):
+    """Answers with the messages themselves."""
+
+    def __iter__(self) -> Iterator[Message]:
+        """The messages, ordered by log time, recording and arrival."""
+        from hybridlog.message import messages_in
+
+        for run in self._planner().runs():
+            yield from messages_in(run)
+
+    def follow(self, *names: str) -> Following:
+        """The messages that running recordings flush from now on, until all of them have ended.
+
+        With `between`, also those that are flushed already. Each comes once; those that are
+        flushed together are in order of log time. MongoDB is not needed.
+
+        Args:
+            names: The topics as they were written: globs take topics that appear later.
+
+        Raises:
+            UsageError: No recording of the question is running, or it has `reverse`, `during`
+                or a filter that MongoDB answers.
+        """
+        from hybridlog.query.answers.follow import Following
+
+        self.counters.reset()
+        return Following(self.session, self.question, self.counters, names)
+
+    def first(self) -> Message | None:
+        """The first message; None if the answer is empty."""
+        return next(iter(self.limit(1)), None)
+
+    @of_one_moment
+    def at(self, moment: TimeLike) -> Message:
+        """The message of `at_time`. Its arrays are read-only: copy to change them.
+
+        Raises:
+            TopicError: no such message exists.
+            UsageError: the question has a time range, or another clock than log time.
+        """
+        if not self.question.is_unbounded or self.question.clock != "log":
+            raise UsageError(
+                "A message at a time is the last one by log time; `between`, `during` and "
+                "`clock` cannot be combined with it."
+            )
+        from hybridlog.query.answers.last_message import message_at
+
+        with self.counters.timed():
+            found = message_at(self.session, self.question, self.counters, moment)
+        if found is None:
+            raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
+        return found
+
+    def at_time(self, moment: TimeLike) -> Self:
+        """Only the message that was current at a time: the last one not after it.
+
+        Raises:
+            TopicError: no such message exists.
+            UsageError: the question has a time range, or another clock than log time.
+        """
+        from hybridlog.query.answers.last_message import just_before
+
+        found = self.at(moment)
+        time = found.log_time_ns
+        question = just_before(self.question, found.recording, time, time)
+        # What is lost between the message and the moment may have been the current one.
+        snapshot = self.session.snapshot()
+        place = snapshot.by_id[found.recording]
+        start, end = int(snapshot.begin[place]), int(snapshot.end[place])
+        latest = max(parse_time(moment, start=start, end=end), time)
+        since = type(self)(self.session, replace(question, bounds=(time, latest + 1)))
+        return type(self)(self.session, question, (*self.conditions, since))
+
+    def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """The messages in order, many at once; `batch.channel` indexes the channels.
+
+        Messages without payload are left out; `counters.reduced` counts them.
+        """
+        for run in self._planner().runs():
+            whole = np.array([not channel.is_reduced for channel in run.channels], np.bool_)
+            batch = run.batch if whole.all() else run.batch.take(whole[run.batch.channel])
+            self.counters.reduced += len(run.batch) - len(batch)
+            if len(batch):
+                yield batch, run.channels
+
+    @of_one_moment
+    def latched(
+        self, *, original_times: bool = False
+    ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """Latched messages from before the time range that are in force when it begins.
+
+        They are those that a subscriber receives which joins at that time. Their log time is
+        the beginning of the range. Take them before `batches`, and with separate counters.
+
+        Args:
+            original_times: They keep their own log time.
+        """
+        from hybridlog.query.answers.latched import in_force
+
+        self.counters.reset()
+        return in_force(self.session, self.question, self.counters, original_times=original_times)
+
+    @of_one_moment
+    def extras(self) -> Extras:
+        """Attachments and metadata records that belong to the answer as a slice.
+
+        Raises:
+            SegmentError: A segment is damaged.
+        """
+        from hybridlog.attachments import extras_of
+
+        return extras_of(self.session, self.question)
+
+    @of_one_moment
+    def count(self) -> int:
+        """Number of messages."""
+        with self.counters.timed():
+            found = Planner(self.session, self.question, self.counters).count()
+            self.counters.messages = found
+        return found
+
+    def documents(self) -> Iterator[dict[str, Any]]:
+        """The index documents in MongoDB, in the order of the messages.
+
+        In a store without MongoDB, they are made of the messages.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
+        """
+        from hybridlog.query.answers.index_documents import index_documents
+
+        self.session.renew()
+        self.counters.reset()
+        return index_documents(self.session, self.question, self.counters)
+
+    @of_one_moment
+    def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
+        """Every message as an array (`Message.to_numpy`): stacked if all are alike.
+
+        Messages that cannot be arrays are left out; `counters.unreadable` counts them.
+
+        Raises:
+            PayloadError: None of the messages can be an array.
+            DefinitionError: The first of them has no definition.
+        """
+        scans = self._scans()
+        if scans is not None:
+            return scans
+        arrays: list[NDArray[Any]] = []
+        refused: PayloadError | DefinitionError | None = None
+        unreadable = 0
+        for message in self:
+            try:
+                arrays.append(message.to_numpy())
+            except (PayloadError, DefinitionError) as error:
+                refused = refused or error
+                unreadable += 1
+        if refused is not None and not arrays:
+            raise refused
+        self.counters.unreadable += unreadable
+        alike = {(a.shape, a.dtype) for a in arrays}
+        return np.stack(arrays) if len(alike) == 1 else arrays
+
+    def _scans(self) -> NDArray[Any] | None:
+        """Laser scans of one length as an array, from columns; None for everything else."""
+        from hybridlog.frames.scans import FIELDS, are_scans, scans_in
+
+        if not are_scans(self.channels()):
+            return None
+        self.counters.reset()
+        question = replace(self.question, fields=FIELDS, tags=())
+        found = scans_in(Planner(self.session, question, self.counters))
+        return None if self.counters.unreadable or self.counters.reduced else found

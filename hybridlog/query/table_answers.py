@@ -1,0 +1,150 @@
+"""Answers of a question that are tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from hybridlog.query.steps import Steps
+from hybridlog.session import of_one_moment
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from matplotlib.axes import Axes
+
+    from hybridlog.across.align import Aligned
+    from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.times import DurationLike
+
+
+class TableAnswers(Steps):
+    """Answers with the fields of messages as rows and columns."""
+
+    @of_one_moment
+    def to_arrow(self) -> pa.Table:
+        """A table: scalars and strings as columns, arrays as lists, first column log time."""
+        from hybridlog.frames.answer import to_arrow
+
+        return to_arrow(self._planner())
+
+    @of_one_moment
+    def to_pandas(self) -> pd.DataFrame:
+        """A frame of the same columns, indexed by log time (UTC, ns)."""
+        from hybridlog.frames.answer import to_pandas
+
+        frame = to_pandas(self._planner())
+        frame.attrs["hybridlog"] = asdict(self.counters)
+        return frame
+
+    def to_tables(self) -> Iterator[pa.Table]:
+        """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
+        from hybridlog.frames.answer import stream
+
+        return stream(self._planner())
+
+    def to_json_lines(self) -> Iterator[list[str]]:
+        """The answer in order as lines of JSON, many at a time."""
+        from hybridlog.frames.lines import lines
+
+        for batch in lines(self._planner()):
+            yield [line if isinstance(line, str) else "".join(line) for line in batch]
+
+    @of_one_moment
+    def plot(self, *fields: str, ax: Axes | None = None) -> Axes:
+        """Draw fields over time with matplotlib, a line for each topic and recording.
+
+        Where messages are closer than pixels, the line goes through the least and the greatest
+        value of each pixel. Times without messages, and values that are NaN, are gaps.
+
+        Args:
+            fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
+                (`twist.linear`); without, those of `fields`.
+            ax: Where to draw; None for a new figure of pyplot.
+
+        Returns:
+            The axes; seconds since the beginning of each recording are from left to right.
+
+        Raises:
+            TopicError: no topic has such a field.
+            UsageError: no field, a field that is no number, `reverse`, or too many lines.
+            TimeError: the range is outside all recordings.
+            MissingDependencyError: matplotlib is not installed.
+        """
+        from hybridlog.drawing.figure import new_axes, plot
+
+        axes = new_axes() if ax is None else ax
+        plot(axes, self, fields)
+        return axes
+
+    @of_one_moment
+    def resample(
+        self,
+        step: DurationLike,
+        how: str = "asof",
+        tolerance: DurationLike | None = None,
+    ) -> Aligned:
+        """The topics at regular log times: every `step` from the beginning of each recording.
+
+        With `between` or `during`, from the beginning of the range. Columns are those of
+        `Store.align`; those of a single topic have no prefix. With an aggregate, `count` is in
+        place of `distance`: the number of messages from a row to the next, or to the end.
+
+        Args:
+            step: Time between two rows, a duration.
+            how: `asof`, `nearest` or `interpolate`, as for `Store.align`. Or an aggregate of
+                the messages from a row to the next: `count`; `first` or `last`, their fields;
+                `min`, `max` or `mean` of finite numbers, null without any.
+            tolerance: Greatest distance in time; None for any.
+
+        Raises:
+            UsageError: an unknown way, a step of 0, a tolerance for an aggregate, a field that
+                has none, another clock than the log's, or limit, every or reverse.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.across.align import resampled
+
+        return resampled(self.session, self.question, step, how, tolerance)
+
+    @of_one_moment
+    def rate(self, window: DurationLike | None = None) -> pa.Table:
+        """Number and rate of the messages of each topic.
+
+        Args:
+            window: Length of the windows, a duration; the first begins with the recording or
+                the range, the last may be shorter. None for all messages in one.
+
+        Returns:
+            `begin`, `end`, `recording` (label), `topic`, `messages` and `rate`, messages a
+            second. Without windows: from the first message to the last, and the mean rate
+            from one to the next, null if there is none.
+
+        Raises:
+            UsageError: `limit`, `every`, `reverse`, another clock than the log's, or too many
+                windows.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.query.answers.rates import Rates
+
+        with self.counters.timed():
+            return Rates(self.session, self.question, self.counters).rate(window)
+
+    @of_one_moment
+    def stats(self, *fields: str) -> list[FieldStatistics]:
+        """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
+
+        Args:
+            fields: Paths; also summaries (`ranges.min`), and arrays, for all their elements.
+                None for every field that is a number.
+
+        Raises:
+            TopicError: no such field exists.
+            UsageError: `limit`, `every`, `reverse`, or no field is a number.
+            TimeError: a range outside of all recordings.
+        """
+        from hybridlog.query.answers.field_statistics import statistics
+
+        query = self.fields(*fields) if fields else self
+        with self.counters.timed():
+            return statistics(self.session, query.question, self.counters)
