@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import re
 import subprocess
@@ -16,7 +17,13 @@ import pytest
 from tests.imports import PACKAGES, ROOT, Import, imports_of, modules
 
 MODULES = modules()
-IMPORTS = {name: imports_of(path, name) for name, path in MODULES.items()}
+
+
+@functools.cache
+def all_imports() -> dict[str, list[Import]]:
+    """What each module imports."""
+    return {name: imports_of(path, name) for name, path in MODULES.items()}
+
 
 HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zstandard")
 """What no command may load before it needs it."""
@@ -127,8 +134,8 @@ def _places(name: str, imports: list[Import]) -> str:
 
 def test_modules_are_found() -> None:
     assert {"hybridlog", "hybridlog.store", "hybridlog_storage.mongo.database"} <= set(MODULES)
-    assert any(i.module == "numpy" for i in IMPORTS["hybridlog_storage.messages"])
-    typed = [i for i in IMPORTS["hybridlog_storage.messages"] if i.module == "numpy.typing"]
+    assert any(i.module == "numpy" for i in all_imports()["hybridlog_storage.messages"])
+    typed = [i for i in all_imports()["hybridlog_storage.messages"] if i.module == "numpy.typing"]
     assert typed
     assert all(i.typing for i in typed)
 
@@ -161,13 +168,13 @@ def test_the_reader_of_imports_sees_all_kinds(tmp_path: Path) -> None:
 def test_storage_never_imports_hybridlog() -> None:
     for name in MODULES:
         if _is(name, "hybridlog_storage"):
-            wrong = [i for i in IMPORTS[name] if _is(i.module, "hybridlog")]
+            wrong = [i for i in all_imports()[name] if _is(i.module, "hybridlog")]
             assert not wrong, f"mechanism must not know policy: {_places(name, wrong)}"
 
 
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_third_party_packages_stay_where_they_belong(package: str) -> None:
-    for name, imports in IMPORTS.items():
+    for name, imports in all_imports().items():
         wrong = [i for i in imports if _is(i.module, package) and not i.typing]
         allowed = any(_is(name, place) for place in ALLOWED[package])
         assert allowed or not wrong, (
@@ -183,7 +190,7 @@ def test_no_permission_outlives_its_need(package: str) -> None:
     for place in ALLOWED[package]:
         users = [
             name
-            for name, imports in IMPORTS.items()
+            for name, imports in all_imports().items()
             if _is(name, place) and any(_is(i.module, package) for i in imports)
         ]
         assert users, f"{place} does not import {package} any more: take it off the list"
@@ -191,7 +198,7 @@ def test_no_permission_outlives_its_need(package: str) -> None:
 
 def test_only_known_packages_are_imported() -> None:
     known = {*ALLOWED, "numpy", "hybridlog", "hybridlog_storage", *sys.stdlib_module_names}
-    for name, imports in IMPORTS.items():
+    for name, imports in all_imports().items():
         wrong = [i for i in imports if i.module.partition(".")[0] not in known]
         assert not wrong, f"say in ALLOWED where these belong: {_places(name, wrong)}"
 
@@ -213,7 +220,7 @@ def test_what_is_imported_is_declared(package: str) -> None:
 
 @pytest.mark.parametrize("target", sorted(WIRED_BY))
 def test_one_module_wires_the_parts(target: str) -> None:
-    for name, imports in IMPORTS.items():
+    for name, imports in all_imports().items():
         wrong = [i for i in imports if _is(i.module, target) and not i.typing]
         allowed = any(_is(name, p) if p != "hybridlog" else name == p for p in WIRED_BY[target])
         assert allowed or not wrong, f"{target} is not for {_places(name, wrong)}"
@@ -255,7 +262,7 @@ def test_no_cycle_of_imports() -> None:
             # A package is loaded before its modules, whoever imports them.
             if i.module in MODULES and not _is(name, i.module)
         }
-        for name, imports in IMPORTS.items()
+        for name, imports in all_imports().items()
     }
     assert _cycles(graph) == []
 

@@ -16,6 +16,7 @@ from tests.running.commands import COMMANDS, EXEMPT, Asked, place_for
 from tests.running.methods import LABEL, same
 from tests.running.running import Running, begun
 from tests.running.sequence import Known
+from tests.some import in_turn
 
 EVERY = [one for rules in COMMANDS.values() for one in rules]
 
@@ -24,7 +25,16 @@ def _id(one: Asked) -> str:
     return " ".join(one.words)
 
 
-@pytest.fixture(scope="module", params=["one", "many"])
+KINDS = ("one", "many")
+EACH_IN_TURN = pytest.mark.parametrize(
+    ("one", "running"),
+    in_turn(EVERY, KINDS),
+    indirect=["running"],
+    ids=lambda it: it if isinstance(it, str) else _id(it),
+)
+
+
+@pytest.fixture(scope="module", params=KINDS)
 def running(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Running]:
@@ -57,7 +67,7 @@ def test_at_rest(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("one", EVERY, ids=_id)
+@EACH_IN_TURN
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
     done = run(*words, store=running.path, code=one.code)
@@ -81,7 +91,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, int]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("one", EVERY, ids=_id)
+@EACH_IN_TURN
 def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
 ) -> None:

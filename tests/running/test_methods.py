@@ -14,6 +14,7 @@ from hybridlog.query.query import Query
 from tests.running.methods import EXEMPT_METHODS, LABEL, METHODS, STORE, same
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
+from tests.some import in_turn
 
 SPECIAL = {"__iter__", "__getitem__", "__eq__", "__hash__", "__repr__"}
 PRIVATE = {"_repr_html_", "_ipython_key_completions_"}
@@ -131,7 +132,9 @@ MAX_BEHIND_S = 2.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mongo", [None, NO_MONGODB], ids=["mongodb", "without"])
+@pytest.mark.parametrize(
+    ("running", "mongo"), in_turn(["one", "many"], [None, NO_MONGODB]), indirect=["running"]
+)
 def test_each_call_while_segments_are_sealed(running: Running, mongo: str | None) -> None:
     """Each answer is a beginning of the sequence, without a gap, and at most 2 s short."""
     with hl.open(running.path, mongo=mongo) as store:

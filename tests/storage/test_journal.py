@@ -391,10 +391,14 @@ def is_noticed(state: JournalState) -> bool:
     return bool(state.damaged or state.torn)
 
 
-def test_every_flipped_bit_is_noticed_and_gives_never_another_event() -> None:
-    for bit in range(8 * len(DATA)):
+@pytest.mark.parametrize(
+    "turn", [0, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in range(1, 8))]
+)
+def test_every_flipped_bit_is_noticed_and_gives_never_another_event(turn: int) -> None:
+    for byte in range(len(DATA)):
+        bit = 8 * byte + (byte + turn) % 8
         data = bytearray(DATA)
-        data[bit // 8] ^= 1 << bit % 8
+        data[byte] ^= 1 << bit % 8
         found = events_of(bytes(data))
         # One line is lost, or two that became one, and the others are what they were.
         assert len(LINES) - 2 <= len(found) < len(LINES), bit

@@ -29,6 +29,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.mongo import mongod as module
 from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
+from tests.some import in_turn
 
 LINGER_S = 0.2
 
@@ -411,8 +412,10 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
         assert ping(user.start()), "nothing stays behind"
 
 
-@pytest.mark.parametrize("times", [1, 2, 9])
-@pytest.mark.parametrize("end", ["kill -9 $$", "kill -15 $$", "exit 0", "kill -9 $PPID; sleep 9"])
+@pytest.mark.parametrize(
+    ("end", "times"),
+    in_turn(["kill -9 $$", "kill -15 $$", "exit 0", "kill -9 $PPID; sleep 9"], [1, 2, 9]),
+)
 def test_one_that_others_end_while_it_starts_is_started_again(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, times: int
 ) -> None:

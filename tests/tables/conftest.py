@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from hybridlog_storage.settings import NONE
 from tests.tables.logs import BASE, varied, write_log
 
 SMALL_CHUNKS = SegmentSettings(chunk_size=4096)
@@ -24,17 +26,32 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture
-def store(tmp_path: Path, server: str) -> Iterator[hl.Store]:
-    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
+def mongo(server: str) -> str:
+    """The address of a database of its own."""
+    return server.replace("/?", f"/t{secrets.token_hex(6)}?")
+
+
+@pytest.fixture
+def store(tmp_path: Path, mongo: str) -> Iterator[hl.Store]:
     with hl.open(tmp_path / "store", create=True, mongo=mongo, require_database=True) as opened:
         yield opened
 
 
-@pytest.fixture
-def recorded(store: hl.Store, tmp_path: Path) -> hl.Store:
+@pytest.fixture(scope="session")
+def recorded_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of three topics, one of them with a file of its own."""
+    place = tmp_path_factory.mktemp("recorded")
     topics = ["/large", "/large", "/large", "/small/one", "/large", "/small/two"]
     said = [(BASE + n * 11 // 3, topics[n % 6], varied(n)) for n in range(1800)]
-    log = write_log(tmp_path / "log.mcap", said)
-    store.record(log, name="log", settings=SegmentSettings(chunk_size=32 << 10))
-    return store
+    log = write_log(place / "log.mcap", said)
+    with hl.open(place / "store", create=True, mongo=NONE) as store:
+        store.record(log, name="log", settings=SegmentSettings(chunk_size=32 << 10))
+    return place / "store"
+
+
+@pytest.fixture
+def recorded(recorded_once: Path, tmp_path: Path) -> Iterator[hl.Store]:
+    """A store of its own with that recording, without MongoDB."""
+    shutil.copytree(recorded_once, tmp_path / "store")
+    with hl.open(tmp_path / "store", mongo=NONE) as store:
+        yield store

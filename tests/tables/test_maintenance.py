@@ -319,9 +319,10 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
     return os.waitstatus_to_exitcode(status) == 9
 
 
+@pytest.mark.parametrize("stride", [3, pytest.param(1, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("what", ["make", "make again", "remove"])
 def test_killed_at_each_step(
-    few: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+    few: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str, stride: int
 ) -> None:
     """At every step: what is there is whole, and what is missing is made by the next one."""
     monkeypatch.setattr(writing, "LONG_ROWS", 300)
@@ -354,7 +355,7 @@ def test_killed_at_each_step(
         assert sorted(contents(few).values()) == sorted(whole.values())
         if not was_killed:
             break
-        step += 1
+        step += stride
     assert step > 5
     few.refresh()
     few.connect()

@@ -26,6 +26,7 @@ from hybridlog.columns.topic_table import TopicTable, _merged
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
+from tests.some import in_turn
 from tests.tables import ask
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import BASE, SECOND, decoded, varied, write_log
@@ -229,8 +230,7 @@ def is_positive(records: Any) -> Any:
     return pc.greater(records.field("i8"), 0).fill_null(False).to_numpy(zero_copy_only=False)
 
 
-@pytest.mark.parametrize("topic", ["/large", "/small/one"])
-@pytest.mark.parametrize("harm", DAMAGE)
+@pytest.mark.parametrize(("harm", "topic"), in_turn(DAMAGE, ["/large", "/small/one"]))
 def test_damaged_tables_are_none_and_are_made_again(
     recorded: hl.Store, tables: Tables, harm: Callable[[Path], None], topic: str
 ) -> None:
@@ -277,7 +277,7 @@ def test_damage_that_is_met_while_reading(recorded: hl.Store, tables: Tables) ->
     assert tables.of(entry, "/large") is None
 
 
-def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables) -> None:
+def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables, mongo: str) -> None:
     want = recorded.topic("/large").where("i8 > 0").count()
     shutil.rmtree(recorded.directory.path / "tables")
     assert recorded.topic("/large").where("i8 > 0").count() == want
@@ -285,12 +285,16 @@ def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables) -> No
     assert recorded.topic("/large").where("i8 > 0").count() == want
     assert recorded.verify().findings == []
     assert count(recorded, tables, "/large") == want
-    recorded.rebuild_index()
-    assert compare(recorded) == 1800
+    with hl.open(recorded.directory.path, mongo=mongo) as indexed:
+        indexed.rebuild_index()
+        assert compare(indexed) == 1800
 
 
-def test_tables_of_other_recordings_are_not_believed(recorded: hl.Store, tmp_path: Path) -> None:
-    recorded.record(tmp_path / "log.mcap", name="other", again=True, settings=SMALL_CHUNKS)
+def test_tables_of_other_recordings_are_not_believed(
+    recorded: hl.Store, recorded_once: Path
+) -> None:
+    log = recorded_once.parent / "log.mcap"
+    recorded.record(log, name="other", again=True, settings=SMALL_CHUNKS)
     one, other = recorded.entry("log"), recorded.entry("other")
     making.remove(recorded.directory, one.id)
     tables = Tables(recorded.directory.path)

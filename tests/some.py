@@ -1,0 +1,19 @@
+"""A part of many cases by default, and all of them by `-m exhaustive`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+EXHAUSTIVE = pytest.mark.exhaustive
+
+
+def in_turn(ones: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+    """All pairs, by the others; by default each of the ones is in one of them."""
+    return [
+        pytest.param(one, other, marks=[] if place == number % len(others) else EXHAUSTIVE)
+        for place, other in enumerate(others)
+        for number, one in enumerate(ones)
+    ]
