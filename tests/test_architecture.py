@@ -86,7 +86,7 @@ ALLOWED = {
     "rosbags": ("hybridlog.demo", "hybridlog.formats.rosbag1.writer", "hybridlog.schema"),
     "sqlite3": ("hybridlog.formats.rosbag2.sqlite", "hybridlog_storage.catalog"),
     "starlette": ("hybridlog.view",),
-    "uvicorn": ("hybridlog.view.connection", "hybridlog.view.server"),
+    "uvicorn": ("hybridlog.view.server",),
     "websockets": (
         "hybridlog.view.playback.server",
         "hybridlog.live.sources.foxglove.connection",

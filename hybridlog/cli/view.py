@@ -12,7 +12,7 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.open_store import opened_store
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 _MAX_FOLDERS = 1000
 
@@ -67,8 +67,12 @@ def view_command(
     import webbrowser
     from urllib.parse import quote
 
-    from hybridlog.view.server import ViewServer
-
+    try:
+        from hybridlog.view.server import ViewServer
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
+        ) from error
     if store is None and not os.environ.get("HYBRIDLOG_STORE"):
         store = _only_store_near()
     if origins and not mcap:

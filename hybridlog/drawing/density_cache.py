@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from hybridlog.drawing.chunk_parts import RecordedChunks
-from hybridlog.drawing.density import MOST_WORK, Density, count, reading_work
-from hybridlog.drawing.silence import sampled_period
+from hybridlog.drawing.density import MOST_WORK, Density, count, reading_work, sampled_period
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.stopping import held
 

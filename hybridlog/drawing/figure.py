@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Text
 
-    from hybridlog.drawing.asked import Asked
+    from hybridlog.drawing.fields import SeriesQuery
 
 DPI: Final = 100
 FEW: Final = 100
@@ -56,7 +56,7 @@ def new_axes() -> Axes:
         return plt.subplots(layout="constrained")[1]
 
 
-def plot(axes: Axes, query: Asked, fields: Sequence[str]) -> None:
+def plot(axes: Axes, query: SeriesQuery, fields: Sequence[str]) -> None:
     """Draw fields of a query over time; see `Query.plot`."""
     with _matplotlib():
         width = max(1, round(axes.get_window_extent().width))

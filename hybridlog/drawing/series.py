@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.asked import Asked
+    from hybridlog.drawing.fields import SeriesQuery
     from hybridlog.query.question import Span
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
@@ -92,7 +92,7 @@ class Series:
 
 
 def series(
-    query: Asked, fields: Sequence[str], *, pixels: int, span: Span | None = None
+    query: SeriesQuery, fields: Sequence[str], *, pixels: int, span: Span | None = None
 ) -> list[Series]:
     """Fields of the messages of a query over log time.
 
@@ -125,7 +125,9 @@ def series(
     return found
 
 
-def _asked(query: Asked, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Asked, Span]:
+def _asked(
+    query: SeriesQuery, wanted: Sequence[_Wanted], span: Span | None
+) -> tuple[SeriesQuery, Span]:
     """The query for the wanted fields, and the part of the span that it covers.
 
     Raises:
@@ -151,7 +153,7 @@ def _asked(query: Asked, wanted: Sequence[_Wanted], span: Span | None) -> tuple[
     return asked, (begin, end)
 
 
-def numbers_of(query: Asked) -> list[str]:
+def numbers_of(query: SeriesQuery) -> list[str]:
     """Paths of the fields that are single numbers; none where no definition fixes them."""
     known = query.field_types() or {}
     return [p for p, kind in known.items() if kind in NUMERIC and "[" not in p]

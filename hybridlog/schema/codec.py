@@ -215,7 +215,7 @@ def one_message(codec: Codec, payload: Buffer) -> Decoded:
     size = np.array([memoryview(payload).nbytes], np.int64)
     decoded = codec.columns(payload, np.zeros(1, np.int64), size)
     if decoded.unreadable:
-        raise PayloadError(decoded.unreadable[0].reason)
+        raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
     return decoded
 
 

@@ -20,7 +20,7 @@ MAX_PIXELS: Final = 8192
 _INTEGER: Final = re.compile(r"-?\d{1,19}", re.ASCII)
 
 
-class Asked:
+class RequestParams:
     """The parameters of one request.
 
     Args:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import struct
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from starlette.concurrency import run_in_threadpool
@@ -19,19 +21,26 @@ from starlette.routing import Route
 from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.formats.slices import SliceCache
+from hybridlog.query.answers.next_time import next_time
 from hybridlog.record.losses import extent_of
-from hybridlog.view.asked import Asked
+from hybridlog.view.asked import RequestParams
 from hybridlog.view.sql_process import SqlProcess
-from hybridlog_storage.errors import HybridlogError, ResourceError, TopicError
+from hybridlog_storage.errors import HybridlogError, ResourceError, TimeError, TopicError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.stopping import GivenUpError, held, until_given_up
+from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from starlette.requests import Request
 
+    from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.store import Store
+    from hybridlog.view.asked import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
+
 
 MAX_WORKING: Final = 4
 """Number of answers that are worked out at once; others wait for their turn."""
@@ -92,7 +101,7 @@ class Context:
                 self._looked = time.monotonic()
                 self._took = self._looked - begun
 
-    def recording(self, asked: Asked) -> RecordingEntry:
+    def recording(self, asked: RequestParams) -> RecordingEntry:
         """The recording that the parameter `recording` names by its label or id.
 
         Raises:
@@ -113,7 +122,7 @@ class Context:
                 raise TopicError(f"{recording.label} has no topic {topic!r}.")
         return self.store.query(topics, [recording.id])
 
-    def topic(self, asked: Asked) -> tuple[RecordingEntry, Query]:
+    def topic(self, asked: RequestParams) -> tuple[RecordingEntry, Query]:
         """The recording, and a query about its topic that the parameter `topic` names.
 
         Raises:
@@ -136,7 +145,7 @@ def extent(recording: RecordingEntry) -> tuple[int, int]:
     return (begin, end) if begin < end else (recording.created, recording.created)
 
 
-Answer: TypeAlias = "Callable[[Context, Asked], Any]"
+Answer: TypeAlias = "Callable[[Context, RequestParams], Any]"
 """Works out an answer: plain values, which become JSON, or a response."""
 
 
@@ -151,7 +160,7 @@ def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -
 
     def answered(request: Request, given_up: threading.Event) -> Response:
         context: Context = request.app.state.context
-        asked = Asked(request.query_params, request.headers.get("if-none-match"))
+        asked = RequestParams(request.query_params, request.headers.get("if-none-match"))
         try:
             with (
                 until_given_up(given_up),
@@ -206,3 +215,90 @@ def broken_response(_: Request, error: Exception) -> Response:
     else:
         traceback.print_exception(error, file=sys.stderr)
     return json_response({"error": "hybridlog failed; its terminal has the details."}, 500)
+
+
+@dataclass(frozen=True, slots=True)
+class Current:
+    """The message that is current at a time.
+
+    Attributes:
+        message: The last message not after that time; None if there is none.
+        time: Its log time, ns since the start of the recording; None without a message.
+        until: Log time of the next message; None if no later one is known. Both are texts, as
+            the page has no integers of 64 bits.
+    """
+
+    message: Message | None
+    time: str | None
+    until: str | None
+
+    @property
+    def tag(self) -> str:
+        """An entity tag: equal for the same message."""
+        message = self.message
+        return '"none"' if message is None else f'"{message.recording}-{message.seq}"'
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Headers of an answer about the message."""
+        times = {"Hybridlog-Time": self.time, "Hybridlog-Until": self.until}
+        known = {name: time for name, time in times.items() if time is not None}
+        return {"ETag": self.tag, "Cache-Control": "private, no-cache", **known}
+
+
+def current(context: Context, asked: RequestParams) -> Current:
+    """The message of the parameters `recording`, `topic`, `at` and `seq`.
+
+    Of several messages at that time, it is the last one whose arrival number is at most `seq`.
+
+    Raises:
+        TopicError: No such recording or topic exists.
+        UsageError: A parameter is missing or out of bounds.
+    """
+    recording, query = context.topic(asked)
+    start = start_of(recording)
+    moment = asked.moment(start)
+    message = _message(query, moment, asked.integer("seq", 0, END, END))
+    # Of messages with the same time, the last one is current: the next one is later.
+    later = moment if message is None else message.log_time_ns + 1
+    until = next_time(context.store.session, recording, query.topics[0], later)
+    return Current(
+        message,
+        None if message is None else str(message.log_time_ns - start),
+        None if until is None else str(until - start),
+    )
+
+
+def _message(query: Query, moment: int, seq: int) -> Message | None:
+    if seq < END:
+        with suppress(TimeError):
+            beside = query.between(*span_of(moment, moment)).where(f"_meta.seq <= {seq}")
+            found = beside.reverse().first()
+            if found is not None:
+                return found
+        moment -= 1
+    with suppress(TopicError):  # there is none yet
+        return query.at(moment)
+    return None
+
+
+_ALIGNED = 8
+
+
+def packed_response(
+    header: Mapping[str, Any], arrays: Mapping[str, NDArray[np.floating[Any]]]
+) -> Response:
+    """Plain values, and arrays of float32 or float64 by name; the wide ones come first."""
+    ordered = sorted(arrays.items(), key=lambda one: -one[1].dtype.itemsize)
+    described = [
+        {"name": name, "type": f"float{array.dtype.itemsize * 8}", "count": array.size}
+        for name, array in ordered
+    ]
+    values = {**header, "arrays": described}
+    text = json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-(len(text) + 4) % _ALIGNED)
+    parts = [struct.pack("<I", len(text)), text]
+    parts += [
+        array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes() for _, array in ordered
+    ]
+    return Response(b"".join(parts), media_type="application/octet-stream")

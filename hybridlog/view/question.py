@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.store import Store
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -136,7 +136,7 @@ def _topic_of(where: str) -> str | None:
     return condition.topic if isinstance(condition, Near) else None
 
 
-def question_of(context: Context, asked: Asked) -> PageQuestion:
+def question_of(context: Context, asked: RequestParams) -> PageQuestion:
     """The question of a request about one topic.
 
     Args:

@@ -1,13 +1,23 @@
-"""Serves the view on the loopback interface until it is stopped."""
+"""The server of the view: its application, on the loopback interface until it is stopped."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Collection
 from contextlib import nullcontext
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import uvicorn
+from starlette.applications import Starlette
+from starlette.routing import Mount
+from starlette.staticfiles import StaticFiles
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from hybridlog.view.context import Context, broken_response
+from hybridlog.view.guard import Guard
 from hybridlog.view.loopback import HOST, Admission, listen, new_token
-from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
@@ -28,22 +38,12 @@ class ViewServer:
         url: The address of the page, with its token.
 
     Raises:
-        MissingDependencyError: starlette or uvicorn is not installed.
         UsageError: The port cannot be used.
     """
 
     def __init__(
         self, store: Store, port: int = 0, *, viewers: bool = False, origins: Collection[str] = ()
     ) -> None:
-        try:
-            import uvicorn
-
-            from hybridlog.view.app import make_app
-            from hybridlog.view.connection import BoundedConnection
-        except ModuleNotFoundError as error:
-            raise MissingDependencyError(
-                "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
-            ) from error
         self._socket = listen(port)
         self.port: int = self._socket.getsockname()[1]
         token = new_token()
@@ -67,8 +67,6 @@ class ViewServer:
 
     def run(self) -> None:
         """Serve until `stop`, or until a signal ends the process."""
-        import asyncio
-
         try:
             asyncio.run(self._server.serve([self._socket]))
         finally:
@@ -77,3 +75,105 @@ class ViewServer:
     def stop(self) -> None:
         """End `run` soon. May be called from any thread."""
         self._server.should_exit = True
+
+
+ROUTES: Final = (
+    "ask",
+    "export",
+    "messages",
+    "recordings",
+    "series",
+    "spatial",
+    "timeline",
+)
+"""The modules of `routes/`."""
+
+_STATIC: Final = Path(__file__).parent / "static"
+
+
+def make_app(store: Store, rules: Admission) -> Guard:
+    """The application, behind its guard.
+
+    Args:
+        store: The store that is shown.
+        rules: Who may ask. Their guests may read the routes below `mcap/`; without any, these
+            routes do not exist.
+    """
+    has_guests = rules.viewers or bool(rules.origins)
+    names = (*ROUTES, "mcap") if has_guests else ROUTES
+    routes = [
+        route for name in names for route in import_module(f"hybridlog.view.routes.{name}").routes
+    ]
+    routes.append(Mount("/", StaticFiles(directory=_STATIC, html=True), name="page"))
+    app = Starlette(routes=routes, exception_handlers={Exception: broken_response})
+    app.state.context = Context(store)
+    return Guard(app, rules, shared=("/mcap/",) if has_guests else ())
+
+
+MAX_STRANGERS: Final = 64
+"""Connections without a request that has the token; the oldest one makes room for another."""
+
+
+class BoundedConnection(H11Protocol):
+    """A connection whose requests arrive whole within a time, and in bounded memory.
+
+    Otherwise any local user could hold all connections with requests that never end.
+
+    Attributes:
+        patience_s: Time for a request to arrive, from the connection or the last answer on.
+        is_stranger: True until a request has the token.
+        since: Time of the event loop at which it was made.
+    """
+
+    patience_s = 30.0
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._waiting: asyncio.TimerHandle | None = None
+        self.is_stranger = True
+        self.since = self.loop.time()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """A client has connected."""
+        super().connection_made(transport)
+        self._wait()
+        known: set[Any] = self.connections
+        strangers = [one for one in known if one.is_stranger]
+        if len(strangers) > MAX_STRANGERS:
+            oldest = min(strangers, key=lambda one: one.since)
+            known.discard(oldest)  # it is lost a little later
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection is closed."""
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def handle_events(self) -> None:
+        """Something has arrived."""
+        before = self.cycle
+        super().handle_events()
+        if self.cycle is not before:
+            self._stop_waiting()
+            guard: Any = self.config.app
+            self.is_stranger &= not guard.rules.knows(self.scope["path"])
+
+    def on_response_complete(self) -> None:
+        """A request is answered."""
+        self._wait()
+        super().on_response_complete()
+
+    def _wait(self) -> None:
+        self._stop_waiting()
+        self._waiting = self.loop.call_later(self.patience_s, self._give_up)
+
+    def _stop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
+
+    def _give_up(self) -> None:
+        if self.transport.get_write_buffer_size():
+            self._wait()  # a slow reader, who has asked already
+        else:
+            self.transport.abort()

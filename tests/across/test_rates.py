@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.drawing.density import gaps as silent
 from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.series import series
-from hybridlog.drawing.silence import gaps as silent
 from hybridlog.query import periods
 from hybridlog.query.answers import rates
 from hybridlog.query.answers.field_statistics import _Running

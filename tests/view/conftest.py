@@ -16,9 +16,8 @@ from starlette.testclient import TestClient
 import hybridlog as hl
 from hybridlog.demo.topics import RobotConfig
 from hybridlog.demo.write import write_bag
-from hybridlog.view.app import make_app
 from hybridlog.view.loopback import Admission
-from hybridlog.view.server import ViewServer
+from hybridlog.view.server import ViewServer, make_app
 from tests.every_image import write_images
 from tests.odd_messages import write_odd
 from tests.view.chromium import Chromium, chromium

@@ -21,9 +21,9 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli import fetch
-from hybridlog.view.app import make_app
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask, export
+from hybridlog.view.server import make_app
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 

@@ -17,9 +17,9 @@ import hybridlog as hl
 from hybridlog.demo.write import write_bag
 from hybridlog.query import chunk_scan
 from hybridlog.view import context
-from hybridlog.view.app import make_app
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask
+from hybridlog.view.server import make_app
 from hybridlog_storage.messages import Channel
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
@@ -27,7 +27,7 @@ from tests.view.test_ask import asked_for
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog.view.question import PageQuestion
 
 S = 10**9
@@ -97,7 +97,7 @@ def test_reading_payloads_is_given_up(
         if is_compact:
             assert store.compact()
         asked = {**SCAN, "where": "ranges[7] < 3 or ranges[7] > 3.1"}
-        module = "tables/reader" if is_compact else "query/chunk_scan"
+        module = "hybridlog/columns/" if is_compact else "query/chunk_scan"
         assert_stops(store, monkeypatch, "ask", asked, module)
 
 
@@ -182,7 +182,7 @@ def test_updates_do_not_starve_a_question(
     """An answer that takes longer than the time from one update to the next comes, and again."""
     question_of = ask.question_of
 
-    def slow(context: context.Context, asked: Asked) -> PageQuestion:
+    def slow(context: context.Context, asked: RequestParams) -> PageQuestion:
         time.sleep(1.2)
         return question_of(context, asked)
 

@@ -20,8 +20,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.view import loopback
-from hybridlog.view.app import ROUTES
-from hybridlog.view.connection import BoundedConnection
+from hybridlog.view.server import ROUTES, BoundedConnection
 from tests.view.conftest import served
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.formats.slices import SliceCache, payload_bytes, write_mcap
-from hybridlog.view.app import make_app
 from hybridlog.view.loopback import Admission
+from hybridlog.view.server import make_app
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_bag, read_mcap

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from hybridlog.drawing.matches import Matches
     from hybridlog.sql.topic_view import Remarks
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog.view.question import PageQuestion
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -51,7 +51,7 @@ SQL_COLUMNS: Final = 200
 _MAX_CANDIDATES: Final = 50
 
 
-def ask(context: Context, asked: Asked) -> dict[str, Any]:
+def ask(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The number of messages that satisfy a predicate, with losses and remarks."""
     question = question_of(context, asked)
     query = question.query()
@@ -66,7 +66,7 @@ def ask(context: Context, asked: Asked) -> dict[str, Any]:
     }
 
 
-def matches(context: Context, asked: Asked) -> dict[str, Any]:
+def matches(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
     question = question_of(context, asked)
     start = start_of(question.recording)
@@ -84,7 +84,7 @@ def matches(context: Context, asked: Asked) -> dict[str, Any]:
     }
 
 
-def match_list(context: Context, asked: Asked) -> dict[str, Any]:
+def match_list(context: Context, asked: RequestParams) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
     question = question_of(context, asked)
     start = start_of(question.recording)
@@ -108,7 +108,7 @@ def _matches(context: Context, question: PageQuestion) -> Matches:
     return context.matches.matches(key, question.query)
 
 
-def completion(context: Context, asked: Asked) -> dict[str, Any]:
+def completion(context: Context, asked: RequestParams) -> dict[str, Any]:
     """Candidates for completing a predicate or SQL at a place."""
     text = asked.text("text", "", longest=MAX_TEXT)
     place = min(asked.integer("place", 0, MAX_TEXT), len(text))
@@ -148,7 +148,7 @@ def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
     return {"begin": place - len(word), "candidates": offered}
 
 
-def sql(context: Context, asked: Asked) -> dict[str, Any]:
+def sql(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The first rows of a query in SQL."""
     text = asked.text("text", longest=MAX_TEXT)
     return context.sql.ask(sql_answer, text, SQL_SECONDS)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from starlette.responses import Response
 
     from hybridlog.query.query import Query
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog_storage.messages import Buffer
 
 MAX_TOPICS: Final = 200
@@ -31,7 +31,7 @@ Pieces: TypeAlias = "Generator[bytes, None, None]"
 _streams = asyncio.Semaphore(MAX_STREAMS)
 
 
-def command(context: Context, asked: Asked) -> dict[str, Any]:
+def command(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The command line that writes a part of a recording, and how many messages it has."""
     question = _question(context, asked)
     query = question.query()
@@ -46,7 +46,7 @@ def command(context: Context, asked: Asked) -> dict[str, Any]:
     }
 
 
-def file(context: Context, asked: Asked) -> Response:
+def file(context: Context, asked: RequestParams) -> Response:
     """A part of a recording as an MCAP file."""
     question = _question(context, asked)
     return mcap_response(question.query(), question.file_name())
@@ -92,7 +92,7 @@ async def _sent(pieces: Pieces) -> AsyncIterator[bytes]:
         pieces.close()
 
 
-def _question(context: Context, asked: Asked) -> PageQuestion:
+def _question(context: Context, asked: RequestParams) -> PageQuestion:
     recording = context.recording(asked)
     topics = tuple(dict.fromkeys(asked.texts("topic", most=MAX_TOPICS)))
     context.query(recording, *topics)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog_storage.messages import Schema
 
 MAX_RECORDINGS: Final = 100
@@ -34,7 +34,7 @@ _MAX_PREDICATES: Final = 16
 _MEDIA_TYPE: Final = "application/octet-stream"
 
 
-def slice_file(context: Context, asked: Asked) -> Response:
+def slice_file(context: Context, asked: RequestParams) -> Response:
     """A selection as an MCAP file; ranges of it can be asked for."""
     query = _query(context, asked)
     path = context.slices.get(query, _name(context, query), write_mcap)
@@ -43,7 +43,7 @@ def slice_file(context: Context, asked: Asked) -> Response:
     return FileResponse(path, headers={"ETag": f'"{etag}"'}, media_type=_MEDIA_TYPE)
 
 
-def manifest(context: Context, asked: Asked) -> dict[str, Any]:
+def manifest(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The manifest of a remote data loader: topics, times and data URL of a selection."""
     query = _query(context, asked)
     spans = query.spans().values()
@@ -62,12 +62,12 @@ def manifest(context: Context, asked: Asked) -> dict[str, Any]:
     return {"name": _name(context, query), "sources": [source]}
 
 
-def data(context: Context, asked: Asked) -> Response:
+def data(context: Context, asked: RequestParams) -> Response:
     """A selection as an MCAP file that is read from its beginning to its end."""
     return mcap_response(_query(context, asked), "slice.mcap")
 
 
-def _query(context: Context, asked: Asked) -> Query:
+def _query(context: Context, asked: RequestParams) -> Query:
     """The query of the parameters, which mean what the options of the command line mean."""
     context.refresh()
     names = asked.texts("recording", most=MAX_RECORDINGS)
@@ -83,13 +83,13 @@ def _query(context: Context, asked: Asked) -> Query:
     return query
 
 
-def _time(asked: Asked, name: str, default: str) -> str:
+def _time(asked: RequestParams, name: str, default: str) -> str:
     """A time as on the command line; the plus of `+10s` is a space in a URL."""
     text = asked.text(name, default, longest=64)
     return f"+{text[1:]}" if text.startswith(" ") else text
 
 
-def _parameters(asked: Asked) -> list[tuple[str, str]]:
+def _parameters(asked: RequestParams) -> list[tuple[str, str]]:
     """The parameters, for another URL."""
     several = {"recording": MAX_RECORDINGS, "topic": MAX_TOPICS, "where": _MAX_PREDICATES}
     found = [

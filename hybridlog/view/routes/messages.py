@@ -1,25 +1,27 @@
-"""The message at the cursor as a tree."""
+"""The message at the cursor, and rows of the log panel."""
 
 from __future__ import annotations
 
 import re
 from typing import TYPE_CHECKING, Any, Final
 
+from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.times import format_time
-from hybridlog.view.context import route
-from hybridlog.view.current import current
+from hybridlog.view.context import current, route, start_of
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.view.asked import Asked
+    from hybridlog.query.query import Query
+    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
+
 
 _PATH: Final = re.compile(r"(\d{1,9}(\.\d{1,9}){0,99})?", re.ASCII)
 _MAX_BEGIN: Final = 1 << 40
 
 
-def message(context: Context, asked: Asked) -> dict[str, Any]:
+def message(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The message, or the part of it at a path, from an element or character on."""
     place = asked.text("path", "")
     if not _PATH.fullmatch(place):
@@ -54,4 +56,55 @@ def _time(ns: int | None) -> str | None:
     return None if ns is None or not 0 <= ns < 1 << 63 else format_time(ns)
 
 
-routes = [route("/message", message)]
+_MAX_LINES: Final = 500
+_MAX_SEQ: Final = 1 << 62
+_MAX_FILTER: Final = 200
+
+
+def log(context: Context, asked: RequestParams) -> dict[str, Any]:
+    """Lines before and after a time; with `seq`, before and after the line of that number."""
+    before = asked.integer("before", 0, _MAX_LINES, 0)
+    after = asked.integer("after", 0, _MAX_LINES, 0)
+    recording, query = context.topic(asked)
+    start = start_of(recording)
+    lines = _log(query, asked)
+    time = asked.moment(start)
+    # A line at the time itself is before the cursor, as it is current there.
+    seq = asked.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
+    found = lines.before(time, seq, before)
+    later = lines.after(time, seq, after)
+    return {
+        "lines": [_line(line, start) for line in (*found, *later)],
+        "first": len(found) < before,
+        "last": len(later) < after,
+    }
+
+
+def log_count(context: Context, asked: RequestParams) -> dict[str, Any]:
+    """Number of lines that pass the filters."""
+    _, query = context.topic(asked)
+    return {"count": _log(query, asked).count()}
+
+
+def _log(query: Query, asked: RequestParams) -> Log:
+    level = asked.word("level", ("", *LEVELS), "")
+    text = asked.text("text", "", longest=_MAX_FILTER)
+    schemas = (channel.channel.schema for channel in query.channels())
+    type_name = next((schema.name for schema in schemas if schema is not None), "")
+    return Log(query, kind_of(type_name), level, text)
+
+
+def _line(line: Line, start: int) -> dict[str, Any]:
+    found: dict[str, Any] = {"time": str(line.time - start), "seq": line.seq, "text": line.text}
+    if line.level:
+        found["level"] = line.level
+    if line.name:
+        found["name"] = line.name
+    if not line.is_whole:
+        found["cut"] = True
+    if not line.is_readable:
+        found["problem"] = True
+    return found
+
+
+routes = [route("/message", message), route("/log", log), route("/log/count", log_count)]

@@ -13,7 +13,7 @@ from hybridlog.record.losses import losses_of
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
@@ -39,7 +39,7 @@ _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
 """Keys to order recordings by."""
 
 
-def recordings(context: Context, asked: Asked) -> dict[str, Any]:
+def recordings(context: Context, asked: RequestParams) -> dict[str, Any]:
     """A part of the recordings that satisfy some conditions, in some order."""
     context.refresh()
     first = asked.integer("first", 0, 1 << 31, 0)
@@ -61,7 +61,7 @@ def recordings(context: Context, asked: Asked) -> dict[str, Any]:
     }
 
 
-def recording(context: Context, asked: Asked) -> dict[str, Any]:
+def recording(context: Context, asked: RequestParams) -> dict[str, Any]:
     """One recording: its topics, marks, losses and times."""
     entry = context.recording(asked)
     start = start_of(entry)
@@ -85,7 +85,7 @@ def recording(context: Context, asked: Asked) -> dict[str, Any]:
     }
 
 
-def _choice(asked: Asked) -> Choice:
+def _choice(asked: RequestParams) -> Choice:
     begin, end = asked.text("begin", ""), asked.text("end", "")
     return Choice.of(
         _globs(asked.text("name", "")),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
 
 MAX_FIELDS: Final = 16
@@ -23,14 +23,14 @@ MAX_FIELDS: Final = 16
 _GREATEST_EXACT: Final = 1 << 53
 
 
-def fields(context: Context, asked: Asked) -> dict[str, Any]:
+def fields(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
     _, query = context.topic(asked)
     found = fields_of(query.field_types(), iter(query.limit(SAMPLE)))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
-def series(context: Context, asked: Asked) -> dict[str, Any]:
+def series(context: Context, asked: RequestParams) -> dict[str, Any]:
     """Least and greatest values by pixel, or each value if there are few."""
     recording, query = context.topic(asked)
     start = start_of(recording)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from starlette.responses import Response
 
-from hybridlog.drawing.silence import gaps
+from hybridlog.drawing.density import gaps
 from hybridlog.record.marks import MARKS
 from hybridlog.view.context import Context, extent, route, start_of
 from hybridlog_storage.errors import UsageError
@@ -16,7 +16,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.view.asked import Asked
+    from hybridlog.view.asked import RequestParams
 
 MAX_LANES: Final = 64
 """Topics of one picture."""
@@ -28,7 +28,7 @@ MAX_MARKS: Final = 500
 _ALIGNED: Final = 8  # bytes
 
 
-def timeline(context: Context, asked: Asked) -> Response:
+def timeline(context: Context, asked: RequestParams) -> Response:
     """Messages of some topics by bin, as bytes.
 
     Parameters are `recording`, `begin` and `end` (ns since its start), `pixels` (most bins that
@@ -75,7 +75,7 @@ def timeline(context: Context, asked: Asked) -> Response:
     return Response(content, media_type="application/octet-stream")
 
 
-def marks(context: Context, asked: Asked) -> dict[str, Any]:
+def marks(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The first marks in a range, and how many more there are."""
     recording = context.recording(asked)
     start = start_of(recording)

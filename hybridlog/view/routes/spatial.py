@@ -1,0 +1,131 @@
+"""What is drawn in space: images, scans and clouds, tracks on the map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from starlette.responses import Response
+
+from hybridlog.drawing.images import picture
+from hybridlog.drawing.points import MAX_POINTS, bounds, points
+from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
+from hybridlog.view.context import current, json_response, packed_response, route, start_of
+from hybridlog_storage.errors import DefinitionError, MissingDependencyError, PayloadError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from starlette.responses import Response
+
+    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.context import Context
+
+
+def image(context: Context, asked: RequestParams) -> Response:
+    """The picture as a file; as JSON, why there is none. Headers say when it is current."""
+    found = current(context, asked)
+    if found.message is None:
+        answer: Response = json_response({})
+    elif asked.tag == found.tag:
+        answer = Response(status_code=304)
+    else:
+        try:
+            made = picture(found.message, raw=False)
+            answer = Response(made.data, media_type=made.media_type)
+        except (DefinitionError, MissingDependencyError, PayloadError) as error:
+            answer = json_response({"problem": str(error)})
+    answer.headers.update(found.headers)
+    return answer
+
+
+def points_at(context: Context, asked: RequestParams) -> Response:
+    """The points of the message that is current at a time.
+
+    Parameters: `recording`, `topic`, `at`; `value`, the name of the values to colour by;
+    `limit`, the greatest number of points.
+    """
+    limit = asked.integer("limit", 1, MAX_POINTS, MAX_POINTS)
+    value = asked.text("value", "")
+    shown = current(context, asked)
+    header: dict[str, Any] = {"time": shown.time, "until": shown.until}
+    if shown.message is None:
+        return packed_response(header, {})
+    try:
+        found = points(shown.message, values=[value], limit=limit)
+    except (DefinitionError, PayloadError) as error:
+        return packed_response({**header, "problem": str(error)}, {})
+    values = {"value": found.values[value]} if value in found.values else {}
+    columns = dict(zip("xyz", found.xyz.T, strict=True)) | values
+    header |= {
+        "frame": found.frame,
+        "shown": len(found.xyz),
+        "total": found.total,
+        "dropped": found.dropped,
+        "every": found.every,
+        "origin": found.origin,
+        "flat": found.is_flat,
+        "remarks": found.remarks,
+        "names": found.names,
+        "base": found.bases.get(value, 0.0),
+        "bounds": {name: bounds(array) for name, array in columns.items()},
+    }
+    return packed_response(header, {"xyz": found.xyz, **values})
+
+
+def track_of(context: Context, asked: RequestParams) -> Response:
+    """The track of a topic in metres, of a receiver from its first fix, and the times.
+
+    Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time. A time
+    is the sum of `times` and `rests`: a float64 is too coarse far from the start.
+    """
+    recording, query = context.topic(asked)
+    start = start_of(recording)
+    span = None
+    if asked.has("begin") or asked.has("end"):
+        span = asked.span(start)
+    found = track(query, pixels=asked.pixels(), span=span)
+    header = {
+        "grid": None if found.grid is None else asdict(found.grid),
+        "is_geographic": found.is_geographic,
+        "messages": found.messages,
+        "fixes": found.fixes,
+        "exact": found.exact,
+    }
+    offsets = found.times - start
+    times = offsets.astype(np.float64)
+    arrays: dict[str, NDArray[np.floating[Any]]] = {
+        "times": times,
+        "rests": np.array([n - int(float(n)) for n in offsets.tolist()], np.float32),
+        "xy": found.xy.astype(np.float32),
+    }
+    return packed_response(header, arrays)
+
+
+def fix_at(context: Context, asked: RequestParams) -> dict[str, Any]:
+    """The position of the message that is current at a time.
+
+    Parameters: `recording`, `topic`, `at`.
+    """
+    shown = current(context, asked)
+    answer: dict[str, Any] = {"time": shown.time, "until": shown.until}
+    if shown.message is None:
+        return answer
+    _, query = context.topic(asked)
+    position = position_of(query.field_types()) or Position("", is_geographic=True)
+    if position.is_geographic:
+        found = asdict(fix_of(shown.message, position.prefix))
+    else:
+        found = asdict(pose_of(shown.message, position.prefix))
+    for name in found.keys() & {"latitude", "longitude", "x", "y"}:
+        found[name] = found[name] if math.isfinite(found[name]) else None
+    return {**found, **answer}
+
+
+routes = [
+    route("/image", image),
+    route("/points", points_at),
+    route("/track", track_of),
+    route("/fix", fix_at),
+]
