@@ -129,6 +129,11 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
         "log", "hybridlog.formats.mcap.writer:McapWriter", (".mcap",), has_profile=True
     ),
     "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:BagWriter", (".bag",)),
+    "tum": OutputFormat("table", "hybridlog.formats.places:TumWriter", (".tum",), is_text=True),
+    "geojson": OutputFormat(
+        "table", "hybridlog.formats.places:GeoJsonWriter", (".geojson",), is_text=True
+    ),
+    "ply": OutputFormat("payloads", "hybridlog.formats.ply:open_ply_writer", ()),
     "raw": OutputFormat("payloads", "hybridlog.formats.raw:open_raw_writer", ()),
     "png": OutputFormat("pictures", "hybridlog.formats.pictures:open_pictures_writer", (".png",)),
     "jpg": OutputFormat(

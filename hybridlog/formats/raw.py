@@ -30,7 +30,9 @@ INDEX = "index.jsonl"
 PICTURE_SUFFIXES = (".jpg", ".png", ".webp", ".gif", ".avif", ".bmp", ".tif", ".jp2", ".jxl")
 
 _LONGEST_LINE = 1 << 20
-_FILE = re.compile(rf"[0-9]+(-[0-9]+)?({'|'.join(map(re.escape, ('.bin', *PICTURE_SUFFIXES)))})")
+_FILE = re.compile(
+    rf"[0-9]+(-[0-9]+)?({'|'.join(map(re.escape, ('.bin', '.ply', *PICTURE_SUFFIXES)))})"
+)
 
 
 def holds_messages(directory: Path) -> bool:

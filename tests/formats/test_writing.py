@@ -28,10 +28,20 @@ from hybridlog_storage.disk.unfinished import (
     undone,
 )
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
-from tests.formats.batches import many, ros1_channels
+from tests.formats.batches import clouds, many, ros1_channels
 
 WRITERS = formats_of("lines", "table", "log", "payloads")
-TABLE = pa.table({"x": [1.0, 2.0], "name": ["a", "b"], "v": [[1, 2], []]})
+DIRECTORIES = [name for name in WRITERS if not OUTPUTS[name].suffixes]
+FILES = [name for name in WRITERS if name not in DIRECTORIES]
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw", "latitude", "longitude")
+TABLE = pa.table(
+    {
+        "log_time": pa.array([1, 2], pa.timestamp("ns", "UTC")),
+        **{name: [1.0, 2.0] for name in POSE},
+        "name": ["a", "b"],
+        "v": [[1, 2], []],
+    }
+)
 
 
 def fill(name: str, target: object, times: int = 1, messages: int = 300) -> object:
@@ -42,6 +52,8 @@ def fill(name: str, target: object, times: int = 1, messages: int = 300) -> obje
             writer.write(TABLE)
         elif OUTPUTS[name].content == "lines":
             writer.write(['{"x": 1}'] * 100)
+        elif name == "ply":
+            writer.write(*clouds(messages))
         else:
             writer.write(many(messages), ros1_channels())
     return writer  # type: ignore[no-any-return]
@@ -74,18 +86,18 @@ def test_close_leaves_only_the_target(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", WRITERS)
 def test_an_exception_in_the_block_aborts(name: str, tmp_path: Path) -> None:
     target = tmp_path / "out"
-    if name != "raw":
+    if name in FILES:
         target.write_bytes(b"what was there")
     with pytest.raises(KeyError), fill(name, target):  # type: ignore[attr-defined]
         raise KeyError
-    if name == "raw":
+    if name in DIRECTORIES:
         assert list(tmp_path.iterdir()) == []
     else:
         assert target.read_bytes() == b"what was there"
         assert list(tmp_path.iterdir()) == [target]
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "raw"])
+@pytest.mark.parametrize("name", FILES)
 def test_a_full_disk(name: str) -> None:
     with pytest.raises(DiskFullError, match="no space left"):
         fill(name, "/dev/full").close()  # type: ignore[attr-defined]
@@ -106,7 +118,7 @@ def test_a_disk_that_fills_up_at_the_end(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "raw"])
+@pytest.mark.parametrize("name", FILES)
 def test_a_stream_gets_the_same_bytes(name: str, tmp_path: Path) -> None:
     stream = io.BytesIO()
     fill(name, stream).close()  # type: ignore[attr-defined]

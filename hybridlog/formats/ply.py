@@ -1,0 +1,120 @@
+"""Writes point clouds and scans as PLY, a file a message, binary, with all fields."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.arrays.message_arrays import to_numpy
+from hybridlog.formats.raw import DirectoryWriter
+from hybridlog.schema.codecs import codec_for
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.formats.writing import Target
+    from hybridlog.schema.codec import Codec
+    from hybridlog_storage.messages import Batch, Channel
+
+_TYPES: Final = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+"""Names of PLY's numbers."""
+_NO_WORD: Final = re.compile(r"\W", re.ASCII)
+
+
+def open_ply_writer(target: Target) -> PlyWriter:
+    """Open a writer of a directory.
+
+    Raises:
+        UsageError: The target is a stream.
+    """
+    if isinstance(target, str | os.PathLike):
+        return PlyWriter(target)
+    raise UsageError("ply makes a file a message: name a directory with -o.")
+
+
+class PlyWriter(DirectoryWriter):
+    """Writes a directory with a PLY file a message."""
+
+    def __init__(self, target: str | os.PathLike[str]) -> None:
+        super().__init__(target)
+        self._codecs: dict[Channel, Codec] = {}
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append the points of messages.
+
+        Raises:
+            UsageError: A message has no points.
+            PayloadError: A message is damaged.
+            DiskFullError: No space left.
+        """
+        for row in range(len(batch)):
+            channel = channels[int(batch.channel[row])]
+            if channel not in self._codecs:
+                self._codecs[channel] = codec_for(channel)
+            name = channel.schema.name if channel.schema else ""
+            points = to_numpy(name, self._codecs[channel].decode(batch.payload(row)))
+            about = {
+                "topic": channel.topic,
+                "type": name,
+                "log_time_ns": int(batch.log_time[row]),
+                "points": points.size,
+            }
+            self.add(ply_of(points), ".ply", about)
+
+
+def ply_of(points: NDArray[Any]) -> bytes:
+    """A PLY file.
+
+    Args:
+        points: Records with `x`, `y` and `z`, or with `range` and `angle`, of any shape. Fields
+            of several numbers become as many properties.
+
+    Raises:
+        UsageError: They are no points.
+    """
+    names = points.dtype.names or ()
+    columns: dict[str, NDArray[Any]] = {}
+    if "range" in names and "angle" in names:
+        distance, angle = points["range"].reshape(-1), points["angle"].reshape(-1)
+        columns = {"x": distance * np.cos(angle), "y": distance * np.sin(angle)}
+        columns["z"] = np.zeros_like(columns["x"])
+    elif not {"x", "y", "z"} <= set(names):
+        raise UsageError("ply takes clouds and scans: messages with points.")
+    for name in names:
+        values = points[name].reshape(points.size, -1)
+        for place in range(values.shape[1]):
+            own = _NO_WORD.sub("_", name) + (f"_{place}" if values.shape[1] > 1 else "")
+            while own in columns:
+                own += "_"
+            columns[own] = values[:, place]
+    types = [(name, _little(column.dtype)) for name, column in columns.items()]
+    rows = np.empty(points.size, types)
+    for name, column in columns.items():
+        rows[name] = column
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {points.size}",
+        *(f"property {_TYPES[kind.str[1:]]} {name}" for name, kind in types),
+        "end_header\n",
+    ]
+    return "\n".join(lines).encode("ascii") + rows.tobytes()
+
+
+def _little(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of PLY for numbers; those of 64 bits become doubles."""
+    return kind.newbyteorder("<") if kind.str[1:] in _TYPES else np.dtype("<f8")
