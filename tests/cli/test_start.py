@@ -229,7 +229,7 @@ def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     assert not {name.split(".")[0] for name in loaded} & UNNEEDED
     ours = {name for name in loaded if name.split(".")[0] in {"hybridlog", "hybridlog_storage"}}
     unneeded = (
-        "hybridlog.columns",
+        "hybridlog.columns.tables",
         "hybridlog.frames",
         "hybridlog.index.indexing",
         "hybridlog.record.recorder",
