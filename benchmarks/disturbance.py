@@ -10,7 +10,7 @@ from hybridlog_storage.threads import processors
 TAKEN_SHARE = 0.05
 """A host that takes more of the processors' time away than this disturbs a run."""
 
-MOST_RUNS = 3
+MAX_RUNS = 3
 """So often a disturbed run is done altogether."""
 
 

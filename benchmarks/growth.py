@@ -24,7 +24,7 @@ import hybridlog as hl
 DAY = 86_400 * 10**9
 START = 18_262 * DAY
 MESSAGES = 200
-MOST_AT_ONCE = 1_000
+MAX_AT_ONCE = 1_000
 """Work on all recordings is done in stores of at most so many."""
 TOPICS = ("/pose", "/imu", "/tf", "/joint_states")
 
@@ -120,7 +120,7 @@ def measure(path: Path, count: int, logs: Path) -> dict[str, float]:
             "verify of all": store.verify,
             "index rebuild of all": store.rebuild_index,
         }.items():
-            if count > MOST_AT_ONCE:
+            if count > MAX_AT_ONCE:
                 continue
             before = spent(server)
             once()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
 
-_MOST_SHOWN = 64 << 20  # bytes of a payload that a thumbnail is made of
+_MAX_SHOWN = 64 << 20  # bytes of a payload that a thumbnail is made of
 
 
 class Message:
@@ -100,7 +100,7 @@ class Message:
         from hybridlog.drawing.pixels import thumbnail
 
         is_image = self.type.replace("/msg/", "/") in IMAGES
-        if not is_image or len(self._view) > _MOST_SHOWN or self._is_reduced:
+        if not is_image or len(self._view) > _MAX_SHOWN or self._is_reduced:
             return b""
         try:
             message = self.decode()

@@ -83,7 +83,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.summary import RecordingSummary
 
-_SHOWN = 5  # recordings in a message
+_MAX_NAMES = 5  # recordings in a message
 _MAX_OPEN_SEGMENTS = 256
 _MAX_COLUMNS = 4096  # sets of chunks that are at hand
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
@@ -952,7 +952,7 @@ class Session:
             others = snapshot.having({*found}.difference(known)).tolist()
             if not others:
                 raise
-            labels = listed((snapshot.summaries[place].label for place in others), _SHOWN)
+            labels = listed((snapshot.summaries[place].label for place in others), _MAX_NAMES)
             have = "has" if len(others) == 1 else "have"
             raise TopicError(f"{error}; in the store, {labels} {have} such a topic") from error
 

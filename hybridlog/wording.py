@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-MOST_LISTED = 10
+MAX_LISTED = 10
 
 
-def listed(names: Iterable[str], most: int = MOST_LISTED) -> str:
+def listed(names: Iterable[str], most: int = MAX_LISTED) -> str:
     """Names with commas between them: `a, b and 4 more` if they are many; `none` without any."""
     known = list(names)
     # One name takes no more room than the words for it.

@@ -27,7 +27,7 @@ from hybridlog import session as session_module
 from hybridlog.demo.write import write_bag
 from hybridlog.query import index_reader
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines.base import Outcomes
+from hybridlog.query.engines.base import MatchColumns
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.index_reader import IndexReader
@@ -280,10 +280,10 @@ def test_another_engine_goes_on_where_one_fails(
         part = planner.parts()[0]
         want = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
 
-        def breaking(engine: TablesEngine, part: Part) -> Iterator[Outcomes]:
+        def breaking(engine: TablesEngine, part: Part) -> Iterator[MatchColumns]:
             whole = next(PayloadScan(opened.session, Counters()).outcomes(part))
-            yield Outcomes(*(column[:7] for column in whole))
-            yield Outcomes(*(column[:0] for column in whole))
+            yield MatchColumns(*(column[:7] for column in whole))
+            yield MatchColumns(*(column[:0] for column in whole))
             raise StoreError("gone")
 
         monkeypatch.setattr(TablesEngine, "outcomes", breaking)

@@ -186,7 +186,7 @@ def test_what_is_no_picture_has_none(store: hl.Store, topic: str) -> None:
 
 
 def test_a_large_image_is_not_decoded(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybridlog.message._MOST_SHOWN", 1000)
+    monkeypatch.setattr("hybridlog.message._MAX_SHOWN", 1000)
     assert Parsed(only(store, "/image")._repr_html_()).images == []
 
 

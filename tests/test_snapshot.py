@@ -205,7 +205,7 @@ def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_messages_are_in_order_however_recordings_are_grouped(
     overlapping: Any, monkeypatch: pytest.MonkeyPatch, more: int, backwards: bool
 ) -> None:
-    monkeypatch.setattr(planner, "_MORE_TOGETHER", more)
+    monkeypatch.setattr(planner, "_GROUP_GROWTH", more)
     store, times = overlapping
     wanted = sorted(
         (time, recording, n) for recording, own in times.items() for n, time in enumerate(own)

@@ -35,10 +35,10 @@ _LEAD = 24
 """Ticks, 0.8 s, for which the viewpoint stays on its side before and after a closing."""
 _NEAR = 9
 """Ticks, 0.3 s: outside of a window of 0.1 s, inside of one of 0.5 s."""
-_LEAST_HOLD, _MOST_HOLD = 60, 450
-_LEAST_LONG, _MOST_LONG = 1970, 3030
+_LEAST_HOLD, _MAX_HOLD = 60, 450
+_LEAST_LONG, _MAX_LONG = 1970, 3030
 """65 s to 100 s: one whole minute, and far from two."""
-_MOST_EPISODE = 4 * (42 + 60) + 42 + 3 * _LEAD + 2 * _NEAR + 40
+_MAX_EPISODE = 4 * (42 + 60) + 42 + 3 * _LEAD + 2 * _NEAR + 40
 """Ticks of an episode without the time for which the gripper stays closed."""
 _HOMEWARD = 80
 
@@ -108,12 +108,12 @@ class ViewpointPlan:
         self._rest(30)
         number, had_long = 0, False
         while True:
-            left = self.ticks - self._done - _HOMEWARD - _MOST_EPISODE
-            if left < _MOST_HOLD:
+            left = self.ticks - self._done - _HOMEWARD - _MAX_EPISODE
+            if left < _MAX_HOLD:
                 break
-            is_long = left >= _MOST_LONG and (not had_long or self.rng.random() < 0.05)
+            is_long = left >= _MAX_LONG and (not had_long or self.rng.random() < 0.05)
             had_long |= is_long
-            least, most = (_LEAST_LONG, _MOST_LONG) if is_long else (_LEAST_HOLD, _MOST_HOLD)
+            least, most = (_LEAST_LONG, _MAX_LONG) if is_long else (_LEAST_HOLD, _MAX_HOLD)
             self._episode(self.grasps[number % len(self.grasps)], self._number(least, most))
             number += 1
         self._move(HOME, self._number(20, 40))

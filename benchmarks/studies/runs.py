@@ -15,7 +15,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.disturbance import MOST_RUNS, is_disturbed
+from benchmarks.disturbance import MAX_RUNS, is_disturbed
 from benchmarks.harness.run import Setting
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
@@ -89,7 +89,7 @@ class Context:
         return (
             not self.quick
             and is_disturbed(known.values)
-            and self.journal.successes(sample) < MOST_RUNS
+            and self.journal.successes(sample) < MAX_RUNS
         )
 
     def run(

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _DISTANCE = "distance"
-_SHOWN = 20  # remarks about empty columns
+_MAX_NAMES = 20  # remarks about empty columns
 _LOST = "messages of that time are lost"
 _NO_TIME = "the row has no time on the clock"
 _NO_VALUE = "the message has no such value"
@@ -163,9 +163,11 @@ class Aligned:
             for name, reasons in self.empty.items()
             for reason, number in reasons.items()
         ]
-        found += lines[:_SHOWN]
-        if len(lines) > _SHOWN:
-            found.append(f"{counted(len(lines) - _SHOWN, 'more column')} are empty in some rows.")
+        found += lines[:_MAX_NAMES]
+        if len(lines) > _MAX_NAMES:
+            found.append(
+                f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
+            )
         for stream in streams:
             found += remarks(self._session, stream.question, (), is_empty=False)
         asked_for = [(stream.question, stream.counters) for stream in streams]

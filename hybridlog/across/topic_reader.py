@@ -36,7 +36,7 @@ TIME: Final = "log_time"
 """Column of the time of a row."""
 RECORDING: Final = "recording"
 """Column of the recording of a row."""
-_SHOWN: Final = 3  # recordings in a message
+_MAX_NAMES: Final = 3  # recordings in a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +146,8 @@ class TopicReader:
         if not labels:
             return "the messages are of other recordings"
         return (
-            f"the messages of that time are of other recordings ({listed(labels, _SHOWN)}), which "
-            "--beside or across_recordings takes"
+            "the messages of that time are of other recordings "
+            f"({listed(labels, _MAX_NAMES)}), which --beside or across_recordings takes"
         )
 
     def lost(self, recording: str) -> NDArray[np.int64]:

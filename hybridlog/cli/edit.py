@@ -165,7 +165,7 @@ def _mark_running(
         yield str(request(path, name, "mark", text=text, tags=tags)["recording"])
 
 
-_MOST_ROWS = 20
+_MAX_ROWS = 20
 
 
 @click.command()
@@ -209,14 +209,14 @@ def _confirm(copies: Sequence[str], chosen: Sequence[RecordingSummary]) -> None:
     if several:
         for copy in copies:
             output.note(f"  {copy}: a copy")
-        for one in chosen[:_MOST_ROWS]:
+        for one in chosen[:_MAX_ROWS]:
             span = "" if one.span is None else f"{output.short_time(one.span[0])}, "
             output.note(
                 f"  {one.label}: {span}{output.counted(one.messages, 'message')}, "
                 f"{output.size(one.stored_bytes)}"
             )
-        if len(chosen) > _MOST_ROWS:
-            output.note(f"  and {len(chosen) - _MOST_ROWS} more")
+        if len(chosen) > _MAX_ROWS:
+            output.note(f"  and {len(chosen) - _MAX_ROWS} more")
         names = f"these {len(labels)} recordings"
     if not click.confirm(f"Delete {names} for good?", err=True):
         output.note("Nothing is deleted.")

@@ -20,7 +20,7 @@ from hybridlog.cli.query_options import recordings_of
 from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
-from hybridlog.wording import MOST_LISTED
+from hybridlog.wording import MAX_LISTED
 from hybridlog_storage.errors import SegmentError, StoreError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 _MAX_LINE = 100  # characters of a name and what follows it
-_MOST_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
+_MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
 _DRAWN_WORK = 1 << 20  # see `density`: little is read for a sparkline
 _LETTERS = 40  # of the coverage bar and of the longest sparkline
 _OVER_TIME = "over time"
@@ -75,7 +75,7 @@ def info_command(
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
         extras = {entry.id: _extras(opened, entry) for entry in chosen}
         drawn = {}
-        if sys.stdout.isatty() and not as_json and len(chosen) <= _MOST_DRAWN:
+        if sys.stdout.isatty() and not as_json and len(chosen) <= _MAX_DRAWN:
             drawn = {entry.id: _densities(opened, entry) for entry in chosen}
     if as_json:
         full = [_as_dict(entry, *extras[entry.id]) for entry in chosen]
@@ -303,7 +303,7 @@ def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
     """Rows of a table; the last one counts the lines that are left out."""
     rows = [
         (name, line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…")
-        for line in lines[:MOST_LISTED]
+        for line in lines[:MAX_LISTED]
     ]
     more = len(lines) - len(rows)
     return [*rows, (name, f"and {more} more")] if more else rows

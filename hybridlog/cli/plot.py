@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _FORMATS = ("png", "svg", "pdf", "html")
 _WIDTH, _HEIGHT = 1200, 400
 _LETTERS = 60  # of a line of text in a file
-_MOST_LETTERS = 500
+_MAX_LETTERS = 500
 _PAGE_PIXELS = 10_000  # of a page, in which one can zoom
 _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 
@@ -95,7 +95,7 @@ def plot_command(
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
         names = [] if fields is None else parse_fields(fields)
         width = _WIDTH if shape is None else shape[0]
-        pixels = {"": _MOST_LETTERS, "html": _PAGE_PIXELS}.get(form, width)
+        pixels = {"": _MAX_LETTERS, "html": _PAGE_PIXELS}.get(form, width)
         found = lines(query, names, pixels=pixels)
         if not form:
             _print(found)

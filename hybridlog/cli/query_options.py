@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 
-_SHOWN = 5  # recordings in a message
+_MAX_NAMES = 5  # recordings in a message
 
 
 def recordings_of(store: Store, choice: Choice) -> Recordings:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.store import Store
 
-_MOST_FAILED = 20  # errors that are repeated at the end
+_MAX_FAILED = 20  # errors that are repeated at the end
 
 
 def record_logs(choices: RecordChoices) -> None:
@@ -379,7 +379,7 @@ class Results:
         output.note(f"hybridlog: {error}")
         self._failed += 1
         self._exit_code = self._exit_code or error.exit_code
-        if len(self._messages) < _MOST_FAILED:
+        if len(self._messages) < _MAX_FAILED:
             self._messages.append(str(error))
         about = {} if path is None else {"path": str(path)}
         self._summarise({**about, "error": str(error), "exit_code": error.exit_code})

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _INTERVAL_S = 2.0
 """Seconds between two looks at the directories."""
-_MOST_UNFINISHED = 10
+_MAX_UNFINISHED = 10
 
 
 def record_watched(choices: RecordChoices) -> None:
@@ -104,7 +104,7 @@ class _Watching:
 
     def _print_unfinished(self) -> None:
         paths: list[Path] = [path for watch in self._watches for path in watch.unfinished()]
-        for path in paths[:_MOST_UNFINISHED]:
+        for path in paths[:_MAX_UNFINISHED]:
             output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")
-        if len(paths) > _MOST_UNFINISHED:
-            output.note(f"and {len(paths) - _MOST_UNFINISHED} more that are not complete")
+        if len(paths) > _MAX_UNFINISHED:
+            output.note(f"and {len(paths) - _MAX_UNFINISHED} more that are not complete")

@@ -58,7 +58,7 @@ GROUP_ROWS: Final = 131_072
 GROUP_BYTES: Final = 32 << 20
 """Maximum bytes of the columns of a row group in memory."""
 _ARENA = 8 << 20  # bytes of payloads collected: each topic's part costs a millisecond
-_ENOUGH = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
+_MIN_IN_PLACE_BYTES = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
 _ROWS = 1 << 18  # messages collected
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
@@ -377,7 +377,7 @@ class TableWriter:
         begin, rows = int(batch.offset.min()), len(batch)
         size = int((batch.offset + batch.length).max()) - begin
         is_full = self._filled + size > _ARENA or self._held_rows + rows > _ROWS
-        is_enough = size >= min(_ENOUGH, _ARENA)
+        is_enough = size >= min(_MIN_IN_PLACE_BYTES, _ARENA)
         if is_enough or is_full or chunk.segment != self._held_segment:
             self._decode()
         self._held_segment = chunk.segment

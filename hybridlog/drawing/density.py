@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 
-MOST_WORK: Final = 1 << 24
+MAX_WORK: Final = 1 << 24
 """Messages whose times are read for one picture; a chunk counts as `_CHUNK_WORK` more."""
 _CHUNK_WORK: Final = 1000
 
@@ -57,7 +57,7 @@ def density(
     pixels: int,
     topics: Sequence[str] | None = None,
     *,
-    most_work: int = MOST_WORK,
+    most_work: int = MAX_WORK,
 ) -> Density:
     """Counts of messages by pixel.
 
@@ -88,7 +88,7 @@ def count(
     edges: NDArray[np.int64],
     *,
     since: int = 0,
-    most_work: int = MOST_WORK,
+    most_work: int = MAX_WORK,
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number of messages of some topics between neighbouring times.
 

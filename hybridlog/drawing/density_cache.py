@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from hybridlog.drawing.chunk_parts import RecordedChunks
-from hybridlog.drawing.density import MOST_WORK, Density, count, reading_work, sampled_period
+from hybridlog.drawing.density import MAX_WORK, Density, count, reading_work, sampled_period
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.stopping import held
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 _BLOCK: Final = 10  # a block has 2^10 bins
 _STEPS: Final = 4  # of zooming in that are drawn from the same bins
-_MOST_BINS: Final = 1 << 21  # that are counted for one picture
-_LIGHT: Final = 1 << 20  # messages that are read for finer bins in any case
-_DEARER: Final = 4  # times more messages that finer bins may cost
+_MAX_BINS: Final = 1 << 21  # that are counted for one picture
+_CHEAP_MESSAGES: Final = 1 << 20  # messages that are read for finer bins in any case
+_MAX_COST_RATIO: Final = 4  # times more messages that finer bins may cost
 _LATEST: Final = np.iinfo(np.int64).max
 
 
@@ -189,12 +189,12 @@ class _Recorded:
         for most in (level - _STEPS + 1, level):
             fine = max(most - most % _STEPS, 0)
             steps = level - fine
-            if steps == 0 or (end - begin << steps) * len(topics) > _MOST_BINS:
+            if steps == 0 or (end - begin << steps) * len(topics) > _MAX_BINS:
                 continue
             if plain is None:
                 plain = reading_work(chunks, topics, _edges(level, begin, end))
             work = reading_work(chunks, topics, _edges(fine, begin << steps, end << steps))
-            if work <= min(max(_DEARER * plain, _LIGHT), MOST_WORK):
+            if work <= min(max(_MAX_COST_RATIO * plain, _CHEAP_MESSAGES), MAX_WORK):
                 return fine
         return level
 

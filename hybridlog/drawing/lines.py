@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MOST: Final = 50
 """Lines that can be told apart, with good will."""
 _GREATEST: Final = 1e300
-_SHOWN = 8  # names in a message
+_MAX_NAMES = 8  # names in a message
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Lin
     """
     if not fields:
         numbers = [name for one in _by_topic(query) for name in numbers_of(one)]
-        raise UsageError(f"Name a field, such as {listed(dict.fromkeys(numbers), _SHOWN)}.")
+        raise UsageError(f"Name a field, such as {listed(dict.fromkeys(numbers), _MAX_NAMES)}.")
     summaries = {summary.id: summary for summary in query.summaries()}
     with query.counters.timed():
         found: list[Line] = []

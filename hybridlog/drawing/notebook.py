@@ -17,12 +17,12 @@ from hybridlog.wording import listed
 if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
-MOST_ROWS = 20
-_MOST_TEXT = 100  # characters of a cell
-_MOST_ITEMS = 8  # elements of an array
+MAX_ROWS = 20
+_MAX_TEXT = 100  # characters of a cell
+_MAX_ITEMS = 8  # elements of an array
 
 
-def shown(text: object, most: int = _MOST_TEXT) -> str:
+def shown(text: object, most: int = _MAX_TEXT) -> str:
     """Text of any length in short, on one line."""
     cut = str(text)[: most + 1]
     line = " ".join(cut.split())
@@ -37,8 +37,8 @@ def recordings_html(title: str, recordings: Sequence[RecordingSummary]) -> str:
         recordings: Oldest first.
     """
     columns = ("recording", "start", "duration", "topics", "messages", "tags")
-    rows = (_recording_row(one) for one in recordings[-MOST_ROWS:])
-    more = len(recordings) - MOST_ROWS
+    rows = (_recording_row(one) for one in recordings[-MAX_ROWS:])
+    more = len(recordings) - MAX_ROWS
     note = f"and {more} earlier ones" if more > 0 else ""
     return _titled(title, _table(columns, rows), note)
 
@@ -74,9 +74,9 @@ def message_html(
         image = f'<img alt="thumbnail" src="data:image/png;base64,{data}">'
     if fields is None:
         return _titled(title, image, problem)
-    leaves = list(islice(_leaves("", fields), MOST_ROWS + 1))
-    rows = [[name, _value(value)] for name, value in leaves[:MOST_ROWS]]
-    note = "and more fields" if len(leaves) > MOST_ROWS else ""
+    leaves = list(islice(_leaves("", fields), MAX_ROWS + 1))
+    rows = [[name, _value(value)] for name, value in leaves[:MAX_ROWS]]
+    note = "and more fields" if len(leaves) > MAX_ROWS else ""
     return _titled(title, image + _table((), rows), note)
 
 
@@ -91,13 +91,13 @@ def _leaves(prefix: str, fields: Mapping[str, object]) -> Iterator[tuple[str, ob
 def _value(value: object) -> str:
     if isinstance(value, list):
         items: list[str] = []
-        for item in value[:_MOST_ITEMS]:
+        for item in value[:_MAX_ITEMS]:
             items.append(shown(item, 30))
-            if sum(map(len, items)) > _MOST_TEXT // 2:
+            if sum(map(len, items)) > _MAX_TEXT // 2:
                 break
         more = len(value) - len(items)
         return f"[{', '.join(items)}{f' and {more} more' if more else ''}]"
-    return str(value)[: _MOST_TEXT + 1]
+    return str(value)[: _MAX_TEXT + 1]
 
 
 def _titled(title: str, body: str, note: str = "") -> str:

@@ -24,7 +24,7 @@ COLOUR: Final = "rgb"
 """Name of the values that are colours: red * 65536 + green * 256 + blue."""
 _MAX_VALUES = 64
 _BLOCK = 1 << 18  # points that are looked at together, which bounds the memory
-_FAR = 8192.0  # m; from here on float32 has steps of a millimetre
+_FAR_M = 8192.0  # m; from here on float32 has steps of a millimetre
 _AXES = ("x", "y", "z")
 _NONE: Final = np.empty(0)
 _PARTS = (("red", "green", "blue"), ("r", "g", "b"))
@@ -216,7 +216,7 @@ def _origin(axis: NDArray[Any]) -> float:
         return 0.0
     low, middle, high = np.quantile(_some(finite), (0.01, 0.5, 0.99)).tolist()
     far = max(abs(low), abs(high))
-    return float(round(middle)) if far > _FAR and far > 2 * (high - low) else 0.0
+    return float(round(middle)) if far > _FAR_M and far > 2 * (high - low) else 0.0
 
 
 def _bounds_of_ranges(scan: Any, remarks: list[str]) -> tuple[np.float32, np.float32]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
-_SHOWN = 8  # names of fields in a message
+_MAX_NAMES = 8  # names of fields in a message
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _asked(
     if query.question.reverse:
         raise UsageError("Time runs from left to right here: leave out reverse.")
     if not wanted:
-        raise UsageError(f"Name a field, such as {listed(numbers_of(query), _SHOWN)}.")
+        raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
     asked = query.fields(*dict.fromkeys(one.path for one in wanted))
     _check(wanted, asked.field_types() or {})
     spans = query.spans()

@@ -27,7 +27,7 @@ _RADIUS = 6_378_137.0  # m, semi-major axis of WGS 84
 _ECCENTRICITY = 6.694379990141317e-3  # squared
 _CHI = 5.991464547107979  # square of the radius that holds 95 % of a normal distribution in 2-D
 _STATUS: Final = "status.status"
-_KEPT = 6  # positions of a pixel at most
+_POSITIONS_PER_PIXEL = 6  # positions of a pixel at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +242,7 @@ class _Builder:
     def __init__(self, begin: int, end: int, pixels: int, *, is_geographic: bool) -> None:
         self._begin = begin
         self._width = max(1, -(-(end - begin) // pixels))
-        self._limit = _KEPT * pixels
+        self._limit = _POSITIONS_PER_PIXEL * pixels
         self._times = np.empty(0, np.int64)
         self._xy = np.empty((0, 2))
         self._grid: Grid | None = None

@@ -28,7 +28,7 @@ MAX_TEXT: Final = 1000
 
 _SHOWN: Final = {True: 64, False: 16}
 """Elements that are shown unasked, of an array of plain values and of any other."""
-_MOST_CHARACTERS: Final = 1 << 18
+_MAX_CHARACTERS: Final = 1 << 18
 _LONGEST_INTEGER: Final = 1 << 256
 
 Node: TypeAlias = "dict[str, Any]"
@@ -78,7 +78,7 @@ class _Walk:
 
     def __init__(self) -> None:
         self.nodes = MAX_NODES
-        self.characters = _MOST_CHARACTERS
+        self.characters = _MAX_CHARACTERS
 
     def node(self, value: Any, depth: int, begin: int = 0, count: int | None = None) -> Node:
         """The node of a value."""

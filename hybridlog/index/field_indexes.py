@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 OWN_FIELDS = ("_meta.t", "_meta.pub", "_meta.inserted_at", "_meta.rec")
 """Fields that every index document has, in any topic."""
 
-_MOST_FIELDS = 8
+_MAX_FIELDS = 8
 
 
 class FieldIndex(NamedTuple):
@@ -94,8 +94,8 @@ def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
 def _check(fields: Sequence[str]) -> None:
     if not fields:
         raise UsageError("Name at least one field; `hybridlog schema TOPIC` lists them.")
-    if len(fields) > _MOST_FIELDS or len(set(fields)) != len(fields):
-        raise UsageError(f"An index takes up to {_MOST_FIELDS} fields, without duplicates.")
+    if len(fields) > _MAX_FIELDS or len(set(fields)) != len(fields):
+        raise UsageError(f"An index takes up to {_MAX_FIELDS} fields, without duplicates.")
 
 
 def _keys(fields: Sequence[str]) -> list[tuple[str, int]]:

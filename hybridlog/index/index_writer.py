@@ -180,8 +180,8 @@ class IndexWriter:
         target: Where documents go.
         catalog: Gets the decoding results of each segment.
         tables: Gets each chunk once, in the order of the file.
-        behind: Returns whether the recorder has more than it can write; this then waits.
-        spare: Processors for what can wait. One is held while documents or tables are made.
+        pause_indexing: Returns whether the recorder has more than it can write; this then waits.
+        cpu_slots: Processors for what can wait. One is held while documents or tables are made.
         interval_s: Longest time between two passes, seconds.
 
     Attributes:
@@ -198,8 +198,8 @@ class IndexWriter:
         catalog: Catalog,
         *,
         tables: TableWriter,
-        behind: Callable[[], bool] = lambda: False,
-        spare: AbstractContextManager[Any] | None = None,
+        pause_indexing: Callable[[], bool] = lambda: False,
+        cpu_slots: AbstractContextManager[Any] | None = None,
         interval_s: float = INTERVAL_S,
     ) -> None:
         self.failure = target.failure
@@ -210,8 +210,8 @@ class IndexWriter:
         self._target = target
         self._catalog = catalog
         self._tables = tables
-        self._behind = behind
-        self._spare = spare or nullcontext()
+        self._pause_indexing = pause_indexing
+        self._cpu_slots = cpu_slots or nullcontext()
         self._interval_s = interval_s
         self._indexer = ChunkIndexer(entry.id, has_documents=target.is_wanted)
         self._channels: Mapping[int, Channel] = {}
@@ -360,7 +360,7 @@ class IndexWriter:
         group: list[StoredChunk] = []
         size = 0
         for place in places:
-            while self._behind():
+            while self._pause_indexing():
                 time.sleep(_PAUSE_S)
             try:
                 chunk = reader.read_chunk(place)
@@ -379,9 +379,9 @@ class IndexWriter:
         """Make rows and documents of chunks of one segment."""
         new = [chunk for chunk in chunks if (chunk.segment, chunk.number) >= self._next]
         for chunk in new:
-            with self._spare:
+            with self._cpu_slots:
                 self._tables.add(chunk, self._channels)
-        with self._spare:
+        with self._cpu_slots:
             documents, entries = self._indexer.documents_of(chunks, self._channels)
         for entry in entries[len(chunks) - len(new) :]:
             self._stats[entry.number] = entry.stats

@@ -10,7 +10,7 @@ from hybridlog_storage.buffers import SLAB, buffers
 
 _INITIAL_BYTES = 128 << 20  # buffers reserved before the first message, at most
 _AHEAD_S = 0.75  # later: as much as comes in this time, since disks stall for so long
-_PAUSE = 1.0  # between two buffers, as a multiple of the time one takes: it delays writers
+_BUFFER_PAUSE_RATIO = 1.0  # pause between two buffers, relative to the time of one
 _SHARE_FOR_SMALL = 0.25  # of the reserved buffers, which large chunks do not use
 _RATES = 16  # the highest of so many rates counts: sources pause, and disks stall
 _STEADY = 1.25  # a rate that grows by more is still rising
@@ -96,4 +96,4 @@ class MemoryReservation:
     def _reserve(self, total: int) -> None:
         # Without more memory recording goes on with what is reserved.
         with suppress(MemoryError, OSError):
-            buffers.prepare(self._usual, total, pause=_PAUSE, enough=self._ended)
+            buffers.prepare(self._usual, total, pause=_BUFFER_PAUSE_RATIO, enough=self._ended)

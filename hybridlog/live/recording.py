@@ -59,7 +59,7 @@ _SKIP_COMPRESSION_AT = 8 << 20  # unwritten bytes; above it only chunks that shr
 _DELAY_INDEX_AT = 32 << 20  # above it the index waits
 _MAX_COPYING = 2  # threads that copy large messages at the same time
 _NO_LIMIT = nullcontext()
-_CALM_S = 1.0  # both measures last so long afterwards, or they would cause the next delay
+_PRESSURE_HOLD_S = 1.0  # both measures last so long afterwards, or they would cause the next delay
 _LATE_S = 0.01  # a large message that waits longer for its copy starts both measures,
 _LATE_TIMES = 20  # for this multiple of its waiting time
 _RATE_S = 0.25  # interval at which the incoming rate is measured
@@ -118,7 +118,7 @@ class _PressureTimer:
 
     def is_high(self, unwritten: int) -> bool:
         if unwritten > self._bound:
-            self.hold(_CALM_S)
+            self.hold(_PRESSURE_HOLD_S)
         return time.monotonic() < self._high_until
 
 
@@ -193,11 +193,11 @@ class LiveRecording:
                 settings=options.settings,
                 no_index=options.no_index,
                 pressure=Backpressure(
-                    hurry=lambda: self._is_under_pressure(self._compression_pressure),
-                    behind=lambda: self._is_under_pressure(self._index_pressure),
+                    skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
+                    pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
                     index_interval_s=_index_interval_s(options.flush_interval_s),
                     next_chunk_size=self._reservation.next_chunk_size,
-                    spare=threading.BoundedSemaphore(_spare_processors()),
+                    cpu_slots=threading.BoundedSemaphore(_spare_processors()),
                     on_written=self._make_room,
                 ),
             )
@@ -312,7 +312,7 @@ class LiveRecording:
                 self._inbox_bytes += size
             enough = self._inbox_bytes >= self._worth_waking
         if at_once:
-            self._lay_now(message)
+            self._append_now(message)
         elif enough:
             self._wake()
         return True
@@ -392,13 +392,13 @@ class LiveRecording:
             try:
                 end = {"status": "complete", "losses": []}
                 if isinstance(self._failure, DiskFullError):
-                    failure = self._capture.give_up(end, self._cut_off())
+                    failure = self._capture.close_truncated(end, self._cut_off())
                 elif self._failure is not None:
                     raise self._failure
                 else:
                     failure = self._close_whole(end)
             except BaseException:
-                self._capture.leave()
+                self._capture.abort()
                 raise
         return RecordReport(
             self._capture.entry,
@@ -415,7 +415,7 @@ class LiveRecording:
         try:
             return self._capture.close(end)
         except DiskFullError:
-            return self._capture.give_up(end, self._cut_off())
+            return self._capture.close_truncated(end, self._cut_off())
 
     def _cut_off(self) -> list[dict[str, Any]]:
         """Rows of the ledger, with the messages that were taken but not written."""
@@ -443,7 +443,7 @@ class LiveRecording:
         with self._closing:
             self._end()
             with self._frozen:
-                self._capture.forget()
+                self._capture.rollback()
 
     def _closed_beyond(self) -> int:
         """Bytes of closed chunks beyond those in normal operation."""
@@ -532,7 +532,7 @@ class LiveRecording:
         if rows:
             self._capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
 
-    def _lay_now(self, message: _Message) -> None:
+    def _append_now(self, message: _Message) -> None:
         """Copy a message into its chunk, after the queued ones.
 
         The thread that brings the message copies it. In a queue it would need memory of
@@ -545,7 +545,7 @@ class LiveRecording:
         try:
             with limit:
                 with self._laying:
-                    self._relieve(time.monotonic() - since)
+                    self._raise_pressure(time.monotonic() - since)
                     self._check()
                     with self._failing():
                         self._take()
@@ -558,11 +558,11 @@ class LiveRecording:
         finally:
             self._make_room(len(message.payload))
 
-    def _relieve(self, waited: float) -> None:
+    def _raise_pressure(self, waited: float) -> None:
         """Relieve processors and disk after a message has waited long for its copy."""
         if waited > _LATE_S:
             for timer in (self._compression_pressure, self._index_pressure):
-                timer.hold(min(_LATE_TIMES * waited, _CALM_S))
+                timer.hold(min(_LATE_TIMES * waited, _PRESSURE_HOLD_S))
 
     def _take(self) -> None:
         """Move queued messages into chunks; the caller holds `_laying`."""
@@ -571,9 +571,9 @@ class LiveRecording:
             self._inbox, self._inbox_bytes = deque(), 0
         if inbox:
             for group in [inbox] if size <= _MAX_LAID else _groups(inbox):
-                self._make_room(self._lay_down(group))
+                self._make_room(self._append_batch(group))
 
-    def _lay_down(self, group: Sequence[_Message]) -> int:
+    def _append_batch(self, group: Sequence[_Message]) -> int:
         """Write some messages into chunks; returns their payload bytes."""
         if len(group) >= _MIN_BATCH * self._count_chunks(group):
             batch = _batch(group)

@@ -104,7 +104,7 @@ def bring_up_to_date(
         entry = entry_of(summary)
         indexed = known.get(entry.key)
         is_whole = indexed is not None and indexed.is_whole(entry)
-        if indexed is not None and is_whole and _recall(catalog, entry, indexed):
+        if indexed is not None and is_whole and _restore_damage(catalog, entry, indexed):
             has_changed = True
             entry = put_entry(directory, catalog, entry.label)
             if entry.id != summary.id:  # another recording has the label now
@@ -133,7 +133,7 @@ def _bring_one(
     # The process that holds the lock indexes it.
     with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
         try:
-            chunks = _tend(directory, catalog, database, replace(entry, label=label), progress)
+            chunks = _bring_up(directory, catalog, database, replace(entry, label=label), progress)
         except SegmentError as error:
             report.unreadable[label] = str(error)
         else:
@@ -141,7 +141,7 @@ def _bring_one(
                 report.indexed[label] = chunks
 
 
-def _recall(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
+def _restore_damage(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
     """Copy the index's list of unreadable chunks to the catalog; True if it changed."""
     with suppress(CatalogError):
         if catalog.damage(entry.id) == indexed.damage:
@@ -155,7 +155,7 @@ def _is_settled(indexed: Indexed | None, entry: RecordingEntry) -> bool:
     return indexed is not None and indexed.mirrors(entry) and entry.is_decoded
 
 
-def _tend(
+def _bring_up(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database,

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 Span = tuple[int, int]
 """`[begin, end)` in nanoseconds."""
 
-MOST_PIECES = 10_000_000
+MAX_PIECES = 10_000_000
 """Maximum number of intervals that `Intervals.cut` makes."""
-_AT_ONCE = 10_000  # intervals whose columns become Python numbers together
+_ROWS_PER_BATCH = 10_000  # intervals whose columns become Python numbers together
 
 
 class Events(Protocol):
@@ -141,8 +141,8 @@ class Intervals:
     def __iter__(self) -> Iterator[Interval]:
         """The intervals, one by one."""
         columns = (self._recording, self._begin, self._end, self._messages)
-        for start in range(0, len(self), _AT_ONCE):
-            rows = (column[start : start + _AT_ONCE].tolist() for column in columns)
+        for start in range(0, len(self), _ROWS_PER_BATCH):
+            rows = (column[start : start + _ROWS_PER_BATCH].tolist() for column in columns)
             for code, begin, end, count in zip(*rows, strict=True):
                 yield Interval(self._recordings[code], begin, end, count)
 
@@ -198,7 +198,7 @@ class Intervals:
         if size == 0:
             raise UsageError("Intervals cannot be cut into pieces of length 0.")
         count = (self._end - self._begin) // size
-        if int(count.sum()) > MOST_PIECES:
+        if int(count.sum()) > MAX_PIECES:
             raise UsageError(
                 f"The cut makes {int(count.sum())} intervals; use a greater length or a time range."
             )

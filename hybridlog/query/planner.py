@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines.base import Engine, Objects, Outcomes, Values
+    from hybridlog.query.engines.base import Engine, MatchColumns, Objects, Values
     from hybridlog.query.engines.running import RunningTables
     from hybridlog.query.engines.tables import ArraysEngine, TablesEngine
     from hybridlog.query.index_reader import IndexReader
@@ -47,12 +47,12 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-_MORE_TOGETHER = 64  # so many times more recordings are planned after each group
-_MOST_TOGETHER = 4096  # recordings planned at once, if they do not overlap
+_GROUP_GROWTH = 64  # so many times more recordings are planned after each group
+_MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
-_Rows = TypeVar("_Rows", "Outcomes", "Values")
+_Rows = TypeVar("_Rows", "MatchColumns", "Values")
 _Key = tuple[int, int]
-_RETRIED = (ResourceError, SegmentError, StoreError, UndecidedError)
+_FALLBACK_ERRORS = (ResourceError, SegmentError, StoreError, UndecidedError)
 """Failures of one engine that another engine may not have."""
 
 
@@ -173,7 +173,7 @@ class Planner:
         for topic, channels in by_topic.items():
             if not any(c.stats.messages for c in channels):
                 continue  # nothing was sent on the topic
-            blind = [c for c in channels if asks_fields and _has_no_fields(c)]
+            undecodable = [c for c in channels if asks_fields and _has_no_fields(c)]
             yield Part(
                 recording,
                 topic,
@@ -182,7 +182,7 @@ class Planner:
                 self.question.clock,
                 windows,
                 predicate,
-                tuple(blind),
+                tuple(undecodable),
             )
 
     def channels(self) -> list[RecordedChannel]:
@@ -255,7 +255,7 @@ class Planner:
             self._decidable.update(zip(wanted, found, strict=True))
         return [self._decidable.get(part, part) for part in parts]
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
         (part,) = self._decided([part])
         return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
@@ -271,7 +271,7 @@ class Planner:
         try:
             if part.predicate is not None:
                 self._tables.check(part)
-        except _RETRIED:
+        except _FALLBACK_ERRORS:
             return False
         return True
 
@@ -290,7 +290,7 @@ class Planner:
         if question.limit == 0:
             return
         runs = self._runs()
-        for run in runs if question.returns_all else _thinned(runs, question):
+        for run in runs if question.returns_all else _decimated(runs, question):
             self.counters.add_messages(run.batch)
             yield run
 
@@ -329,7 +329,7 @@ class Planner:
             end = int(edges[row]) if row < len(edges) else len(order)
             rows = order[begin:end].tolist()
             yield [part for row in rows for part in self.parts_in(*found[row])]
-            begin, most = end, min(most * _MORE_TOGETHER, _MOST_TOGETHER)
+            begin, most = end, min(most * _GROUP_GROWTH, _MAX_GROUP)
 
     def plan(self, parts: Sequence[Part]) -> ScanPlan:
         """The plan for reading the matching messages of some parts."""
@@ -365,7 +365,7 @@ class Planner:
             for engine, chosen in [*selecting.items()]:
                 try:
                     found = engine.select(chosen, tasks)
-                except _RETRIED:
+                except _FALLBACK_ERRORS:
                     for part in chosen:
                         read(part)
                     del selecting[engine]
@@ -399,8 +399,8 @@ class Planner:
             if part in self._counted or part.predicate is None:
                 continue
             self._counted.add(part)
-            if part.blind:
-                unseen = replace(part, channels=part.blind, blind=(), predicate=None)
+            if part.undecodable:
+                unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
                 self.counters.unreadable += self._count_stored(unseen)
             if part.needs_index:
                 self.counters.unindexed += self.count_unindexed([part])
@@ -420,8 +420,8 @@ class Planner:
         """
         total = 0
         for part in (part for part in parts if part.recording.status == "open"):
-            channels = (*part.channels, *part.blind)
-            whole = replace(part, channels=channels, blind=(), predicate=None)
+            channels = (*part.channels, *part.undecodable)
+            whole = replace(part, channels=channels, undecodable=(), predicate=None)
             total += max(self._count_stored(whole) - self.index.count([whole]), 0)
         return total
 
@@ -433,7 +433,7 @@ class Planner:
             if isinstance(engine, Checking):
                 try:
                     engine.check(part)
-                except _RETRIED:
+                except _FALLBACK_ERRORS:
                     continue
             return engine
         return self._scan
@@ -459,7 +459,7 @@ class Planner:
         for engine, group in groups.items():
             try:
                 total += engine.count(group)
-            except _RETRIED:
+            except _FALLBACK_ERRORS:
                 total += sum(self._count_part(self._choose(p, Need.COUNT), p) for p in group)
         return total
 
@@ -469,7 +469,7 @@ class Planner:
         for engine in engines:
             try:
                 return engine.count([part])
-            except _RETRIED as error:
+            except _FALLBACK_ERRORS as error:
                 if failure is None or isinstance(failure, UndecidedError):
                     failure = error
         assert failure is not None
@@ -493,7 +493,7 @@ class Planner:
                         yield rest
                         last = _last_key(rest) or last
                 return
-            except _RETRIED as error:
+            except _FALLBACK_ERRORS as error:
                 if failure is None or isinstance(failure, UndecidedError):
                     failure = error
         assert failure is not None
@@ -516,7 +516,7 @@ def _has_no_fields(channel: RecordedChannel) -> bool:
     return not channel.is_reduced and not channel.codec.indexed
 
 
-def _last_key(item: Outcomes | Values) -> _Key | None:
+def _last_key(item: MatchColumns | Values) -> _Key | None:
     """Log time and arrival number of the last row; None without rows."""
     return (int(item.log_time[-1]), int(item.seq[-1])) if len(item.log_time) else None
 
@@ -532,7 +532,7 @@ def _after(item: _Rows, key: _Key) -> _Rows | None:
     return item._replace(**columns)
 
 
-def _thinned(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
+def _decimated(runs: Iterator[MessageRun], question: Question) -> Iterator[MessageRun]:
     """Every n-th message of each topic, up to the limit."""
     number: dict[str, int] = {}
     seen: dict[int, int] = defaultdict(int)

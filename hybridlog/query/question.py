@@ -127,7 +127,7 @@ class Part:
         clock: The clock of `bounds`.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
         predicate: Condition on the fields; None for no condition.
-        blind: Further channels of the topic, of whose messages the predicate cannot be asked
+        undecodable: Further channels of the topic, of whose messages the predicate cannot be asked
             because they have no fields.
     """
 
@@ -138,7 +138,7 @@ class Part:
     clock: Clock
     windows: NDArray[np.int64] | None
     predicate: Predicate | None
-    blind: tuple[RecordedChannel, ...] = ()
+    undecodable: tuple[RecordedChannel, ...] = ()
 
     @property
     def is_unbounded(self) -> bool:

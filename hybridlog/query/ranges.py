@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelStats
     from hybridlog_storage.summary import RecordingSummary
 
-_SHOWN = 5  # recordings in a message
+_MAX_NAMES = 5  # recordings in a message
 
 
 class Resolved(NamedTuple):
@@ -263,7 +263,7 @@ class RangeResolver:
             if low < high or low == start or high == end:
                 label = summaries[place].label
                 spans.append(f"{label} spans {format_time(start)} to {format_time(end)}")
-            if len(spans) == _SHOWN:
+            if len(spans) == _MAX_NAMES:
                 break
         if not spans:
             start, end = self._clock_span(summaries[places[0]])
@@ -280,7 +280,7 @@ class RangeResolver:
         snapshot = self._session.snapshot()
         places = snapshot.between(snapshot.having(self._question.topics), *shared).tolist()
         labels = [snapshot.summaries[place].label for place in places]
-        return f" Other recordings span that time: {listed(labels, _SHOWN)}." if labels else ""
+        return f" Other recordings span that time: {listed(labels, _MAX_NAMES)}." if labels else ""
 
 
 def _known_ends(stats: ChannelStats, *, is_publish: bool) -> list[int]:

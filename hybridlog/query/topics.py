@@ -22,7 +22,7 @@ from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex, te
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
-_SHOWN = 10
+_MAX_NAMES = 10
 _LONGEST_PATTERN = 1_000
 _LONGEST_REGEX = 200
 
@@ -289,7 +289,7 @@ def _unknown(pattern: str, known: list[str]) -> str:
         for key in {whole, whole.rsplit("/", 1)[-1]}:
             by_key.setdefault(key, []).append(topic)
     for word in (wanted, last):
-        for key in difflib.get_close_matches(word, by_key, n=_SHOWN, cutoff=0.6):
+        for key in difflib.get_close_matches(word, by_key, n=_MAX_NAMES, cutoff=0.6):
             nearest.update(dict.fromkeys(by_key[key]))
     if nearest:
         return f"there is no topic {_shown(pattern)}; did you mean {_listed(nearest)}?"
@@ -303,7 +303,7 @@ def _there_are(known: list[str]) -> str:
 
 
 def _listed(topics: Iterable[str]) -> str:
-    return listed((_shown(name, quote=False) for name in topics), _SHOWN)
+    return listed((_shown(name, quote=False) for name in topics), _MAX_NAMES)
 
 
 def _shown(text: str, *, quote: bool = True) -> str:

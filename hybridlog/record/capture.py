@@ -43,22 +43,22 @@ class Backpressure:
     """Settings of a live recording, which cannot wait for compression, disk and index.
 
     Attributes:
-        hurry: Returns whether writing is behind. Then only chunks that shrink to a fifth are
-            compressed.
-        behind: Returns whether writing is so far behind that indexing pauses.
+        skip_compression: Returns whether writing is behind. Then only chunks that shrink to a
+            fifth are compressed.
+        pause_indexing: Returns whether writing is so far behind that indexing pauses.
         index_interval_s: Longest time between two passes of the index, seconds.
         next_chunk_size: Returns the size in bytes of the next chunk.
-        spare: Semaphore of the processors for packing that can wait, and for making documents
+        cpu_slots: Semaphore of the processors for packing that can wait, and for making documents
             and tables.
         on_written: Called on another thread when less content waits for the disk. `append`
             then never waits; its caller watches `writer.waiting`.
     """
 
-    hurry: Callable[[], bool]
-    behind: Callable[[], bool]
+    skip_compression: Callable[[], bool]
+    pause_indexing: Callable[[], bool]
     index_interval_s: float
     next_chunk_size: Callable[[], int]
-    spare: BoundedSemaphore
+    cpu_slots: BoundedSemaphore
     on_written: Callable[[], None]
 
 
@@ -121,8 +121,8 @@ class Capture:
             target,
             catalog,
             tables=self._tables,
-            behind=pressure.behind if pressure else lambda: False,
-            spare=pressure.spare if pressure else None,
+            pause_indexing=pressure.pause_indexing if pressure else lambda: False,
+            cpu_slots=pressure.cpu_slots if pressure else None,
             interval_s=pressure.index_interval_s if pressure else INTERVAL_S,
         )
         self._held.callback(self.index.release)
@@ -133,9 +133,9 @@ class Capture:
             settings,
             no_index=self._no_index,
             on_sealing=self._announce,
-            hurry=pressure.hurry if pressure else None,
+            skip_compression=pressure.skip_compression if pressure else None,
             next_chunk_size=pressure.next_chunk_size if pressure else None,
-            spare=pressure.spare if pressure else None,
+            cpu_slots=pressure.cpu_slots if pressure else None,
             on_written=pressure.on_written if pressure else None,
         )
 
@@ -169,7 +169,7 @@ class Capture:
         self.writer.close(json_metadata(END_METADATA, end))
         return self._finish()
 
-    def give_up(
+    def close_truncated(
         self, end: Mapping[str, Any], lost: Sequence[Mapping[str, Any]]
     ) -> DatabaseError | None:
         """Complete the recording on a full disk.
@@ -186,12 +186,12 @@ class Capture:
         """
         self._end = end  # the segment holds the last losses
         try:
-            self.writer.give_up(
+            self.writer.close_truncated(
                 [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
             )
         except DiskFullError:
             if not self.writer.written.total():
-                self.forget()
+                self.rollback()
             raise
         return self._finish()
 
@@ -223,14 +223,14 @@ class Capture:
         self._held.close()
         return failure
 
-    def leave(self) -> None:
+    def abort(self) -> None:
         """Stop at once; flushed messages stay, and the next opening of the store seals them."""
         self.writer.abort()
         self.index.abandon()
         self._tables.discard()
         self._held.close()
 
-    def forget(self) -> None:
+    def rollback(self) -> None:
         """Remove the whole recording; the next opening finishes a removal that fails."""
         label, entry = self.entry.label, self.entry
         with suppress(HybridlogError):  # the directory's hidden name announces it, too

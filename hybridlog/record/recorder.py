@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
 
-_MOST_PARTS = 1000  # of a log, whose fingerprints the recording has
+_MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ def record(
         failure = capture.close(_end_of(source))
     except BaseException:
         # Remove a partial recording: the source still exists, the command can be repeated.
-        capture.forget()
+        capture.rollback()
         raise
     return RecordReport(
         capture.entry,
@@ -330,7 +330,7 @@ def _end_of(source: Source) -> dict[str, Any]:
 
 def _identity(fingerprint: Fingerprint) -> dict[str, object]:
     """The fingerprint of a log in the description of its recording."""
-    several = 1 < len(fingerprint.parts) <= _MOST_PARTS
+    several = 1 < len(fingerprint.parts) <= _MAX_PARTS
     parts = {"parts": list(fingerprint.parts)} if several else {}
     return {"fingerprint": fingerprint.whole, **parts}
 

@@ -27,7 +27,7 @@ from hybridlog.query import periods
 from hybridlog.query.answers import rates
 from hybridlog.query.answers.field_statistics import _Running
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines.base import Need, Outcomes
+from hybridlog.query.engines.base import MatchColumns, Need
 from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
@@ -53,13 +53,13 @@ def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
         return
     outcomes = Planner.outcomes
 
-    def cut(planner: Planner, part: Part) -> Iterator[Outcomes]:
+    def cut(planner: Planner, part: Part) -> Iterator[MatchColumns]:
         for one in outcomes(planner, part):
             for begin in range(0, len(one.log_time), 3):
-                yield Outcomes(*(column[begin : begin + 3] for column in one))
+                yield MatchColumns(*(column[begin : begin + 3] for column in one))
 
     monkeypatch.setattr(Planner, "outcomes", cut)
-    monkeypatch.setattr(rates, "_KEPT", 4)
+    monkeypatch.setattr(rates, "_MAX_SECOND_LOOK", 4)
 
 
 def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:

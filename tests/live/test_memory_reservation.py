@@ -158,7 +158,7 @@ def test_where_there_is_no_memory_it_is_asked_for_once(
 def test_who_closes_does_not_wait_for_all_of_it(
     pool: Buffers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_PAUSE", 1e9)
+    monkeypatch.setattr(module, "_BUFFER_PAUSE_RATIO", 1e9)
     with closing(MemoryReservation(SIZE, 16 * SLAB)) as reservation:
         given = pool._given[SLAB]
         reservation.observe(1e12)

@@ -72,13 +72,13 @@ class Running:
 def block_writing(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Nothing is laid into chunks until the event is set."""
     blocked = threading.Event()
-    lay_down = LiveRecording._lay_down
+    lay_down = LiveRecording._append_batch
 
     def slow(self: LiveRecording, group: object) -> int:
         blocked.wait()
         return lay_down(self, group)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(LiveRecording, "_lay_down", slow)
+    monkeypatch.setattr(LiveRecording, "_append_batch", slow)
     return blocked
 
 

@@ -336,7 +336,7 @@ def test_the_index_falls_behind_and_catches_up(
 def test_the_index_waits_while_messages_wait_for_their_turn(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool, size: int
 ) -> None:
-    monkeypatch.setattr(live, "_CALM_S", 3600)
+    monkeypatch.setattr(live, "_PRESSURE_HOLD_S", 3600)
     monkeypatch.setattr(live, "_LATE_TIMES", 36_000 if late else 0)
     own = channel("/talk")
     with store.start("talk", flush_interval_s=0.2) as recording:

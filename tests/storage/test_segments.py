@@ -405,7 +405,7 @@ def test_a_segment_has_no_more_chunks_than_a_summary_should(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However well they shrink."""
-    monkeypatch.setattr(segment_writer, "_MOST_CHUNKS", 10)
+    monkeypatch.setattr(segment_writer, "_MAX_CHUNKS", 10)
     writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None, SegmentSettings(chunk_size=2000))
     payloads = [bytes([n]) * 1500 for n in range(200)]
     for n, payload in enumerate(payloads):
@@ -1325,7 +1325,7 @@ def test_when_the_journal_fails_the_segment_is_sealed_later(tmp_path: Path) -> N
     before = opened.read_bytes()
     # Who gives up tries it once more, and says the rest in another segment.
     fails = False
-    writer.give_up([json_metadata(END_METADATA, {"status": "damaged"})])
+    writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
     assert [sealed.file for sealed in told] == ["000000.mcap", "000001.mcap"]
     assert (directory / "000000.mcap").read_bytes() == before
     with SegmentReader(directory / "000001.mcap", 1) as reader:
@@ -1499,7 +1499,7 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
         except (DiskFullError, StoreError):
             try:
                 if gives_up:
-                    writer.give_up([json_metadata(END_METADATA, {"status": "damaged"})])
+                    writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
                 else:
                     writer.abort()
             except (DiskFullError, StoreError):
@@ -1525,7 +1525,7 @@ def test_channels_of_all_chunks_are_bounded_in_a_segment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However many topics share a chunk."""
-    monkeypatch.setattr(segment_writer, "_MOST_PARTS", 20)
+    monkeypatch.setattr(segment_writer, "_MAX_PARTS", 20)
     topics = [Channel(f"/{n}", "json", None) for n in range(10)]
     writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None)
     for n in range(6):

@@ -44,7 +44,7 @@ _LEAST_HEADER = 8  # bytes of a header with the field `op` only
 _MANY = 100  # records in a run from which the next run is searched by columns,
 _SMALL = 4096  # if their mean size is at most this
 _SAMPLE = 1 << 16  # bytes sampled to find rare values
-_MOST_HITS = 1 / 16  # share of candidate positions above which columns cost too much
+_MAX_HITS = 1 / 16  # share of candidate positions above which columns cost too much
 
 # Required fields of a header of each kind: name and length of the value (None: any
 # length).
@@ -233,7 +233,7 @@ class _Template:
             self._rare = int(seen[self._bytes].argmin())
         at = 4 + int(self._columns[self._rare])
         places = np.flatnonzero(data[at : at + count] == self._bytes[self._rare])
-        if len(places) > _MOST_HITS * len(data):
+        if len(places) > _MAX_HITS * len(data):
             return np.empty(0, np.int64)
         # The rest of each header is checked once, when the starts of records are known.
         found: NDArray[np.int64] = places[_u32_at(data, places) == self.size]

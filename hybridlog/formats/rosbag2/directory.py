@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-_MOST_MISSING = 100  # files that are reported one by one
+_MAX_MISSING = 100  # files that are reported one by one
 
 
 def read_metadata(folder: Path) -> BagMetadata | Damage | None:
@@ -89,9 +89,9 @@ def _missing(folder: Path, metadata: BagMetadata, names: list[str]) -> list[Dama
             f"the file is missing; {NAME} lists it",
             metadata.counts.get(name),
         )
-        for name in names[:_MOST_MISSING]
+        for name in names[:_MAX_MISSING]
     ]
-    if more := names[_MOST_MISSING:]:
+    if more := names[_MAX_MISSING:]:
         counts = [metadata.counts.get(name) for name in more]
         known = [count for count in counts if count is not None]
         lost = sum(known) if len(known) == len(counts) else None

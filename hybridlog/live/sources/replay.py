@@ -39,7 +39,7 @@ _MAX_PAUSE_S: Final = 3600.0
 _BETWEEN_S: Final = 0.1  # from the last message of a round to the first of the next
 _LATE_S: Final = 0.5
 _LONG_S: Final = 60.0
-_AT_ONCE: Final = 1024  # messages between two reads of the clock
+_MAX_MESSAGES: Final = 1024  # messages between two reads of the clock
 _TICK_S: Final = 0.1
 _JOIN_S: Final = 5.0
 
@@ -313,7 +313,7 @@ class _Player:
                 if self._pause(float(due[at]) - now, int(times[at])):
                     return
                 continue
-            ready = min(ready, at + _AT_ONCE)
+            ready = min(ready, at + _MAX_MESSAGES)
             newest = int(times[ready - 1])
             # A message in the wrong place of the log is not played late.
             if newest >= self._newest:

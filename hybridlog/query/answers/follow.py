@@ -150,8 +150,8 @@ class Following(Planner, Iterator["Message"]):
         return self._scan
 
     def _count_unreadable(self, parts: Sequence[Part]) -> None:
-        for part in (part for part in parts if part.blind):
-            unseen = replace(part, channels=part.blind, blind=(), predicate=None)
+        for part in (part for part in parts if part.undecodable):
+            unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
             self.counters.unreadable += self._scan.count([unseen])
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.answers.lost import flush_interval_ns
-from hybridlog.query.intervals import MOST_PIECES, Intervals
+from hybridlog.query.intervals import MAX_PIECES, Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-_KEPT = 1_000_000  # times that are kept for a second look
+_MAX_SECOND_LOOK = 1_000_000  # times that are kept for a second look
 _Columns = dict[str, list["NDArray[Any]"]]
 
 
@@ -84,7 +84,7 @@ class Rates:
                 self._overall(stretch) if size is None else self._by_window(stretch, size)
             )
             rows += len(begin)
-            if rows > MOST_PIECES:
+            if rows > MAX_PIECES:
                 raise UsageError(f"There are {rows} windows; use a longer one or a time range.")
             labels.append((stretch.summary.label, stretch.topic, len(begin)))
             for name, values in (
@@ -157,7 +157,7 @@ class Rates:
 
     def _by_window(self, stretch: _Stretch, size: int) -> tuple[NDArray[Any], ...]:
         low, high = stretch.span
-        if (high - low) // size > MOST_PIECES:
+        if (high - low) // size > MAX_PIECES:
             raise UsageError(
                 f"There are {(high - low) // size} windows; use a longer one or a time range."
             )
@@ -200,12 +200,12 @@ class _Times:
         count = 0
         for times in self._read():
             count += len(times)
-            if count <= _KEPT:
+            if count <= _MAX_SECOND_LOOK:
                 kept.append(times)
             else:
                 kept.clear()
             yield times
-        self._kept = kept if count <= _KEPT else None
+        self._kept = kept if count <= _MAX_SECOND_LOOK else None
 
 
 def _longer(

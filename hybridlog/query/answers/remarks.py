@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _MOST = 100  # recordings looked at
-_SHOWN = 5  # names in a remark
+_MAX_NAMES = 5  # names in a remark
 _APART_NS = 86_400 * 10**9  # header stamps and log times this far apart have other epochs
 
 
@@ -57,7 +57,7 @@ def about_names(session: Session, question: Question, names: Sequence[str]) -> I
             others = [t for t in others if not places.isdisjoint(snapshot.having([t]).tolist())]
         others = [topic for topic in others if topic not in question.topics]
         if others:
-            yield f"{name!r} is the whole name of a topic; not asked: {listed(others, _SHOWN)}."
+            yield f"{name!r} is the whole name of a topic; not asked: {listed(others, _MAX_NAMES)}."
 
 
 def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:
@@ -115,7 +115,7 @@ def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> 
             known = _fields_in_tables(session, question, topic)
         for path in asked if known is not None else ():
             if not any(_is_near(path, name.replace("[]", "")) for name in known or ()):
-                near = difflib.get_close_matches(path, known or (), n=_SHOWN, cutoff=0.5)
+                near = difflib.get_close_matches(path, known or (), n=_MAX_NAMES, cutoff=0.5)
                 hint = f"; did you mean {', '.join(near)}?" if near else "."
                 yield f"No message of {topic} has a field {path!r}{hint}"
 
@@ -199,4 +199,4 @@ def _others(session: Session, question: Question) -> Iterator[str]:
         if each.summary.id not in (question.recordings or ())
     ]
     if labels:
-        yield f"Other recordings span that time: {listed(labels, _SHOWN)}."
+        yield f"Other recordings span that time: {listed(labels, _MAX_NAMES)}."

@@ -35,7 +35,7 @@ class Need(Enum):
     """References to the matching messages."""
 
 
-class Outcomes(NamedTuple):
+class MatchColumns(NamedTuple):
     """Result of a predicate for each message, in order of log time and arrival.
 
     Attributes:
@@ -86,7 +86,7 @@ class Engine(Protocol):
     def count(self, parts: Sequence[Part]) -> int:
         """Number of matching messages in all parts."""
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of the part's topic and time, whether it matches."""
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
@@ -112,7 +112,7 @@ class Checking(Protocol):
 class Counting:
     """An engine that only counts."""
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """Not supported: `cost` returns None."""
         raise NotImplementedError
 

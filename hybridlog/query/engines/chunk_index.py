@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_counts import Placed
-from hybridlog.query.engines.base import Need, Outcomes, Values
+from hybridlog.query.engines.base import MatchColumns, Need, Values
 from hybridlog_storage.times import inside
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class ChunkIndex:
             alike[part.recording.id, part.bounds, id(part.windows)].append(part)
         return sum(map(self._count, alike.values()))
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """All log times in the windows, sorted; arrival numbers are unknown and 0.
 
         Raises:
@@ -76,7 +76,7 @@ class ChunkIndex:
             found += [times[c.channel_id] for c in part.channels if c.channel_id in times]
         time = np.sort(np.concatenate(found))
         time = time[inside(time, windows)]
-        yield Outcomes(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
+        yield MatchColumns(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Not supported: `cost` returns None."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
-from hybridlog.query.engines.base import Need, Outcomes, Values
+from hybridlog.query.engines.base import MatchColumns, Need, Values
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, MessageRun
@@ -51,7 +51,7 @@ class PayloadScan:
         scan = ChunkScan(self.plan(parts), self._session.segment)
         return sum(len(run.batch) for run in scan.unordered())
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """Read the messages in order and decide on each."""
         from hybridlog.index.indexing import rows_by_channel
 
@@ -66,7 +66,7 @@ class PayloadScan:
                     )
                     holds[rows] = found.holds
                     self._counters.unreadable += found.unreadable
-            yield Outcomes(run.batch.log_time, run.seq, holds)
+            yield MatchColumns(run.batch.log_time, run.seq, holds)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Read the messages that match in order and decode the fields."""

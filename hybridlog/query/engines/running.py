@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog.query.chunk_scan import RowSelection
-from hybridlog.query.engines.base import Need, Outcomes, Values
+from hybridlog.query.engines.base import MatchColumns, Need, Values
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.message_filter import MessageFilter
@@ -77,7 +77,7 @@ class RunningTables:
         sealed = self._tables.count([one.sealed for one in halves])
         return sealed + sum(self._scan.count([one.rest]) for one in halves)
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """The outcomes of both halves."""
         halves = self._of(part)
         return chain(self._tables.outcomes(halves.sealed), self._scan.outcomes(halves.rest))

@@ -11,8 +11,8 @@ import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
 from hybridlog.query.engines.base import (
+    MatchColumns,
     Need,
-    Outcomes,
     UndecidedError,
     Values,
     offsets_by_chunk,
@@ -68,7 +68,7 @@ class TablesEngine:
         self._table_of = table_of or (lambda part: session.table(part.recording, part.topic))
         self._counters = counters
         self._counts: dict[Part, _Count] = {}
-        self._told: set[Part] = set()
+        self._counted: set[Part] = set()
         self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
 
     _byte_s = _BYTE_S
@@ -101,7 +101,7 @@ class TablesEngine:
         if is_lossy or (need is Need.VALUES and not self._are_whole(part, fields)):
             return None
         table = self._table_of(part)
-        is_whole = table is not None and not (table.reduced or part.blind)
+        is_whole = table is not None and not (table.reduced or part.undecodable)
         if table is None or not is_whole or (table.unreadable and part.predicate is None):
             return None  # fields of such messages are not in the table
         # A table may be older than the package that reads the messages.
@@ -185,8 +185,8 @@ class TablesEngine:
     def _tell_unreadable(self, parts: Sequence[Part]) -> None:
         """Count the unreadable messages of parts that are answered, once."""
         for part in parts:
-            if part not in self._told:
-                self._told.add(part)
+            if part not in self._counted:
+                self._counted.add(part)
                 self._counters.unreadable += self._counts[part].unreadable
 
     def _confirm(self, parts: Sequence[Part]) -> None:
@@ -196,11 +196,11 @@ class TablesEngine:
                 self.check(part)
                 self._tell_unreadable([part])
 
-    def outcomes(self, part: Part) -> Iterator[Outcomes]:
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """The outcome for each row, in order."""
         self._confirm([part])
         for rows, holds in self._rows(part, every=True):
-            yield Outcomes(rows.t, rows.seq, holds)
+            yield MatchColumns(rows.t, rows.seq, holds)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Columns of the rows for which the predicate holds, in order."""

@@ -30,7 +30,7 @@ Kind = Literal["number", "string", "bool", "time", "date", "other"]
 
 STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 """Names of the statistics in the summary of an array."""
-_SHOWN = 10
+_MAX_NAMES = 10
 _ANY_ELEMENT = re.compile(r"\[\*?\]")
 _KINDS: dict[str, Kind] = {
     "bool": "bool",
@@ -198,7 +198,7 @@ class _Checker:
             return
         below = [name for name in self._types.types if name.startswith(f"{path}.")]
         leaves = [name for name in below if name not in self._types.inner]
-        names = listed(leaves, _SHOWN)
+        names = listed(leaves, _MAX_NAMES)
         raise self._fail(
             asked, f"{path} is a message, not a value; ask for one of its fields: {names}"
         )
@@ -235,10 +235,10 @@ class _Checker:
         near = [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
         near += [
             lowered[key]
-            for key in difflib.get_close_matches(path.lower(), lowered, n=_SHOWN, cutoff=0.5)
+            for key in difflib.get_close_matches(path.lower(), lowered, n=_MAX_NAMES, cutoff=0.5)
         ]
         shown = list(dict.fromkeys(near or known))
-        names = listed(shown, _SHOWN)
+        names = listed(shown, _MAX_NAMES)
         hint = f"; did you mean {names}?" if near else f"; there are {names}" if shown else ""
         return self._fail(asked, f"there is no field {path}{hint}")
 

@@ -3,7 +3,7 @@
 const SECOND = 1e9;
 const DAY = 86400 * SECOND;
 const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200];
-const MOST_TICKS = 1000;
+const MAX_TICKS = 1000;
 
 /** The step between ticks that are at least so far apart, ns. */
 export function stepOf(least) {
@@ -24,7 +24,7 @@ export function ticksOf(begin, end, step) {
   const found = [];
   const first = Math.ceil(begin / step) * step;
   // Counted from the first one: far from the start, numbers are too coarse to count steps.
-  for (let n = 0; first + n * step <= end && n < MOST_TICKS; n++) found.push(first + n * step);
+  for (let n = 0; first + n * step <= end && n < MAX_TICKS; n++) found.push(first + n * step);
   return found;
 }
 

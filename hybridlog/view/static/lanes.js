@@ -5,9 +5,9 @@ import { notice } from "./dom.js";
 import { clamped } from "./range.js";
 import { instant } from "./state.js";
 
-const MOST_LANES = 64;
-const MOST_PIXELS = 8192;
-const MOST_BINS = 1 << 17;
+const MAX_LANES = 64;
+const MAX_PIXELS = 8192;
+const MAX_BINS = 1 << 17;
 const LATEST = 2n ** 63n - 1n; // ns
 
 /**
@@ -108,7 +108,7 @@ export class Lanes {
   }
 
   async fetch({ begin, end, pixels, topics }) {
-    const asked = topics.slice(0, MOST_LANES);
+    const asked = topics.slice(0, MAX_LANES);
     // As much again at both sides, so that moving the picture shows something at once.
     const { info } = this.recording;
     const margin = (end - begin) / 2;
@@ -116,7 +116,7 @@ export class Lanes {
     const [low, high] = isWhole
       ? [info.begin, info.end > info.begin ? info.end : info.begin + 1n]
       : [begin - margin, end + margin].map((time) => clamped(instant(time), -LATEST, LATEST));
-    const most = Math.min(MOST_PIXELS, Math.floor(MOST_BINS / asked.length));
+    const most = Math.min(MAX_PIXELS, Math.floor(MAX_BINS / asked.length));
     const answer = await bytes(
       "timeline",
       {

@@ -6,7 +6,7 @@ import * as state from "./state.js";
 import { count, counted, duration, moment, size } from "./words.js";
 
 const ROWS = 100;
-const MOST_ROWS = 200; // of an answer
+const MAX_ROWS = 200; // of an answer
 const EVERY_MS = 3000;
 const REST = 10; // times as long as the last answer took
 
@@ -143,7 +143,7 @@ export function mountList(main) {
 
   /** Recordings that were made since are in the list, too. */
   function look() {
-    if (document.hidden || shown > MOST_ROWS) looking = setTimeout(look, EVERY_MS);
+    if (document.hidden || shown > MAX_ROWS) looking = setTimeout(look, EVERY_MS);
     else load(false, false);
   }
 

@@ -6,7 +6,7 @@ import { exactRange } from "./range.js";
 import * as state from "./state.js";
 
 const NAME = "matches";
-const MOST_PIXELS = 2048;
+const MAX_PIXELS = 2048;
 const PAUSE_MS = 40;
 
 /** The question as the server takes it; null if there is none, or one in SQL. */
@@ -43,7 +43,7 @@ export function drawMatches(recording) {
       overlays.draw(NAME, null);
       return;
     }
-    const pixels = Math.min(window.innerWidth, MOST_PIXELS);
+    const pixels = Math.min(window.innerWidth, MAX_PIXELS);
     const picture = { ...exactRange(recording), pixels };
     try {
       const ask = recording.isUpdating ? "update" : "ask";

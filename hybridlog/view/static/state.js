@@ -12,7 +12,7 @@
  */
 
 const EMPTY = { recording: "", begin: null, end: null, at: 0n, seq: null, panels: null, ask: null };
-const MOST_PANELS = 24;
+const MAX_PANELS = 24;
 
 let values = { ...EMPTY };
 const listeners = [];
@@ -134,7 +134,7 @@ function panelsFrom(found) {
   const isPanel = (one) => typeof one?.kind === "string" && typeof one?.topic === "string";
   return found
     .filter(isPanel)
-    .slice(0, MOST_PANELS)
+    .slice(0, MAX_PANELS)
     .map(({ kind, topic, options }) => ({ kind, topic, options: isPlain(options) ? options : {} }));
 }
 

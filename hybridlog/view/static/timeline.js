@@ -14,7 +14,7 @@ import { count, counted, duration, moment, offset } from "./words.js";
 import { groupOf, shortType } from "./topic_groups.js";
 
 const AXIS = 30;
-const MOST_SHOWN = 12; // lanes that are seen without scrolling
+const MAX_SHOWN = 12; // lanes that are seen without scrolling
 const NARROW = matchMedia("(max-width: 40rem)");
 const DARK = matchMedia("(prefers-color-scheme: dark)");
 const CLICK = 4; // pixels that a click may move
@@ -89,7 +89,7 @@ export function mountTimeline(parent, recording) {
     corner.textContent = `${count(topics.length)} ${words}`;
     const height = rowHeight();
     for (const one of [scroller, canvas]) {
-      one.style.setProperty("height", `${Math.min(topics.length, MOST_SHOWN) * height}px`);
+      one.style.setProperty("height", `${Math.min(topics.length, MAX_SHOWN) * height}px`);
     }
     names.style.setProperty("height", `${topics.length * height}px`);
     readMarks();

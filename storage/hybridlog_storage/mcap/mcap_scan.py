@@ -76,7 +76,7 @@ _WINDOW = 1 << 20
 _MAX_PLAIN = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY = 1 << 28
 _ANOTHER = MAGIC + bytes([Opcode.HEADER])  # the beginning of another file
-_AT_ONCE = 64 << 20  # content of a chunk that is decompressed at once
+_MAX_WHOLE_BYTES = 64 << 20  # content of a chunk that is decompressed at once
 
 _DATA_OPCODES = frozenset(
     {
@@ -150,7 +150,7 @@ class ScannedChunk:
         Raises:
             SegmentError: The rest does not decompress, or is not believed.
         """
-        if max(self.uncompressed_size, len(self.part)) <= _AT_ONCE:
+        if max(self.uncompressed_size, len(self.part)) <= _MAX_WHOLE_BYTES:
             yield parse_content(self.content_bytes(), most=MIN_RECORDS + len(self.part))
             return
         if self.uncompressed_size > self.limit:

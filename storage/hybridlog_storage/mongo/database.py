@@ -63,7 +63,7 @@ BATCH_DOCUMENTS = 5000
 OLDEST_SERVER = (5, 3)
 """The first MongoDB with clustered collections."""
 
-_MOST_TOGETHER = 100
+_MAX_TOGETHER = 100
 """Most questions in one command."""
 _BYTES_TOGETHER = 4 << 20
 
@@ -860,7 +860,7 @@ def _together(
         return
     with _mapped("MongoDB", question=True):
         size = max(len(encode(query)) for _, query in questions)
-    step = max(1, min(_MOST_TOGETHER, _BYTES_TOGETHER // size))
+    step = max(1, min(_MAX_TOGETHER, _BYTES_TOGETHER // size))
     for first in range(0, len(questions), step):
         yield first, questions[first : first + step]
 

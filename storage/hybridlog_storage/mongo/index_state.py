@@ -25,7 +25,9 @@ from hybridlog_storage.mongo.topic_places import SHARED, TopicPlace, text_of
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 STORE: Final = f"{CATALOG_PREFIX}store"
 """Collection that names the store that owns a database."""
-_AT_ONCE: Final = 500  # entries decoded at once; each takes some kilobytes as a dictionary
+_ENTRIES_PER_BATCH: Final = (
+    500  # entries decoded at once; each takes some kilobytes as a dictionary
+)
 
 State = Literal["open", "clearing", "indexing", "complete", "removing"]
 """State of a recording's index: being recorded, documents being removed for a rebuild, being
@@ -40,9 +42,9 @@ _UNCERTAIN_CHANNEL: Final = [
 ]
 _TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
-_MOST_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
+_MAX_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
 _OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
-_SHOWN: Final = (
+_MAX_NAMES: Final = (
     "label",
     "name",
     "tags",
@@ -103,7 +105,7 @@ class Indexed:
     def mirrors(self, entry: RecordingEntry) -> bool:
         """True if the mirror of a recording with the same segments is current."""
         document = _mirrored(entry)
-        return all(self.shown.get(name) == document[name] for name in _SHOWN)
+        return all(self.shown.get(name) == document[name] for name in _MAX_NAMES)
 
     def is_whole(self, entry: RecordingEntry) -> bool:
         """True if the index of a recording is complete and current."""
@@ -131,9 +133,9 @@ class IndexState:
         """The index states of these recordings, or of all, by key."""
         asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
-        wanted = {"id": 1, "index": 1, **dict.fromkeys((*_OF_CHANNELS, *_SHOWN), 1)}
+        wanted = {"id": 1, "index": 1, **dict.fromkeys((*_OF_CHANNELS, *_MAX_NAMES), 1)}
         for document in self._db.find(
-            RECORDINGS, asked, wanted, batch_size=_AT_ONCE, read="majority"
+            RECORDINGS, asked, wanted, batch_size=_ENTRIES_PER_BATCH, read="majority"
         ):
             index = document.get("index") or {}
             channels = document.get("channels") or ()
@@ -149,7 +151,7 @@ class IndexState:
                 int(index.get("turn", 0)),
                 tuple(sorted(topics)),
                 (min(firsts), max(lasts)) if firsts and lasts else None,
-                {name: document.get(name) for name in _SHOWN},
+                {name: document.get(name) for name in _MAX_NAMES},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
                 Through(**index["through"]) if "through" in index else NOTHING,
             )
@@ -320,7 +322,7 @@ def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
         for channel in entry.channels
         for part in (channel.topic, channel.reason or "", *chain(*channel.metadata.items()))
     )
-    if len(entry.channels) * _CHANNEL_BYTES + sum(text) > _MOST_CHANNEL_BYTES:
+    if len(entry.channels) * _CHANNEL_BYTES + sum(text) > _MAX_CHANNEL_BYTES:
         document["channels"] = [{"topic": channel.topic} for channel in entry.channels]
     return document
 

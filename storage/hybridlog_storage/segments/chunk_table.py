@@ -63,7 +63,7 @@ _DTYPES = (CHUNK, PART, OTHER)
 _MAX_BYTES = 1 << 28
 _MAX_FILE = 1 << 62
 _MAX_CHANNEL = 65535
-_FEW = 32  # messages
+_MAX_LIST_MESSAGES = 32  # messages
 _MERGED = 1 << 16  # bytes: checking one record reads its whole stretch
 
 
@@ -224,7 +224,7 @@ def parts_of(batch: Batch, order: NDArray[np.intp]) -> tuple[NDArray[np.void], i
     """
     first, last = order[0], order[-1]
     if batch.channel[first] == batch.channel[last]:  # as in most chunks
-        few = len(order) <= _FEW  # for few rows lists are faster
+        few = len(order) <= _MAX_LIST_MESSAGES  # for few rows lists are faster
         length = batch.length.tolist() if few else batch.length
         publish = batch.publish_time.tolist() if few else batch.publish_time
         times = int(batch.log_time[first]), int(batch.log_time[last])

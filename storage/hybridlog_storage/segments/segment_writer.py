@@ -39,15 +39,15 @@ if TYPE_CHECKING:
     _Count = TypeVar("_Count", int, NDArray[np.int64])
 from hybridlog_storage.threads import Threads
 
-_MOST_CHUNKS = 1 << 14  # chunks of a segment: its reader needs a kilobyte of memory for each
-_MOST_PARTS = 1 << 20  # sum over a segment's chunks of their channels, which the summary lists
+_MAX_CHUNKS = 1 << 14  # chunks of a segment: its reader needs a kilobyte of memory for each
+_MAX_PARTS = 1 << 20  # sum over a segment's chunks of their channels, which the summary lists
 PACKERS = 2
 """Threads that pack chunks."""
 AT_WORK = 8
 """Closed chunks that may be in work before the writer counts as late."""
 _TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
 _SHARED = -1
-_MOST_SPAN = 3600 * 10**9  # ns
+_MAX_SPAN = 3600 * 10**9  # ns
 _PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
 _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
@@ -87,7 +87,7 @@ class SegmentSettings:
     def __post_init__(self) -> None:
         if not 1 << 10 <= self.chunk_size <= 1 << 28:
             raise UsageError("the chunk size must lie between 1 KiB and 256 MiB")
-        if not 0 < self.chunk_span_ns <= _MOST_SPAN:
+        if not 0 < self.chunk_span_ns <= _MAX_SPAN:
             raise UsageError("a chunk must last longer than no time, and an hour at most")
         if not 1 <= self.level <= 19:
             raise UsageError("the zstd level must lie between 1 and 19")
@@ -121,12 +121,12 @@ class RecordingWriter:
         recording: Catalog entry stored in every segment.
         on_chunk: Called on a writer thread, in file order, with every chunk in the file.
         settings: How to divide and compress.
-        hurry: Returns whether to compress only chunks that shrink to a fifth or less; None
-            for never.
+        skip_compression: Returns whether to compress only chunks that shrink to a fifth or
+            less; None for never.
         next_chunk_size: Returns the size in bytes of the next chunk; None for the size in
             the settings.
-        spare: Semaphore of the processors for work that can wait. Packing a chunk takes one
-            if there is no hurry, and waits for it a tenth of a second at most.
+        cpu_slots: Semaphore of the processors for work that can wait. Packing a chunk takes one
+            if there is no skip_compression, and waits for it a tenth of a second at most.
         on_written: Called on a writer thread when less content is waiting. With it `append`
             never waits for the disk, and the caller watches `waiting`. Without it `append`
             waits for a slow disk.
@@ -144,9 +144,9 @@ class RecordingWriter:
         on_chunk: Callable[[StoredChunk, Mapping[int, Channel]], None],
         settings: SegmentSettings | None = None,
         *,
-        hurry: Callable[[], bool] | None = None,
+        skip_compression: Callable[[], bool] | None = None,
         next_chunk_size: Callable[[], int] | None = None,
-        spare: BoundedSemaphore | None = None,
+        cpu_slots: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
         no_index: Callable[[str], bool] | None = None,
         on_sealing: OnSealing | None = None,
@@ -167,8 +167,8 @@ class RecordingWriter:
         self._compressor = Compressor(self.settings.compression, self.settings.level)
         self._pool = Threads(PACKERS, "hybridlog-pack")
         self._disk = Threads(1, "hybridlog-disk")
-        self._hurry = hurry or (lambda: False)
-        self._spare = spare or BoundedSemaphore(PACKERS)
+        self._skip_compression = skip_compression or (lambda: False)
+        self._cpu_slots = cpu_slots or BoundedSemaphore(PACKERS)
         chunk_size = self.settings.chunk_size
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
@@ -314,7 +314,7 @@ class RecordingWriter:
             self._shut_down()
         return self._closed
 
-    def give_up(self, extras: Sequence[Metadata]) -> None:
+    def close_truncated(self, extras: Sequence[Metadata]) -> None:
         """Seal the chunks in the file and drop the others, after a failed write.
 
         Args:
@@ -452,21 +452,21 @@ class RecordingWriter:
         for lock in copying:
             lock.acquire()
         # Checked here: topics of equal rate close their chunks at the same time, and the
-        # hurry shows only when most of these are waiting.
-        hurried = self._hurry()
+        # skip_compression shows only when most of these are waiting.
+        hurried = self._skip_compression()
         with nullcontext() if hurried else self._turn():
-            hurried = hurried or self._hurry()
+            hurried = hurried or self._skip_compression()
             return pack(self._compressor, batch, seq, size, hurried=hurried)
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
         """Hold a spare processor, if one is free soon."""
-        has_one = self._spare.acquire(timeout=_TURN_S)
+        has_one = self._cpu_slots.acquire(timeout=_TURN_S)
         try:
             yield
         finally:
             if has_one:
-                self._spare.release()
+                self._cpu_slots.release()
 
     # The methods below run on the writing thread only.
 
@@ -537,7 +537,7 @@ class RecordingWriter:
         span = self.settings.segment_span_s
         is_old = span is not None and time.monotonic() - self._opened >= span
         is_full = segment.position >= self.settings.segment_size
-        has_many = segment.chunks >= _MOST_CHUNKS or segment.table.parts >= _MOST_PARTS
+        has_many = segment.chunks >= _MAX_CHUNKS or segment.table.parts >= _MAX_PARTS
         if is_old or is_full or has_many:
             self._seal()
 

@@ -2,7 +2,7 @@
 
 import { element, fill } from "../dom.js";
 
-const MOST_SHOWN = 300;
+const MAX_SHOWN = 300;
 let made = 0;
 
 /**
@@ -64,7 +64,7 @@ export function fieldPicker({ most, choose }) {
 
   function draw() {
     const fields = found();
-    const rows = fields.slice(0, MOST_SHOWN).map(({ path, type }) => {
+    const rows = fields.slice(0, MAX_SHOWN).map(({ path, type }) => {
       const isChosen = chosen.includes(path);
       const box = element("input", {
         type: "checkbox",

@@ -3,8 +3,8 @@
 import { ApiError } from "../api.js";
 import { instant } from "../state.js";
 
-const MOST_KEPT = 64;
-const MOST_BYTES = 64 << 20;
+const MAX_KEPT = 64;
+const MAX_BYTES = 64 << 20;
 const STILL_PLAYING = 160; // ms between two steps of a cursor that plays
 
 /**
@@ -63,9 +63,9 @@ export function follow({ load, show, fail, panel }) {
   }
 
   function keep(answer) {
-    kept = [answer, ...kept].slice(0, MOST_KEPT);
+    kept = [answer, ...kept].slice(0, MAX_KEPT);
     let bytes = 0;
-    kept = kept.filter(({ size }, place) => (bytes += size ?? 0) <= MOST_BYTES || !place);
+    kept = kept.filter(({ size }, place) => (bytes += size ?? 0) <= MAX_BYTES || !place);
   }
 
   function received(answer, at) {

@@ -17,7 +17,7 @@ const accepts = ofTypes(
 const LEVELS = ["debug", "info", "warning", "error", "fatal"];
 const ROW = 22; // pixels; the style sheet says the same
 const PAGE = 200; // lines of a request
-const MOST_LINES = 2000;
+const MAX_LINES = 2000;
 const BEYOND = 10; // lines above and below what is seen
 const TYPING = 250; // ms
 
@@ -152,12 +152,12 @@ function mount(body, panel) {
         lines = [...found.lines, ...lines];
         isFirst = found.first;
         view.scrollTop += found.lines.length * ROW;
-        if (lines.length > MOST_LINES) isLast = false;
-        lines = lines.slice(0, MOST_LINES);
+        if (lines.length > MAX_LINES) isLast = false;
+        lines = lines.slice(0, MAX_LINES);
       } else {
         lines = [...lines, ...found.lines];
         isLast = found.last;
-        const surplus = Math.max(lines.length - MOST_LINES, 0);
+        const surplus = Math.max(lines.length - MAX_LINES, 0);
         if (surplus) isFirst = false;
         lines = lines.slice(surplus);
         view.scrollTop -= surplus * ROW;

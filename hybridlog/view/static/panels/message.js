@@ -8,7 +8,7 @@ import { literal, moment, opening } from "./python.js";
 
 const PART = { texts: 100, items: 20, text: 1000 }; // elements, fields or characters of a part
 const OPEN_LEVELS = 3;
-const MOST_REMEMBERED = 40;
+const MAX_REMEMBERED = 40;
 
 export default {
   kind: "message",
@@ -79,7 +79,7 @@ function mount(body, panel) {
       const name = names.join(".");
       const rest = toggled().filter((one) => one !== name);
       const isUsual = isOpen === names.length < OPEN_LEVELS;
-      panel.setOptions({ toggled: isUsual ? rest : [...rest, name].slice(-MOST_REMEMBERED) });
+      panel.setOptions({ toggled: isUsual ? rest : [...rest, name].slice(-MAX_REMEMBERED) });
     },
   };
 

@@ -10,9 +10,9 @@ import { literal, moment, opening } from "./python.js";
 
 const USUAL_FIELDS = 3;
 const FIRST = "ranges.min"; // how near something is
-const MOST_FIELDS = 16;
+const MAX_FIELDS = 16;
 const COLOURS = 8; // classes `series-0` and so on of the style sheet
-const MOST_PIXELS = 4096;
+const MAX_PIXELS = 4096;
 const SHARED_CURSOR = "time";
 const LEAST_DRAG = 5; // pixels; less is a click
 
@@ -39,7 +39,7 @@ export default {
 /** The fields that the options of a panel name; null if they name none. */
 function fieldsOf({ fields }) {
   if (!Array.isArray(fields)) return null;
-  return fields.filter((one) => typeof one === "string").slice(0, MOST_FIELDS);
+  return fields.filter((one) => typeof one === "string").slice(0, MAX_FIELDS);
 }
 
 function mount(body, panel) {
@@ -55,7 +55,7 @@ function mount(body, panel) {
   let isGone = false;
 
   const picker = fieldPicker({
-    most: MOST_FIELDS,
+    most: MAX_FIELDS,
     choose: (fields) => panel.setOptions({ fields }),
   });
   body.append(element("div", { class: "legend-line" }, legend, picker.dom), problem, place);
@@ -96,7 +96,7 @@ function mount(body, panel) {
   async function ask() {
     const { begin, end } = panel.range();
     const names = fields();
-    const pixels = Math.min(Math.max(Math.round(place.clientWidth), 1), MOST_PIXELS);
+    const pixels = Math.min(Math.max(Math.round(place.clientWidth), 1), MAX_PIXELS);
     const { info, start } = panel.recording;
     const isOpen = info.status === "open";
     const now = JSON.stringify([`${begin} ${end} ${start}`, names, pixels, isOpen && info.messages]);

@@ -5,7 +5,7 @@ import { Colours } from "../paint.js";
 import { onTheme } from "./colours.js";
 
 const LEAST_SCALE = 1e-6; // pixels a metre
-const MOST_SCALE = 1e5;
+const MAX_SCALE = 1e5;
 const GRID_PIXELS = 70; // least distance of lines
 const MARGIN = 1.15;
 const STEP = 0.12; // part of the picture that an arrow key moves it by
@@ -237,7 +237,7 @@ export function follow(canvas, { drag, zoom, reset, click, keys }) {
 }
 
 function bounded(scale) {
-  return Math.min(Math.max(scale, LEAST_SCALE), MOST_SCALE);
+  return Math.min(Math.max(scale, LEAST_SCALE), MAX_SCALE);
 }
 
 function paintGrid(context, view, centre) {

@@ -26,7 +26,7 @@ BUDGET = 256 << 20
 """Maximum number of queued bytes."""
 
 _BATCH = 1 << 20
-_AT_ONCE = 64
+_MAX_BUFFERS = 64
 
 
 class Refusal:
@@ -119,7 +119,7 @@ class Outbox:
         buffers = self._buffers
         while buffers:
             try:
-                done = self._peer.sendmsg(list(islice(buffers, _AT_ONCE)))
+                done = self._peer.sendmsg(list(islice(buffers, _MAX_BUFFERS)))
             except BlockingIOError:
                 return False
             self.waiting -= done

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros2.child.middleware import Offer, Subscription
     from hybridlog.live.sources.ros2.child.outbox import Outbox
 
-_AT_ONCE = 1000
+_MAX_MESSAGES = 1000
 _BYTES_AT_ONCE = 8 << 20
 
 _DOUBT_S = 30.0
@@ -135,7 +135,7 @@ class Stream:
         """
         if self._old is not None:
             count, size = self._take(self._old, outbox)
-            if count < _AT_ONCE and time.monotonic() >= self._old_until:
+            if count < _MAX_MESSAGES and time.monotonic() >= self._old_until:
                 self.close_old()
             more, more_size = self._take(self.subscription, outbox)
             return count + more, size + more_size
@@ -144,7 +144,7 @@ class Stream:
     def _take(self, subscription: Subscription, outbox: Outbox) -> tuple[int, int]:
         take, put, gaps = subscription.take, outbox.message, self._gaps
         count = size = 0
-        while count < _AT_ONCE and size < _BYTES_AT_ONCE:
+        while count < _MAX_MESSAGES and size < _BYTES_AT_ONCE:
             got = take()
             if got is None:
                 break
