@@ -193,7 +193,7 @@ def stop(frame, event, argument):
         sys.setprofile(None)
         os.kill(os.getpid(), signal.SIGINT)
 
-FILES = ("base.py", "raw.py", "bag.py", "unfinished.py")
+FILES = ("formats/writing.py", "formats/raw.py", "rosbag1/writer.py", "unfinished.py")
 MOMENT = sys.argv.pop(1)
 sys.setprofile(stop)
 from hybridlog.cli import main

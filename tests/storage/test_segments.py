@@ -301,8 +301,8 @@ def test_no_more_threads_pack_than_may_but_in_a_hurry(
         RECORDING,
         lambda *_: None,
         SegmentSettings(chunk_size=1 << 10),
-        hurry=lambda: hurried,
-        spare=threading.BoundedSemaphore(spare),
+        skip_compression=lambda: hurried,
+        cpu_slots=threading.BoundedSemaphore(spare),
         on_written=lambda: None,
     )
     payloads = [bytes([n]) * 1024 for n in range(4)]
@@ -321,7 +321,7 @@ def test_packing_does_not_wait_for_who_keeps_all_processors(tmp_path: Path) -> N
             RECORDING,
             lambda *_: None,
             SegmentSettings(chunk_size=1 << 10),
-            spare=spare,
+            cpu_slots=spare,
             on_written=lambda: None,
         )
         for n in range(4):
@@ -380,7 +380,7 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
         RECORDING,
         lambda c, _: chunks.append(c),
         SegmentSettings(chunk_size=COPIED_AT_ONCE),
-        hurry=lambda: hurried,
+        skip_compression=lambda: hurried,
         on_written=lambda: None,
     )
     pieces = range(COPIED_AT_ONCE >> 10)
