@@ -359,7 +359,7 @@ def bench_moment(case: str, store: Any, benchmark: Any) -> None:
 
     def forget() -> None:
         if case == "elsewhere":
-            store.session.recent_chunks.clear()
+            store.session.cache.drop("chunk")
 
     def look() -> Any:
         return store.topic("/scan").at(next(moments)).decode()

@@ -405,6 +405,7 @@ EXEMPT: dict[str, str] = {
     "open": "it opens a program with a slice, which `fetch -o` makes",
     "trust": "it is about servers",
     "demo": "it makes a recording",
+    "tf": "these recordings have no transforms; see tests/tf/test_tree.py",
     "tables": "it names the files of recordings that have ended",
 }
 """Commands without a rule here, and why."""

@@ -152,7 +152,7 @@ def test_tables_are_what_the_messages_say(
     pending: int,
 ) -> None:
     monkeypatch.setattr(writing, "_ARENA", arena)
-    monkeypatch.setattr(writing, "_ENOUGH", enough)
+    monkeypatch.setattr(writing, "_MIN_IN_PLACE_BYTES", enough)
     monkeypatch.setattr(writing, "_ROWS", rows)
     monkeypatch.setattr(writing, "_PENDING", pending)
     monkeypatch.setattr(writing, "_LEFT", pending // 4)

@@ -322,7 +322,7 @@ def test_only_what_is_wanted_is_played(tmp_path: Path) -> None:
 
 def test_falling_behind_is_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay, "_LATE_S", 0.0)
-    monkeypatch.setattr(replay, "_AT_ONCE", 10)
+    monkeypatch.setattr(replay, "_MAX_MESSAGES", 10)
     path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"x") for at in range(100)])
     heard = Heard()
     play(path, heard)
