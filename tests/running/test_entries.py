@@ -103,6 +103,25 @@ def test_what_is_sealed_while_it_is_listed_counts_once(
     check(running.follow(directory))
 
 
+@pytest.mark.parametrize("age_s", [0, 1])
+def test_a_segment_that_begins_in_the_tick_of_a_look_is_found(
+    running: Running, monkeypatch: pytest.MonkeyPatch, age_s: int
+) -> None:
+    """The directory looks the same then; after a while it does not."""
+    directory = StoreDirectory(running.path)
+    listing = directory.listing("live")
+    changed = time.time_ns() - age_s * 10**9
+    look = f"1 {changed} {changed} 2 3 {changed} {changed}"
+    monkeypatch.setattr(directory, "looks", lambda _: {"live": look})
+    monkeypatch.setattr(directory, "listing", lambda _: replace(listing, open={}))
+    follower = RunningRecording(directory, "live", lambda: running.sealed)
+    follower.follow()
+    monkeypatch.setattr(directory, "listing", lambda _: listing)
+    assert follower.follow() == (age_s == 0)
+    assert follower.entry is not None
+    assert (follower.entry.messages == COUNT) == (age_s == 0)
+
+
 def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:
     found = running.follow(StoreDirectory(running.path))
     for number, first, last in found.spans:

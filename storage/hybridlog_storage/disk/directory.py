@@ -614,6 +614,16 @@ def _look(about: os.stat_result, journal: str, fd: int) -> str:
     return f"{look} {lines.st_ino} {lines.st_size} {lines.st_mtime_ns} {lines.st_ctime_ns}"
 
 
+def is_settled(look: str) -> bool:
+    """False if the look is so new that it would be the same after another change.
+
+    Args:
+        look: Of `StoreDirectory.looks`.
+    """
+    times = look.split()[2::4]  # of the directory, and of the journal if there is one
+    return all(abs(time.time_ns() - int(one)) > _TICK_NS for one in times)
+
+
 def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_result]:
     """Files of payloads of a recording, by path below their folder.
 
