@@ -270,15 +270,15 @@ def test_recordings_are_deleted_by_choice(tmp_path: Path) -> None:
 
 
 def test_who_is_asked_sees_what_goes(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hybridlog.cli import rm
+    from hybridlog.cli import edit
 
     shown: list[str] = []
-    monkeypatch.setattr(rm.output, "note", shown.append)
-    monkeypatch.setattr(rm.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
-    monkeypatch.setattr(rm.click, "confirm", lambda text, err: shown.append(text) or False)
+    monkeypatch.setattr(edit.output, "note", shown.append)
+    monkeypatch.setattr(edit.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
+    monkeypatch.setattr(edit.click, "confirm", lambda text, err: shown.append(text) or False)
     many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
-    with pytest.raises(rm.click.exceptions.Exit):
-        rm._confirm(["twin"], many)
+    with pytest.raises(edit.click.exceptions.Exit):
+        edit._confirm(["twin"], many)
     assert shown[0] == "  twin: a copy"
     assert shown[1] == "  r0: 2025-06-03T00:00:00Z, 1 message, 1 B"
     assert shown[-3:] == [

@@ -120,7 +120,9 @@ def test_shares_of_chunks_and_tables(store: hl.Store) -> None:
     assert abs(rows["one", "/a"].table_bytes - rows["one", "/b"].table_bytes) <= 1
     # Recordings share a file by their rows.
     share = rows["two", "/a"].table_bytes / rows["two", "/a"].messages
-    assert abs(rows["one", "/a"].table_bytes - share * rows["one", "/a"].messages) <= 1
+    assert (
+        abs(rows["one", "/a"].table_bytes - share * rows["one", "/a"].messages) < 1.5
+    )  # both are rounded
 
 
 def stats_of(documents: int, storage: int, index: int = 0) -> CollectionStats:

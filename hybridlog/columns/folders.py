@@ -391,6 +391,14 @@ def shared_files(root: Path, folder: str, recording: str = "") -> dict[str, set[
     return found
 
 
+def list_bytes(folder: Path) -> int:
+    """Bytes of the list beside a folder; 0 without one."""
+    try:
+        return files.status(_list_of(folder), depth=IN_TABLES).st_size
+    except OSError:
+        return 0
+
+
 def _list_of(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.recordings")
 

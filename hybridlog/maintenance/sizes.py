@@ -195,17 +195,20 @@ def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
 
 def _table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
     """Bytes of the tables by recording and topic: their share of the rows of each file."""
-    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.folders import files_of, list_bytes
 
     found: Counter[tuple[str, str]] = Counter()
     types = {type_prefix(channel.type) for entry in entries for channel in entry.channels}
+    lists: dict[Path, int] = {}  # which belong to the first file of their folder
     for file in files_of(root, types):
+        folder = file.path.parent
+        more = 0 if folder in lists else lists.setdefault(folder, list_bytes(folder))
         rows = {
             (section.id, topic): counts.rows
             for section in file.about.recordings
             for topic, counts in section.topics.items()
         }
-        found.update(_divided(file.size_bytes, rows))
+        found.update(_divided(file.size_bytes + more, rows))
     return found
 
 

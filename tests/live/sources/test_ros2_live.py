@@ -296,8 +296,6 @@ def test_all_that_an_overloaded_publisher_sent_has_come_or_is_counted(
         assert len(came) + sum(counts) == came[-1] - came[0] + 1 + head(memory, name)
         assert came[-1] <= sent[name]
     assert {lost.cause for lost in memory.losses} <= {Cause.TRANSPORT, Cause.QUEUE}
-    if transports:
-        assert memory.losses
 
 
 def test_publishers_that_come_again_are_accused_of_nothing(python: str, talker: Robot) -> None:
