@@ -71,10 +71,9 @@ class TumWriter(_RowWriter):
     """Writes poses as lines of `time x y z qx qy qz qw`, s and m, which evo reads."""
 
     def _columns(self, names: Sequence[str]) -> list[str]:
-        time = next((name for name in _TIMES if name in names), None)
-        for pose in _poses_among(names):
-            if time is not None:
-                return [time, *pose]
+        time, pose = _time_among(names), next(_poses_among(names), None)
+        if time is not None and pose is not None:
+            return [time, *pose]
         raise UsageError(
             "tum takes poses: fields such as pose.position and pose.orientation, or transforms."
         )
@@ -98,7 +97,7 @@ class GeoJsonWriter(_RowWriter):
         self._before = b'{"type": "FeatureCollection", "features": ['
 
     def _columns(self, names: Sequence[str]) -> list[str]:
-        time = next((name for name in _TIMES if name in names), None)
+        time = _time_among(names)
         if time is None or not set(_FIX[:2]) <= set(names):
             raise UsageError("geojson takes fixes: fields latitude and longitude.")
         return [time, *(name for name in _FIX if name in names)]
@@ -107,7 +106,8 @@ class GeoJsonWriter(_RowWriter):
         wanted = [
             name for name in (*columns, "status.status", "recording") if name in table.column_names
         ]
-        for row in table.select(wanted).cast(_with_text_times(table.select(wanted))).to_pylist():
+        chosen = table.select(wanted)
+        for row in chosen.cast(_with_text_times(chosen.schema)).to_pylist():
             longitude, latitude = row.pop("longitude"), row.pop("latitude")
             place = [longitude, latitude, row.pop("altitude", None)]
             if not all(_is_number(one) for one in place[:2]):
@@ -127,6 +127,11 @@ class GeoJsonWriter(_RowWriter):
         super()._finish()
 
 
+def _time_among(names: Sequence[str]) -> str | None:
+    """The best column with the time of a row."""
+    return next((name for name in _TIMES if name in names), None)
+
+
 def _poses_among(names: Sequence[str]) -> Iterator[list[str]]:
     """Seven columns for each pose, the shortest path first."""
     known = set(names)
@@ -143,13 +148,10 @@ def _poses_among(names: Sequence[str]) -> Iterator[list[str]]:
                     yield pose
 
 
-def _with_text_times(table: pa.Table) -> pa.Schema:
-    """The columns with times as ISO 8601."""
+def _with_text_times(schema: pa.Schema) -> pa.Schema:
+    """The columns with times as text, which Arrow writes as `2025-06-03 08:00:30.5Z`."""
     return pa.schema(
-        [
-            (one.name, pa.string() if pa.types.is_timestamp(one.type) else one.type)
-            for one in table.schema
-        ]
+        [(one.name, pa.string() if pa.types.is_timestamp(one.type) else one.type) for one in schema]
     )
 
 

@@ -199,16 +199,18 @@ def _table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple
 
     found: Counter[tuple[str, str]] = Counter()
     types = {type_prefix(channel.type) for entry in entries for channel in entry.channels}
-    lists: dict[Path, int] = {}  # which belong to the first file of their folder
+    seen: set[Path] = set()
     for file in files_of(root, types):
-        folder = file.path.parent
-        more = 0 if folder in lists else lists.setdefault(folder, list_bytes(folder))
+        size, folder = file.size_bytes, file.path.parent
+        if folder not in seen:  # its list counts with its first file
+            seen.add(folder)
+            size += list_bytes(folder)
         rows = {
             (section.id, topic): counts.rows
             for section in file.about.recordings
             for topic, counts in section.topics.items()
         }
-        found.update(_divided(file.size_bytes + more, rows))
+        found.update(_divided(size, rows))
     return found
 
 

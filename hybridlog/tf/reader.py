@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import Frame, FrameTree
 from hybridlog.wording import listed
@@ -27,10 +28,8 @@ TYPES: Final = (
     "geometry_msgs/TransformStamped",
     "foxglove.FrameTransform",
     "foxglove.FrameTransforms",
-    "foxglove_msgs/FrameTransform",
-    "foxglove_msgs/FrameTransforms",
 )
-"""Message types with transforms, without the `msg` of ROS 2."""
+"""Message types with transforms, as `plain_type` names them."""
 _STATIC: Final = "tf_static"
 _MAX_NORM_ERROR: Final = 1e-2
 """How far the norm of a quaternion may be from 1; that of tf2."""
@@ -38,7 +37,7 @@ _MAX_NORM_ERROR: Final = 1e-2
 
 def is_of_transforms(type_name: str) -> bool:
     """True for a type of `TYPES`, as ROS 1, ROS 2 or Foxglove name it."""
-    return type_name.replace("/msg/", "/") in TYPES
+    return plain_type(type_name) in TYPES
 
 
 def frame_tree(recordings: Recordings, topics: Sequence[str] = ()) -> FrameTree:
@@ -145,7 +144,7 @@ class _Builder:
     def _valid(
         self, child: NDArray[np.object_], parent: NDArray[np.object_], pose: Transform
     ) -> NDArray[np.bool_]:
-        """Where a transform is one; others are counted by reason, once each."""
+        """Mask of the valid transforms; each of the others is counted by its first reason."""
         with np.errstate(all="ignore"):
             norm = np.linalg.norm(pose.rotation, axis=1)
             finite = np.isfinite(pose.translation).all(axis=1) & np.isfinite(norm)
@@ -208,7 +207,7 @@ def _transforms_of(table: pa.Table) -> pa.Table:
     columns = {name: table[name].combine_chunks() for name in table.column_names}
     if "transforms" in columns:
         times = times.take(pc.list_parent_indices(columns["transforms"]))
-        columns = _leaves("", columns["transforms"].flatten())
+        columns = _leaves(columns["transforms"].flatten())
     is_foxglove = "parent_frame_id" in columns
     stamp, parent, pose = (
         ("timestamp", "parent_frame_id", "")
@@ -230,15 +229,12 @@ def _transforms_of(table: pa.Table) -> pa.Table:
     return pa.table(found).drop_null()
 
 
-def _leaves(prefix: str, rows: pa.Array) -> dict[str, pa.Array]:
+def _leaves(rows: pa.StructArray) -> dict[str, pa.Array]:
     """The columns of nested rows, by path."""
-    if not pa.types.is_struct(rows.type):
-        return {prefix: rows}
-    found: dict[str, pa.Array] = {}
-    for one in rows.type:
-        path = f"{prefix}.{one.name}" if prefix else one.name
-        found |= _leaves(path, pc.struct_field(rows, one.name))
-    return found
+    table = pa.Table.from_struct_array(rows)
+    while any(pa.types.is_struct(one.type) for one in table.schema):
+        table = table.flatten()
+    return {name: table[name].combine_chunks() for name in table.column_names}
 
 
 def _nanoseconds(columns: Mapping[str, pa.Array], name: str) -> pa.Array:

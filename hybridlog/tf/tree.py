@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     Times = NDArray[np.int64]
     Places = NDArray[np.intp]
+    Way = tuple[str, ...]  # names of frames, each the parent of the one before
 
 _S: Final = 1e9
 _TREE: Final = (
@@ -66,7 +67,7 @@ class Frame:
         return float((len(self.stamps) - 1) / ((self.stamps[-1] - self.stamps[0]) / _S))
 
     def longest_gap(self) -> tuple[int, int] | None:
-        """The longest time between two transforms, ns: where it begins, and where it ends."""
+        """Begin and end of the longest time between two transforms, ns."""
         if self.is_static or len(self.stamps) < 2:
             return None
         place = int(np.diff(self.stamps).argmax())
@@ -107,7 +108,7 @@ class Frame:
     def _outside(
         self, times: Times, extrapolate_ns: int
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Where a time is before the first transform, and after the last one."""
+        """Masks of the times before the first transform, and of those after the last one."""
         begin, end = int(self.stamps[0]) - extrapolate_ns, int(self.stamps[-1]) + extrapolate_ns
         limits = np.iinfo(np.int64)
         return times < max(begin, limits.min), times > min(end, limits.max)
@@ -156,7 +157,7 @@ class FrameTree:
     """The frames of a recording.
 
     Attributes:
-        frames: The frames that have a parent, by name, in the order of their first transforms.
+        frames: The frames that have a parent, by name.
         span: Log time `[begin, end)` of the recording, ns: the origin of relative times.
         invalid: Transforms that were left out, by reason.
         remarks: What the transforms lack, such as lost messages.
@@ -194,7 +195,7 @@ class FrameTree:
                     ahead += [(child, depth + 1) for child in reversed(below.get(name, ()))]
 
     def problems(self) -> list[str]:
-        """What is odd: loops, several trees, frames of two parents, and transforms left out."""
+        """Sentences about loops, several trees, frames of two parents, and transforms left out."""
         found = [
             f"{counted(number, 'transform')} left out: {why}."
             for why, number in self.invalid.items()
@@ -279,11 +280,11 @@ class FrameTree:
             next(self._paths(self._name(name), end, np.arange(1), ()))[1]
             for name in (source, target)
         ]
-        common = next((name for name in ways[0] if name in ways[1]), None)
-        if common is None:
+        used = _until_common(*ways)
+        if used is None:
             raise TransformError(f"There is no way between {source} and {target}.")
-        used = [self.frames[name] for way in ways for name in way[: way.index(common)]]
-        moving = [int(one.stamps[-1]) for one in used if not one.is_static]
+        frames = [self.frames[name] for way in used for name in way]
+        moving = [int(one.stamps[-1]) for one in frames if not one.is_static]
         return min(moving, default=int(end[0]))
 
     def to_arrow(self) -> pa.Table:
@@ -341,8 +342,8 @@ class FrameTree:
         return wanted
 
     def _paths(
-        self, name: str, times: Times, rows: Places, below: tuple[str, ...]
-    ) -> Iterator[tuple[Places, tuple[str, ...]]]:
+        self, name: str, times: Times, rows: Places, below: Way
+    ) -> Iterator[tuple[Places, Way]]:
         """The way from a frame to its root, for each group of times that share it.
 
         The last name of a way is the root, or the frame at which a loop closes.
@@ -363,32 +364,38 @@ class FrameTree:
         *,
         times: Times,
         rows: Places,
-        ways: tuple[tuple[str, ...], tuple[str, ...]],
+        ways: tuple[Way, Way],
         hold: int,
     ) -> None:
         """Work out the transforms of the times that share both ways."""
-        upwards, downwards = ways
-        common = next((name for name in upwards if name in downwards), None)
-        if common is None:
-            missing[f"no way between {upwards[0]} and {downwards[0]}"] += len(rows)
+        used = _until_common(*ways)
+        if used is None:
+            missing[f"no way between {ways[0][0]} and {ways[1][0]}"] += len(rows)
             return
         at = times[rows]
         parts = []
-        for way in ways:
+        for way in used:
             part = identity(len(rows))
-            for name in way[: way.index(common)]:
+            for name in way:
                 part = self.frames[name].pose_at(at, hold) @ part
             parts.append(part)
         up, down = parts
         found = down.inverse() @ up
         made.translation[rows], made.rotation[rows] = found.translation, found.rotation
-        used = [*upwards[: upwards.index(common)], *downwards[: downwards.index(common)]]
         left = ~found.is_known
-        for name in used:
+        for name in (*used[0], *used[1]):
             for why, where in self.frames[name].why_not(at, hold):
                 if number := int((left & where).sum()):
                     missing[why] += number
                 left &= ~where
+
+
+def _until_common(upwards: Way, downwards: Way) -> tuple[Way, Way] | None:
+    """Both ways up to the first frame that they share, without it; None if they share none."""
+    common = next((name for name in upwards if name in downwards), None)
+    if common is None:
+        return None
+    return upwards[: upwards.index(common)], downwards[: downwards.index(common)]
 
 
 def _nanoseconds(times: ArrayLike) -> Times:

@@ -215,7 +215,7 @@ class StoreDirectory:
             changed = files.status(self.recordings, depth=files.IN_STORE).st_mtime_ns
         except OSError:
             return 0, False
-        return changed, abs(time.time_ns() - changed) > _TICK_NS
+        return changed, _is_a_tick_ago(changed)
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
         """The look of each recording's directory, by label.
@@ -621,7 +621,12 @@ def is_settled(look: str) -> bool:
         look: Of `StoreDirectory.looks`.
     """
     times = look.split()[2::4]  # of the directory, and of the journal if there is one
-    return all(abs(time.time_ns() - int(one)) > _TICK_NS for one in times)
+    return all(_is_a_tick_ago(int(one)) for one in times)
+
+
+def _is_a_tick_ago(changed: int) -> bool:
+    """True if another change by now would show another time than this one, ns."""
+    return abs(time.time_ns() - changed) > _TICK_NS
 
 
 def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_result]:
