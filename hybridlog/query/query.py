@@ -89,7 +89,7 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
 
     @of_one_moment
     def completeness(self) -> Completeness:
-        """What the last answer lacks, or, without one, an answer that would be given now.
+        """Completeness of the last answer, or, without one, of an answer given now.
 
         Losses of topics in conditions count as an unknown number.
         """

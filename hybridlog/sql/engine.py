@@ -289,7 +289,7 @@ class SqlAnswer:
         return self._reading.remarks
 
     def told(self) -> list[str]:
-        """What it may lack, in sentences; it has been computed."""
+        """Sentences about what the computed answer may lack."""
         from hybridlog.query.answers.lost import completeness_of
 
         found = self.remarks

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.query.answers.match_times import match_times
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import Frame, FrameTree
 from hybridlog.wording import listed
@@ -81,10 +82,12 @@ def frames_and_stamps(query: Query) -> tuple[list[str], NDArray[np.int64]]:
     """
     known = query.field_types() or {}
     wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
-    table = query.fields(*wanted).to_arrow() if wanted else query.to_arrow()
-    time = table["header.stamp" if "header.stamp" in wanted else "log_time"]
+    if "header.stamp" not in wanted:  # no message has to be read
+        times = match_times(query.session, query.question, query.counters)
+        return [], np.concatenate([np.empty(0, np.int64), *(one.log_time for one in times)])
+    table = query.fields(*wanted).to_arrow()
     frames = table["header.frame_id"].unique().to_pylist() if len(wanted) == 2 else []
-    return frames, time.cast(pa.int64()).to_numpy()
+    return frames, table["header.stamp"].cast(pa.int64()).to_numpy()
 
 
 class _Builder:

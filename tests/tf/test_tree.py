@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog.tf.reader import frames_and_stamps
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import FrameTree
 from hybridlog_storage.errors import TopicError, TransformError
@@ -231,6 +232,15 @@ def test_no_transforms(tmp_path: Path) -> None:
             recording.write(Channel("/a", "json", None), b"{}", log_time=1)
         with pytest.raises(TopicError, match="No topic has transforms"):
             store.tf("x")
+
+
+def test_the_times_of_a_topic_without_headers(log: Log) -> None:
+    """Its log times, and no frame."""
+    log.tree(*(said(n, "a", "b") for n in range(3)))
+    query = log.store.recordings(log.store.summaries()[-1].id).topic("/tf")
+    frames, times = frames_and_stamps(query)
+    assert frames == []
+    assert times.tolist() == [message.log_time_ns for message in query]
 
 
 def test_a_running_recording(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How complete an answer is: its value, and everything that is said about it.
+"""Completeness of an answer: the value, and the sentences about it.
 
 An answer may lack messages that are lost, not written or not indexed yet, or that it could
 not read. `lost.py` finds them.
@@ -28,7 +28,7 @@ _MAX_NAMES = 5
 
 @dataclass(frozen=True, slots=True)
 class Completeness:
-    """How complete an answer is in its range.
+    """Completeness of an answer in its range.
 
     Attributes:
         messages: Number of messages that are known to be lost; of a loss that reaches out of
@@ -110,7 +110,7 @@ class Completeness:
 
 
 def not_written(label: str, messages: int | None, interval_ns: int) -> str:
-    """What a running recording has not written; None for an unknown number of messages."""
+    """Sentence about messages not yet written; None for an unknown number of them."""
     what = f"up to {interval_ns / 1e9:g} s" if messages is None else counted(messages, "message")
     return f"{label} is being recorded: {what} not written yet, nor in this answer."
 

@@ -44,7 +44,7 @@ def completeness_of(
     counters: Counters | None = None,
     *others: tuple[Question, Counters | None],
 ) -> Completeness:
-    """How complete an answer is.
+    """Completeness of an answer.
 
     Args:
         session: The open store.
@@ -158,7 +158,7 @@ def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
 
 
 def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | None, list[str]]:
-    """What running recordings have not written, if questions reach past the last flush.
+    """Messages that are not written yet, if questions reach past the last flush.
 
     Returns:
         The number of messages of the first question, None if a recorder does not answer; and
