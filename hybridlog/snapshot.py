@@ -172,6 +172,11 @@ class Snapshot:
         sets = [any(t.schema in schemas for t in held) for held in self._topics.values()]
         return np.flatnonzero(np.array(sets, np.bool_)[self._set])
 
+    def topics_with(self, schemas: Collection[str]) -> tuple[str, ...]:
+        """Names of all topics with any of some schemas, by hash, sorted."""
+        held = {topic for topics in self._topics.values() for topic in topics}
+        return tuple(sorted({one.topic for one in held if one.schema in schemas}))
+
     def having(self, topics: Collection[str]) -> NDArray[np.intp]:
         """Positions of the recordings that have any of some topics, in order."""
         wanted = frozenset(topics)

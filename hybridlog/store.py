@@ -986,7 +986,13 @@ class Store:
         return self.entry(entry.id)
 
     def mark(
-        self, recording: str, moment: TimeLike, note: str, tags: Mapping[str, str] | None = None
+        self,
+        recording: str,
+        moment: TimeLike,
+        note: str,
+        tags: Mapping[str, str] | None = None,
+        *,
+        until: TimeLike | None = None,
     ) -> RecordingEntry:
         """Set a mark at a time of a recording that has ended.
 
@@ -995,9 +1001,10 @@ class Store:
             moment: Log time, as for `Query.between`.
             note: Text of the mark.
             tags: Tags of the mark.
+            until: Log time of its end, for what lasted; None for a moment.
 
         Raises:
-            TimeError: `moment` is invalid.
+            TimeError: `moment` or `until` is invalid, or `until` is before `moment`.
             StoreError: The recording is being written; use `hybridlog mark` without `--at`.
         """
         from hybridlog.maintenance import edit
@@ -1006,8 +1013,17 @@ class Store:
         (entry,) = self.select([recording])
         start, end = extent_of(entry)
         time = parse_time(moment, start=start, end=end)
+        last = None if until is None else parse_time(until, start=start, end=end)
         try:
-            edit.mark(self.directory, self.catalog, entry, time, text=text(note), tags=tags or {})
+            edit.mark(
+                self.directory,
+                self.catalog,
+                entry,
+                time,
+                text=text(note),
+                tags=tags or {},
+                end=last,
+            )
         except HeldError as error:
             if error.is_recording:
                 raise StoreError(f"{error} To mark it now, mark it without --at.") from error

@@ -116,13 +116,16 @@ def note_command(*, recording: str, text: str, store: Path | None, quiet: bool) 
 
 @click.command()
 @click.argument("text", metavar="TEXT", help="What happened.")
-@options.tags
+@click.option(
+    "--set-tag", "tag", multiple=True, metavar="K=V", help="Add KEY=VALUE to it. Repeatable."
+)
 @options.running
 @click.option(
     "--at",
     metavar="T",
     help="Mark a recording that has ended, at this time, written as for --between.",
 )
+@click.option("--until", metavar="T2", help="The mark lasts from --at to this time.")
 @options.store
 @options.quiet
 def mark_command(
@@ -131,6 +134,7 @@ def mark_command(
     tag: tuple[str, ...],
     recording: tuple[str, ...],
     at: str | None,
+    until: str | None,
     store: Path | None,
     quiet: bool,
 ) -> None:
@@ -142,11 +146,13 @@ def mark_command(
     tags = options.parse_tags(tag)
     if not text.strip():
         raise UsageError("A mark needs a text: say what happened.")
+    if until is not None and at is None:
+        raise UsageError("--until ends a mark that begins at a time: add --at.")
     if at is None:
         labels = _mark_running(text, tags, recording, store)
     elif len(recording) == 1:
         with opened_store(store, None, quiet=quiet) as opened:
-            labels = iter([opened.mark(recording[0], at, text, tags).label])
+            labels = iter([opened.mark(recording[0], at, text, tags, until=until).label])
     else:
         raise UsageError("A mark at a time needs one recording: name it with --recording.")
     for label in labels:

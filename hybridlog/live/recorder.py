@@ -374,9 +374,24 @@ class Recorder:
         self._state = state
         return state
 
-    def mark(self, text: str, tags: Mapping[str, str]) -> None:
-        """Set a mark: a message on the topic of marks, for queries and triggers."""
-        self._sink.take(self._marks, mark_payload(text, tags), received=time.time_ns())
+    def mark(
+        self,
+        text: str,
+        tags: Mapping[str, str],
+        *,
+        begin: int | None = None,
+        end: int | None = None,
+    ) -> None:
+        """Set a mark: a message on the topic of marks, for queries and triggers.
+
+        Args:
+            text: What happened.
+            tags: Tags of the mark.
+            begin: Its log time, ns; None for now.
+            end: Log time of its end, ns; None for a moment.
+        """
+        received = time.time_ns() if begin is None else begin
+        self._sink.take(self._marks, mark_payload(text, tags, end), received=received)
 
     def fire(self, reason: str) -> None:
         """Start a snapshot.

@@ -70,6 +70,7 @@ def mark(
     *,
     text: str,
     tags: Mapping[str, str],
+    end: int | None = None,
 ) -> None:
     """Set a mark: a segment of one message, and a line of the journal.
 
@@ -80,14 +81,17 @@ def mark(
         moment: Log time of the mark, ns.
         text: Text of the mark.
         tags: Tags of the mark.
+        end: Log time of its end, ns; None for a moment.
 
     Raises:
         StoreError: The recording is being written, or a segment of it cannot be read.
-        TimeError: The mark would be before 1970.
+        TimeError: The mark would be before 1970, or end before it begins.
         TopicError: It is gone.
     """
     if moment < 0:
         raise TimeError("A mark cannot be set before 1970: its log time has no sign.")
+    if end is not None and end < moment:
+        raise TimeError("A mark cannot end before it begins.")
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
         path = directory.recording(label)
         inventory = take_inventory(directory, label)
@@ -95,11 +99,12 @@ def mark(
         numbers.update(inventory.state.sealed if inventory.state is not None else ())
         number = max(numbers, default=-1) + 1
         channel, channel_id, schema_id = _channel(inventory)
-        payload = mark_payload(text, tags)
+        payload = mark_payload(text, tags, end)
         seq = _next_seq(directory, label, inventory)
         segment = SegmentFile.create(path, number, recording_metadata(entry), seq)
+        until = {} if end is None else {"end": end}
         marked = journal.event(
-            journal.MARKED, time=moment, text=text, tags=dict(tags), segment=number
+            journal.MARKED, time=moment, **until, text=text, tags=dict(tags), segment=number
         )
 
         def announce(sealed: Sealed) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.across import All, AnyOf, Condition, Near, NoneOf, Own
 from hybridlog.query.question import Question
@@ -55,6 +56,8 @@ def question_about(
     found = Question(*session.having(topics, asked))
     if question.is_unbounded or not question.is_by_log_time:
         return found
+    if {*found.topics} <= {*mark_topics(session)}:
+        return found  # marks may last
     spans = RangeResolver(session, question).spans()
     rows = ((one.id, np.array([[begin, end, 0]], np.int64)) for one, (begin, end) in spans)
     near = Intervals.of(rows).widened(after, before).merged()

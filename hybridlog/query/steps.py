@@ -320,6 +320,8 @@ class Steps:
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Time around each message: `t - before <= time < t + after`, within its recording.
 
+        A mark with an end counts from its beginning to its end.
+
         One window per message: windows may overlap; `during` and `merged` join them.
 
         Args:

@@ -10,19 +10,29 @@ from hybridlog_storage.messages import Channel, Schema
 
 MARKS: Final = "/hybridlog/marks"
 """Topic of marks."""
+MARK: Final = "hybridlog.Mark"
+"""Type of marks."""
 _SCHEMA: Final = (
     b'{"type":"object","properties":{"text":{"type":"string"},'
-    b'"tags":{"type":"object","additionalProperties":{"type":"string"}}}}'
+    b'"tags":{"type":"object","additionalProperties":{"type":"string"}},'
+    b'"end":{"type":"integer"}}}'
 )
 
 
 def mark_channel() -> Channel:
     """The channel of marks."""
-    return Channel(MARKS, "json", Schema("hybridlog.Mark", "jsonschema", _SCHEMA), {})
+    return Channel(MARKS, "json", Schema(MARK, "jsonschema", _SCHEMA), {})
 
 
-def mark_payload(text: str, tags: Mapping[str, str]) -> bytes:
-    """A mark as a message."""
-    content = json.dumps({"text": text, "tags": dict(tags)}, ensure_ascii=False)
+def mark_payload(text: str, tags: Mapping[str, str], end: int | None = None) -> bytes:
+    """A mark as a message, whose log time is the mark's beginning.
+
+    Args:
+        text: What happened.
+        tags: Tags.
+        end: Log time of its end, ns; None for a moment.
+    """
+    until = {} if end is None else {"end": end}
+    content = json.dumps({"text": text, "tags": dict(tags), **until}, ensure_ascii=False)
     # Bytes that are not UTF-8 appear in it as JSON's own escapes.
     return content.encode("utf-8", "backslashreplace")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 import pyarrow as pa
 
-from hybridlog.record.marks import MARKS
-from hybridlog.sql.pieces import ScanCounts
+from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.counters import Counters
 from hybridlog_storage.catalog import ChannelStats
 
 if TYPE_CHECKING:
@@ -71,6 +69,8 @@ _MARKS: Final = pa.schema(
     [
         ("log_time", _TIME),
         ("t", pa.int64()),
+        ("end_time", _TIME),
+        ("end_t", pa.int64()),
         ("recording", pa.string()),
         ("text", pa.string()),
         ("tags", _TAGS),
@@ -152,22 +152,17 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 
 def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
-    for summary in content.summaries_of(MARKS):
-        topic = content.topic_of(summary, MARKS)
-        counts = ScanCounts()
-        for segment, number in topic.places:
-            batch = topic.chunk(segment, number, counts).batch
-            for row in np.flatnonzero(np.isin(batch.channel, list(topic.channels))).tolist():
-                begin, length = int(batch.offset[row]), int(batch.length[row])
-                mark = json.loads(bytes(memoryview(batch.buffer)[begin : begin + length]))
-                time = int(batch.log_time[row])
-                yield {
-                    "log_time": time // 1000,
-                    "t": time,
-                    "recording": summary.label,
-                    "text": mark.get("text"),
-                    "tags": list(mark.get("tags", {}).items()),
-                }
+    labels = {one.id: one.label for one in content.snapshot.summaries}
+    for mark in marks_in(content.session, [*labels], Counters()):
+        yield {
+            "log_time": mark.begin // 1000,
+            "t": mark.begin,
+            "end_time": None if mark.end is None else mark.end // 1000,
+            "end_t": mark.end,
+            "recording": labels[mark.recording],
+            "text": mark.text,
+            "tags": list(mark.tags.items()),
+        }
 
 
 def _times(first: int | None, last: int | None) -> dict[str, Any]:

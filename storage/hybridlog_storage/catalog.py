@@ -211,7 +211,7 @@ class RecordingEntry:
         attachments: Number of attachments of its log.
         metadata_records: Number of metadata records of its log.
         notes: Notes of users: `at` (ns) and `text`.
-        marks: Marks set after it ended: `time` (ns), `text`, `tags`.
+        marks: Marks set after it ended: `time` (ns), `text`, `tags`; those that last, `end` (ns).
         spans: Number, first and last log time (ns) of each segment that has messages.
         digests: Digest of each valid segment, by its number as text.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that

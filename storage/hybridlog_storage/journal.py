@@ -134,7 +134,7 @@ class JournalState:
         name: The present name.
         tags: The present tags.
         notes: Notes in the order of writing: `at` and `text`.
-        marks: Marks set after the end: `time`, `text`, `tags`, `segment`.
+        marks: Marks set after the end: `time`, `text`, `tags`, `segment`; those that last, `end`.
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
         payloads: Files of payloads, by path.
@@ -220,6 +220,10 @@ class JournalState:
 
     def _mark(self, line: Event) -> None:
         mark = _values(line, _MARK)
+        if line.get("end") is not None:
+            mark["end"] = _time(line["end"])
+            if mark["end"] < mark["time"]:
+                raise ValueError("a mark that ends before it begins")
         # A mark whose segment a crash kept from being listed does not exist.
         self.marks = [m for m in self.marks if m["segment"] in self.sealed]
         self.marks.append(mark)

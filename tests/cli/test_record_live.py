@@ -207,7 +207,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     ) as process:
         until_it_speaks(process)
         # By name, by the beginning of the id, and by nothing at all.
-        run("mark", "gripper slipped", "--tag", "trial=7", "-r", "first drive", store=store)
+        run("mark", "gripper slipped", "--set-tag", "trial=7", "-r", "first drive", store=store)
         state = run(
             "top", "first-d", "--json", "--once", "--field", "base/scan:ranges.min", store=store
         ).json

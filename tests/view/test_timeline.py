@@ -250,7 +250,10 @@ def test_a_recording_that_goes_on_is_followed(
     store.mark("live", "+2s", "look <b>here</b>")
     store.refresh()
     marks = client.get("marks", params={"recording": "live", "begin": 0, "end": ended["end"]})
-    assert marks.json() == {"marks": [{"at": 2 * SECOND, "text": "look <b>here</b>"}], "more": 0}
+    assert marks.json() == {
+        "marks": [{"at": 2 * SECOND, "end": 2 * SECOND, "text": "look <b>here</b>"}],
+        "more": 0,
+    }
 
 
 def test_an_answer_is_of_one_moment_on_any_thread(

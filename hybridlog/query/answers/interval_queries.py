@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias, TypeVar
 import numpy as np
 
 from hybridlog.query.answers.lost import lost_times
+from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.intervals import Changing, Holding, Intervals, clipped
 from hybridlog.query.planner import Planner
@@ -124,20 +125,30 @@ class IntervalQueries:
                 "Windows around only some messages of several topics: ask for one topic, or "
                 "without `limit` and `every`."
             )
-        if parse_duration(before) == parse_duration(after) == 0:
+        are_marks = {*self._question.topics} <= {*mark_topics(self._session)}
+        if parse_duration(before) == parse_duration(after) == 0 and not are_marks:
             raise UsageError("A window needs a length: give before, after or both.")
-        found = []
-        for entry, times in self._times():
-            at = placed(times)
-            rows = np.stack([at, at, np.ones_like(at)], axis=1)
-            found.append((entry.key, entry.id, rows))
-        # Windows that begin together are in the order of the recordings' keys.
-        ordered = sorted(found, key=lambda item: item[0])
-        wide = Intervals.of((name, rows) for _, name, rows in ordered).widened(before, after)
+        found = [*(self._lasting() if are_marks else self._moments())]
         snapshot = self._session.snapshot()
+        keys = {name: snapshot.summaries[snapshot.by_id[name]].key for name, _ in found}
+        # Windows that begin together are in the order of the recordings' keys.
+        ordered = sorted(found, key=lambda item: keys[item[0]])
+        wide = Intervals.of(ordered).widened(before, after)
         return wide.within(
             {name: _extent(snapshot.summaries[snapshot.by_id[name]]) for name in wide.recordings}
         )
+
+    def _lasting(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
+        """Begin and end of marks, by recording."""
+        for one in marks(self._session, self._question, self._planner.counters):
+            end = one.begin if one.end is None else one.end
+            yield one.recording, np.array([[one.begin, end, 1]], np.int64)
+
+    def _moments(self) -> Iterator[tuple[str, NDArray[np.int64]]]:
+        """The time of each message as an interval without length, by recording."""
+        for entry, times in self._times():
+            at = placed(times)
+            yield entry.id, np.stack([at, at, np.ones_like(at)], axis=1)
 
     def _times(self) -> Iterator[tuple[RecordingEntry, NDArray[np.int64]]]:
         """Log times of the messages of the answer, by recording."""

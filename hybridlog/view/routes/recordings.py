@@ -130,7 +130,8 @@ def _lost_parts(entry: RecordingEntry, begin: int, end: int) -> list[tuple[float
 
 
 def _mark(mark: Mapping[str, Any], start: int) -> dict[str, Any]:
-    return {"at": mark["time"] - start, "text": mark["text"], "tags": mark["tags"]}
+    begin, end = mark["time"], mark.get("end", mark["time"])
+    return {"at": begin - start, "end": end - start, "text": mark["text"], "tags": mark["tags"]}
 
 
 def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:

@@ -9,7 +9,9 @@ import numpy as np
 from starlette.responses import Response
 
 from hybridlog.drawing.density import gaps
-from hybridlog.record.marks import MARKS
+from hybridlog.query.answers.marks import mark_topics
+from hybridlog.query.answers.marks import marks as marks_of
+from hybridlog.query.counters import Counters
 from hybridlog.view.context import Context, extent, route, start_of
 from hybridlog_storage.errors import UsageError
 
@@ -79,18 +81,21 @@ def marks(context: Context, asked: RequestParams) -> dict[str, Any]:
     """The first marks in a range, and how many more there are."""
     recording = context.recording(asked)
     start = start_of(recording)
-    if MARKS not in {channel.topic for channel in recording.channels}:
+    known = {channel.topic for channel in recording.channels}
+    topics = [one for one in mark_topics(context.store.session, [recording.id]) if one in known]
+    if not topics:
         return {"marks": [], "more": 0}
     begin, end = asked.span(start)
     first, last = recording.span or (start, start)
     if begin > last or end <= first:
         return {"marks": [], "more": 0}  # a query refuses such a range
-    query = context.query(recording, MARKS).between(begin, end)
+    query = context.query(recording, *topics).between(begin, end)
+    some = query.limit(MAX_MARKS)
     found = [
-        {"at": message.log_time_ns - start, "text": str(message.fields.get("text", ""))}
-        for message in query.limit(MAX_MARKS)
+        {"at": one.begin - start, "end": (one.end or one.begin) - start, "text": one.text}
+        for one in marks_of(some.session, some.question, Counters())
     ]
-    return {"marks": found, "more": query.count() - len(found)}
+    return {"marks": found, "more": max(query.count() - MAX_MARKS, 0)}
 
 
 def _within(

@@ -17,6 +17,7 @@ const AXIS = 30;
 const MAX_SHOWN = 12; // lanes that are seen without scrolling
 const NARROW = matchMedia("(max-width: 40rem)");
 const DARK = matchMedia("(prefers-color-scheme: dark)");
+const MARKS = ["hybridlog.Mark", "foxglove.Event", "foxglove_msgs/Event", "foxglove_msgs/msg/Event"];
 const CLICK = 4; // pixels that a click may move
 
 /** Adds the timeline of a recording to an element. Returns a function that takes it away. */
@@ -98,7 +99,7 @@ export function mountTimeline(parent, recording) {
   }
 
   async function readMarks() {
-    if (!recording.info.topics.some(({ topic }) => topic === "/hybridlog/marks")) {
+    if (!recording.info.topics.some(({ type }) => MARKS.includes(type))) {
       marks = recording.info.marks;
       return;
     }
@@ -231,7 +232,7 @@ export function mountTimeline(parent, recording) {
     });
     context.strokeStyle = paints.mark;
     context.setLineDash([4, 3]);
-    for (const { at } of marks) line(context, toX(at), 0, height);
+    for (const time of marks.flatMap(({ at, end }) => [at, end])) line(context, toX(time), 0, height);
     context.setLineDash([]);
     drawCursor(picture, paints);
   }
@@ -287,7 +288,10 @@ export function mountTimeline(parent, recording) {
       if (x + 4 + context.measureText(label).width <= width) context.fillText(label, x + 4, 2);
     }
     context.fillStyle = paints.mark;
-    for (const { at } of marks) flag(context, toX(at));
+    for (const mark of marks) {
+      flag(context, toX(mark.at));
+      context.fillRect(toX(mark.at), AXIS - 3, toX(mark.end) - toX(mark.at), 3);
+    }
     context.fillStyle = paints.text;
     for (const { ticks } of overlays.all()) {
       for (const [time] of ticks) context.fillRect(Math.round(toX(time)) - 0.5, AXIS - 6, 1.5, 6);
@@ -317,7 +321,7 @@ export function mountTimeline(parent, recording) {
     const lines = [`${offset(state.instant(time), digitsOf(nsPerPixel))}  ${moment(recording.toTime(time))}`];
     if (hover.lane !== null) lines.push(...aboutLane(topics[hover.lane].topic, time, nsPerPixel));
     const near = 4 * nsPerPixel;
-    lines.push(...marks.filter(({ at }) => Math.abs(at - time) < near).slice(0, 5).map(({ text }) => `Mark: ${text}`));
+    lines.push(...marks.filter((mark) => mark.at - near < time && time < mark.end + near).slice(0, 5).map(({ text }) => `Mark: ${text}`));
     for (const { title, bands, ticks } of overlays.all()) {
       const isIn = bands.some(([low, high]) => low <= time && time < high);
       const here = ticks.filter(([at]) => Math.abs(at - time) < near);

@@ -1,0 +1,115 @@
+"""Marks in recordings: messages about what happened, at a moment or for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.message import messages_in
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Question
+from hybridlog.record.marks import MARK
+from hybridlog_storage.errors import HybridlogError
+
+if TYPE_CHECKING:
+    from hybridlog.message import Message
+    from hybridlog.query.counters import Counters
+    from hybridlog.session import Session
+
+EVENT: Final = "foxglove.Event"
+_NAMES: Final = ("text", "name", "title", "event", "type")
+"""Keys of the metadata of an event that may say what it is, the best first."""
+
+
+class Mark(NamedTuple):
+    """A mark, or an event of Foxglove.
+
+    Attributes:
+        recording: Id of its recording.
+        begin: ns since the epoch.
+        end: The same; None for a moment.
+        text: What happened.
+        tags: Further values by name.
+    """
+
+    recording: str
+    begin: int
+    end: int | None
+    text: str
+    tags: Mapping[str, str]
+
+
+def mark_topics(session: Session, recordings: Collection[str] | None = None) -> tuple[str, ...]:
+    """Full names of the topics with marks.
+
+    Args:
+        session: The open store.
+        recordings: Ids; None for all.
+    """
+    session.look(recordings)
+    types = session.type_names()
+    wanted = {digest for digest, name in types.items() if plain_type(name) in {MARK, EVENT}}
+    return session.snapshot().topics_with(wanted)
+
+
+def marks(session: Session, question: Question, counters: Counters) -> Iterator[Mark]:
+    """The marks among the messages of a question, in their order.
+
+    Unreadable ones are left out; `counters.unreadable` counts them.
+    """
+    for run in Planner(session, question, counters).runs():
+        for message in messages_in(run):
+            if plain_type(message.type) not in {MARK, EVENT}:
+                continue
+            try:
+                yield _mark_of(message)
+            except HybridlogError:
+                counters.unreadable += 1
+
+
+def marks_in(session: Session, recordings: Collection[str], counters: Counters) -> Iterator[Mark]:
+    """All marks of some recordings, in order of log time.
+
+    Args:
+        session: The open store.
+        recordings: Ids.
+        counters: Count what the answer costs.
+    """
+    topics = mark_topics(session, recordings)
+    places = session.snapshot().having(topics)
+    having = {session.snapshot().summaries[place].id for place in places.tolist()}
+    chosen = tuple(one for one in recordings if one in having)
+    if chosen:
+        yield from marks(session, Question(topics, chosen), counters)
+
+
+def _mark_of(message: Message) -> Mark:
+    fields: dict[str, Any] = message.fields
+    begin: int | None
+    if plain_type(message.type) == MARK:
+        begin, end = message.log_time_ns, fields.get("end")
+        text, tags = fields.get("text"), fields.get("tags")
+    else:
+        begin, end = _time(fields.get("start_time")), _time(fields.get("end_time"))
+        pairs = fields.get("metadata")
+        pairs = pairs if isinstance(pairs, list) else []
+        tags = {str(one.get("key")): str(one.get("value")) for one in pairs}
+        known = next((tags[name] for name in _NAMES if name in tags), None)
+        text = known or ", ".join(f"{key}={value}" for key, value in tags.items())
+    begin = message.log_time_ns if begin is None else begin
+    lasts = isinstance(end, int) and end > begin
+    return Mark(
+        message.recording,
+        begin,
+        end if lasts else None,
+        str(text or ""),
+        tags if isinstance(tags, dict) else {},
+    )
+
+
+def _time(value: Any) -> int | None:
+    """A time in ns; JSON has seconds and nanoseconds."""
+    if isinstance(value, dict):
+        value = int(value.get("sec", 0)) * 10**9 + int(value.get("nsec", 0))
+    return value if isinstance(value, int) else None

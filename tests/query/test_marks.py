@@ -1,0 +1,107 @@
+"""Marks with an end, and events of Foxglove, as intervals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import foxglove
+import pytest
+from foxglove.channels import EventChannel, LogChannel
+from foxglove.messages import Event, KeyValuePair, Log, Timestamp
+from starlette.testclient import TestClient
+
+import hybridlog as hl
+from hybridlog.view.loopback import Admission
+from hybridlog.view.server import make_app
+from hybridlog_storage import journal
+from hybridlog_storage.errors import TimeError, UsageError
+
+S = 10**9
+BEGIN = 1000
+"""Log time of the first message, s; one a second follows."""
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    folder = tmp_path_factory.mktemp("marks")
+    log = folder / "events.mcap"
+    json_event = foxglove.Schema(name="foxglove.Event", encoding="jsonschema", data=b"{}")
+    with foxglove.open_mcap(str(log)):
+        said, events = LogChannel("/log"), EventChannel("/events")
+        other = foxglove.Channel("/json", schema=json_event, message_encoding="json")
+        for number in range(100):
+            said.log(Log(message=str(number)), log_time=(BEGIN + number) * S)
+        pairs = [KeyValuePair(key="name", value="turn"), KeyValuePair(key="way", value="left")]
+        events.log(
+            Event(
+                start_time=Timestamp(BEGIN + 10, 5),
+                end_time=Timestamp(BEGIN + 20, 0),
+                metadata=pairs,
+            ),
+            log_time=(BEGIN + 30) * S,
+        )
+        moment = {"sec": BEGIN + 50, "nsec": 0}
+        value: dict[str, Any] = {"start_time": moment, "end_time": moment, "metadata": []}
+        other.log(json.dumps(value).encode(), log_time=(BEGIN + 50) * S)
+    with hl.open(folder / "store", create=True, mongo="none") as store:
+        store.record(log, name="drive")
+        store.mark("drive", "+60s", "carpet", {"floor": "soft"}, until="+64s")
+        yield store
+
+
+def times(query: hl.Query) -> list[int]:
+    return [one.log_time_ns // S - BEGIN for one in query]
+
+
+def test_marks_are_intervals_of_questions(store: hl.Store) -> None:
+    said = store.topic("log")
+    carpet = "/hybridlog/marks: text = 'carpet'"
+    assert times(said.where(carpet, within="0s")) == [60, 61, 62, 63, 64]
+    assert times(said.where(carpet, within="1s")) == [59, 60, 61, 62, 63, 64, 65]
+    # The mark begins before the range, and the event's message comes after it.
+    assert times(said.between("+63s", "+70s").where(carpet, within="0s")) == [63, 64]
+    turn = "/events: metadata[*].value = 'left'"
+    assert times(said.between("+15s", "+17s").where(turn, within="0s")) == [15, 16]
+    found = store.topic("events").windows()
+    assert [(one.begin_ns, one.end_ns) for one in found] == [
+        ((BEGIN + 10) * S + 5, (BEGIN + 20) * S)
+    ]
+    assert times(said.during(found)) == [*range(11, 20)]
+    assert times(said.where("not /json: end_time.sec > 0", within="0s"))[49:52] == [49, 51, 52]
+    with pytest.raises(UsageError, match="needs a length"):
+        said.windows()
+
+
+def test_marks_in_sql_and_in_the_timeline(store: hl.Store) -> None:
+    rows = store.sql("select t, end_t, text, tags from marks order by t").to_arrow().to_pylist()
+    found = [(row["t"], row["end_t"], row["text"], dict(row["tags"])) for row in rows]
+    assert found == [
+        ((BEGIN + 10) * S + 5, (BEGIN + 20) * S, "turn", {"name": "turn", "way": "left"}),
+        ((BEGIN + 50) * S, None, "", {}),
+        ((BEGIN + 60) * S, (BEGIN + 64) * S, "carpet", {"floor": "soft"}),
+    ]
+    app = make_app(store, Admission(token="a-token", port=4242))
+    client = TestClient(app, base_url="http://127.0.0.1:4242/a-token/")
+    asked = {"recording": "drive", "begin": 0, "end": 100 * S}
+    answer = client.get("marks", params=asked).json()
+    info = client.get("recording", params={"recording": "drive"}).json()
+    assert [(one["at"], one["end"], one["text"]) for one in answer["marks"]] == [  # by log time
+        (10 * S + 5, 20 * S, "turn"),
+        (50 * S, 50 * S, ""),
+        (60 * S, 64 * S, "carpet"),
+    ]
+    assert [(one["at"], one["end"]) for one in info["marks"]] == [(60 * S, 64 * S)]
+
+
+def test_a_mark_ends_after_it_begins(store: hl.Store) -> None:
+    with pytest.raises(TimeError, match="cannot end before it begins"):
+        store.mark("drive", "+5s", "x", until="+4s")
+    (mark,) = store.entry("drive").marks
+    assert mark["end"] - mark["time"] == 4 * S
+    lines = (store.directory.recording("drive") / journal.JOURNAL).read_bytes().splitlines()
+    wrong = journal.event(journal.MARKED, **{**mark, "end": mark["time"] - 1})
+    state = journal.parse(b"\n".join([*lines, journal.encode(wrong).strip()]) + b"\n")
+    assert state.damaged == [len(lines) + 1]
+    assert state.marks == [mark]
