@@ -10,6 +10,11 @@ import pytest
 EXHAUSTIVE = pytest.mark.exhaustive
 
 
+def each(*cases: Any) -> list[Any]:
+    """Cases that are tried by `-m exhaustive` alone."""
+    return [pytest.param(case, marks=EXHAUSTIVE) for case in cases]
+
+
 def in_turn(ones: Sequence[Any], others: Sequence[Any]) -> list[Any]:
     """All pairs, by the others; by default each of the ones is in one of them."""
     return [

@@ -1263,7 +1263,7 @@ def test_the_store_is_its_model(machine: type[Machine]) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(
-            max_examples=6,
+            max_examples=4,
             stateful_step_count=20,
             deadline=None,
             phases=(Phase.generate,),

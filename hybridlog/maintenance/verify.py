@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 _REPAIR = "run `hybridlog repair`"
 _RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"
 _RESTORE_COLUMNS = "restore the file from a copy"
+_NOTING_S = 2.0  # that a recorder may take to note a segment that it has sealed
 _KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})
 
 
@@ -230,6 +232,11 @@ class _Check:
             return
         is_open = holder is not None and holder.is_recording
         entry = describe_inventory(self._catalog, inventory, is_open=is_open).entry
+        until = time.monotonic() + _NOTING_S
+        while is_open and not self._is_noted(entry) and time.monotonic() < until:
+            time.sleep(_NOTING_S / 100)
+            inventory = take_inventory(self._directory, self._label)
+            entry = describe_inventory(self._catalog, inventory, is_open=True).entry
         self._row(entry)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
@@ -342,6 +349,11 @@ class _Check:
     @property
     def _rebuild(self) -> str:
         return f"run `hybridlog index rebuild -r {self._label}`"
+
+    def _is_noted(self, entry: RecordingEntry) -> bool:
+        """True if the catalog has this entry."""
+        known = self._catalog.recording(entry.id)
+        return known is not None and known[1] == entry
 
     def _row(self, entry: RecordingEntry) -> None:
         """Check the catalog's row and its chunk tables."""

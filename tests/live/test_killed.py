@@ -15,6 +15,7 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.errors import HeldError
 from hybridlog_storage.messages import Channel, Schema
+from tests.some import each
 
 FLUSH_S = 0.4
 SLACK_S = 1.5  # for a machine that has other things to do
@@ -47,7 +48,7 @@ def payload(number: int) -> bytes:
     return len(content).to_bytes(4, "little") + content
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1, *each(2, 3, 4)])
 def test_a_kill_costs_no_more_than_the_flush_interval(tmp_path: Path, seed: int) -> None:
     path = tmp_path / "store"
     process = subprocess.Popen(

@@ -26,12 +26,16 @@ def _id(one: Asked) -> str:
 
 
 KINDS = ("one", "many")
-EACH_IN_TURN = pytest.mark.parametrize(
-    ("one", "running"),
-    in_turn(EVERY, KINDS),
-    indirect=["running"],
-    ids=lambda it: it if isinstance(it, str) else _id(it),
-)
+
+
+def asked_in_turn(rules: list[Asked]) -> pytest.MarkDecorator:
+    """Each rule about one kind of recording; `-m exhaustive`: about each."""
+    return pytest.mark.parametrize(
+        ("one", "running"),
+        in_turn(rules, KINDS),
+        indirect=["running"],
+        ids=lambda it: it if isinstance(it, str) else _id(it),
+    )
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -67,7 +71,7 @@ def test_at_rest(
 
 
 @pytest.mark.slow
-@EACH_IN_TURN
+@asked_in_turn([rules[0] for rules in COMMANDS.values()])
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
     done = run(*words, store=running.path, code=one.code)
@@ -91,7 +95,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, int]]:
 
 
 @pytest.mark.slow
-@EACH_IN_TURN
+@asked_in_turn(EVERY)
 def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,6 +12,9 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.maintenance.opening import put_entry
+from hybridlog.maintenance.report import RepairReport
+from hybridlog.maintenance.verify import verify
 from hybridlog.record.losses import Cause
 from hybridlog.record.running import RunningRecording
 from hybridlog_storage.catalog import RecordingEntry
@@ -120,6 +124,25 @@ def test_a_segment_that_begins_in_the_tick_of_a_look_is_found(
     assert follower.follow() == (age_s == 0)
     assert follower.entry is not None
     assert (follower.entry.messages == COUNT) == (age_s == 0)
+
+
+@pytest.mark.parametrize("is_noted", [True, False])
+def test_a_segment_that_is_about_to_be_noted_is_no_problem(
+    running: Running, is_noted: bool
+) -> None:
+    """A recorder seals a segment first, and then tells the catalog."""
+    with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
+        catalog, directory = reader.session.catalog, reader.directory
+        catalog.remove(running.entry.id)
+        noting = threading.Timer(0.3, lambda: put_entry(directory, catalog, "live", is_open=True))
+        if is_noted:
+            noting.start()
+        found = verify(directory, catalog, None, RepairReport(), labels=["live"]).findings
+        assert {one.place for one in found} == (set() if is_noted else {"catalog"})
+        if is_noted:
+            noting.join()
+        else:
+            noting.function()
 
 
 def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:

@@ -119,7 +119,7 @@ def without(data: bytes, chunk: int) -> bytes:
 
 
 def test_flipped_bits_are_no_silence(running: Running, copied: Path) -> None:
-    found = check_flips(running, copied, 20, 1)
+    found = check_flips(running, copied, 12, 1)
     assert found["error"] > 2
     assert found["told"] > 2
 

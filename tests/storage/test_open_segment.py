@@ -7,12 +7,14 @@ from contextlib import suppress
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mcap.records import Metadata
 
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.segments import open_segment
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.open_segment import OpenSegment
@@ -155,6 +157,30 @@ def test_another_chunk_in_the_place_of_the_last_is_read(written: Written, tmp_pa
     check(segment, written, len(written.data))
 
 
+@pytest.mark.parametrize("step", [61, pytest.param(1, marks=pytest.mark.exhaustive)])
+def test_a_part_of_a_write_is_no_damage(
+    written: Written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """A read beside a write sees zeros in place of the rest, wherever the write is by then."""
+    path = tmp_path / "000000.mcap.open"
+    waits: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        path.write_bytes(written.data)
+
+    monkeypatch.setattr(open_segment, "time", SimpleNamespace(sleep=sleep))
+    for seen in range(8, len(written.data), step):
+        path.write_bytes(written.data[:seen].ljust(len(written.data), b"\0"))
+        segment = OpenSegment(tmp_path, 0)
+        segment.follow()
+        path.write_bytes(written.data)
+        segment.follow()
+        assert not segment.damaged, seen
+        check(segment, written, len(written.data))
+    assert waits
+
+
 def told_by(segment: OpenSegment) -> list[object]:
     """All that is read of an open segment; what is damaged is left out."""
     table = segment.flushed.table
@@ -195,7 +221,7 @@ def test_a_flipped_bit_anywhere_in_an_open_segment_is_seen(
         changed = bytearray(data)
         changed[at] ^= 1 << at // 16 % 8
         path.write_bytes(changed)
-        segment = OpenSegment(tmp_path, 0)
+        segment = OpenSegment(tmp_path, 0, writing_s=0)
         segment.follow()
         found = told_by(segment)
         is_told = bool(segment.damaged) or segment.stopped is not None

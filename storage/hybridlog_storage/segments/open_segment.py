@@ -68,6 +68,7 @@ _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 _MAX_TORN: Final = 1 << 20  # bytes looked at of a record that is not whole
 _WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record
+_LOOKS: Final = 5  # at what seems damaged, before it counts as damaged
 _ARRIVALS_SIZE: Final = 96 + PROOF.size  # bytes of an arrival record without its numbers, at most
 _CHUNK_HEAD_SIZE: Final = CHUNK_HEAD.size + 16  # with the longest name of a compression
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
@@ -113,6 +114,7 @@ class OpenSegment:
     Args:
         recording: The recording's directory.
         number: Number of the segment; it may be sealed meanwhile.
+        writing_s: How long to wait before a second look at what seems damaged.
 
     Attributes:
         number: Its number in the recording.
@@ -121,14 +123,15 @@ class OpenSegment:
         losses: Rows of the loss ledger written so far.
         damaged: Chunks and other records that cannot be read.
         stopped: What is in place of the next record, if no writer leaves that; else None.
-        end: Bytes that are read.
+        end: Where the last arrival record ends; what is behind it is read again and again.
 
     Raises:
         SegmentError: It cannot be opened, or is no segment.
     """
 
-    def __init__(self, recording: Path, number: int) -> None:
+    def __init__(self, recording: Path, number: int, *, writing_s: float = _WRITING_S) -> None:
         self.number = number
+        self._writing_s = writing_s
         try:
             self.reader = SegmentReader(recording / f"{number:06d}{OPEN_SUFFIX}", number)
         except SegmentError:  # it may have been sealed just now
@@ -143,6 +146,7 @@ class OpenSegment:
         self.damaged: list[Damage] = []
         self.stopped: Damage | None = None
         self.end = len(MAGIC)
+        self._damaged_before = 0  # of the damaged ones, those before `end`
         self._schemas: dict[int, SchemaRecord] = {}
         self._chunk: tuple[int, int] | None = None  # offset and length of the last chunk record
         self._chunks: list[tuple[int, ...]] = []
@@ -166,6 +170,9 @@ class OpenSegment:
     def follow(self) -> bool:
         """Read what was flushed since, also if the segment was sealed meanwhile.
 
+        A read beside a write may see a part of it, and zeros in place of the rest. So what
+        seems damaged is looked at again, and counts only if it is still the same.
+
         Returns:
             True if there is anything new.
 
@@ -175,12 +182,20 @@ class OpenSegment:
         is_cut = self.is_cut()
         if is_cut:
             self._begin()
-        before = self.end, self.stopped
+        before = self.end, self.stopped, len(self.damaged)
+        known = len(self.damaged)
         self._read_on()
-        if self.stopped is not None:
-            time.sleep(_WRITING_S)  # perhaps the writer is in the middle of this record
+        for _ in range(_LOOKS):
+            seen = list(self.damaged)
+            if self.stopped is None and len(seen) <= known:
+                break
+            time.sleep(self._writing_s)
+            if len(seen) > known:
+                self._begin()
             self._read_on()
-        return is_cut or (self.end, self.stopped) != before
+            if self.damaged == seen:
+                break
+        return is_cut or (self.end, self.stopped, len(self.damaged)) != before
 
     def is_cut(self) -> bool:
         """True if the writer took chunks back that were read, on a full disk."""
@@ -190,12 +205,18 @@ class OpenSegment:
         return bytes(self.reader.read(self._chunks[-1][0], CHUNK_HEAD.size)) != self._last
 
     def _read_on(self) -> None:
-        """Read the records behind those that are read."""
+        """Read the records behind the last arrival record.
+
+        Nothing proves them before there is another one: a length may have been read beside the
+        write of it.
+        """
         self.reader.grow()
-        self.stopped = None
+        self.stopped = self._chunk = None
+        self._unproven.clear()
+        del self.damaged[self._damaged_before :]
         size = self.reader.size
         window, start = memoryview(b""), 0
-        at = self.end if self._chunk is None else self._chunk[0] + self._chunk[1]
+        at = self.end
         while at + RECORD_HEAD.size <= size:
             if at + CHUNK_HEAD.size > start + len(window):
                 try:
@@ -215,9 +236,10 @@ class OpenSegment:
                     break
             except SegmentError as error:
                 self.damaged.append(Damage(at, behind - at, str(error)))
+            else:
+                if opcode == ARRIVAL_OPCODE:
+                    self.end, self._damaged_before = behind, len(self.damaged)
             at = behind
-            if self._chunk is None:
-                self.end = at
 
     def _is_end(self, opcode: int, length: int, at: int) -> bool:
         """True if what is written ends so: with a part of a record, or room behind it.
@@ -258,7 +280,7 @@ class OpenSegment:
         """
         if self._chunk is not None and opcode not in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
             self.damaged.append(Damage(*self._chunk, "its arrival numbers are missing"))
-            self._chunk, self.end = None, at
+            self._chunk = None
         elif opcode == ARRIVAL_OPCODE and self._chunk and not self._may_be_arrivals(at, length):
             raise SegmentError("the arrival numbers are too long")
         if opcode == Opcode.CHUNK and length > _CHUNK_HEAD_SIZE:

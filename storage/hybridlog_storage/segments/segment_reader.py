@@ -79,7 +79,6 @@ _T = TypeVar("_T")
 _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 _TAIL = _FOOTER.size + len(MAGIC)
 _MAX_SUMMARY = 1 << 30
-_DROP = getattr(os, "POSIX_FADV_DONTNEED", None)  # takes read content out of the page cache
 _PIECE = 4 << 20  # bytes read at once for a checksum
 
 
@@ -249,13 +248,7 @@ class SegmentReader:
             ) from error
 
     def grow(self) -> None:
-        """Update the file's size after an append.
-
-        A writer past the page cache repeats the last block. If that was being read, the
-        system may keep it as it was; so it is read anew.
-        """
-        if _DROP is not None and not self._direct:
-            os.posix_fadvise(self._fd, max(self.size - BLOCK, 0), 0, _DROP)
+        """Update the file's size after an append."""
         self.size = os.fstat(self._fd).st_size
 
     def summary(self) -> SegmentSummary:
