@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment
@@ -233,11 +233,11 @@ class _Check:
         is_open = holder is not None and holder.is_recording
         entry = describe_inventory(self._catalog, inventory, is_open=is_open).entry
         until = time.monotonic() + _NOTING_S
-        while is_open and not self._is_noted(entry) and time.monotonic() < until:
+        while is_open and not self._is_noted(entry, is_open=True) and time.monotonic() < until:
             time.sleep(_NOTING_S / 100)
             inventory = take_inventory(self._directory, self._label)
             entry = describe_inventory(self._catalog, inventory, is_open=True).entry
-        self._row(entry)
+        self._row(entry, is_open=is_open)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
             return
@@ -350,17 +350,21 @@ class _Check:
     def _rebuild(self) -> str:
         return f"run `hybridlog index rebuild -r {self._label}`"
 
-    def _is_noted(self, entry: RecordingEntry) -> bool:
-        """True if the catalog has this entry."""
-        known = self._catalog.recording(entry.id)
-        return known is not None and known[1] == entry
+    def _is_noted(self, entry: RecordingEntry, *, is_open: bool) -> bool:
+        """True if the catalog has this entry.
 
-    def _row(self, entry: RecordingEntry) -> None:
-        """Check the catalog's row and its chunk tables."""
+        While it is recorded, what was decoded since the entry was made may be missing.
+        """
         known = self._catalog.recording(entry.id)
-        if known is None:
+        if known is None or not is_open:
+            return known is not None and known[1] == entry
+        return _not_decoded(known[1]) == _not_decoded(entry)
+
+    def _row(self, entry: RecordingEntry, *, is_open: bool) -> None:
+        """Check the catalog's row and its chunk tables."""
+        if self._catalog.recording(entry.id) is None:
             self.found("catalog", "the recording is missing", _REPAIR)
-        elif known[1] != entry:
+        elif not self._is_noted(entry, is_open=is_open):
             self.found("catalog", "its entry differs from the files", _REPAIR)
         for number, _, _ in entry.spans:
             try:
@@ -393,6 +397,16 @@ class _Check:
     def _tables(self, entry: RecordingEntry) -> None:
         for topic, problem in self._checker.damage(entry).items():
             self.found(f"table of {topic}", problem, _REPAIR)
+
+
+def _not_decoded(entry: RecordingEntry) -> RecordingEntry:
+    """An entry as it is before its messages are decoded."""
+    channels = []
+    for channel in entry.channels:
+        stats = replace(channel.stats, unreadable=0, surplus=0, stamped=0, skew_sum=0.0)
+        stats.first_stamp = stats.last_stamp = stats.skew_min = stats.skew_max = None
+        channels.append(replace(channel, stats=stats))
+    return replace(entry, channels=channels, is_decoded=False)
 
 
 def _by_collection(

@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.entries import describe, take_inventory
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.maintenance.verify import verify
 from hybridlog.record.losses import Cause
 from hybridlog.record.running import RunningRecording
-from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.catalog import RecordingEntry, stamps_of
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -143,6 +145,21 @@ def test_a_segment_that_is_about_to_be_noted_is_no_problem(
             noting.join()
         else:
             noting.function()
+
+
+def test_an_entry_from_before_its_messages_were_decoded_is_no_problem(running: Running) -> None:
+    with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
+        catalog, directory = reader.session.catalog, reader.directory
+        inventory = take_inventory(directory, "live")
+        reason = ChunkIndexer(inventory.id).reason
+        found = describe(inventory, is_open=True, reason=reason, stamps=lambda *_: None, damage={})
+        catalog.put(found)
+        assert not found.entry.is_decoded
+        tables = [(n, one.digest, one.table) for n, one in inventory.summaries.items()]
+        decoded = [(n, digest, stamps_of(table, {})) for n, digest, table in tables]
+        catalog.put_stamps(running.entry.id, decoded)
+        assert not verify(directory, catalog, None, RepairReport(), labels=["live"]).findings
+        put_entry(directory, catalog, "live", is_open=True)
 
 
 def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:
