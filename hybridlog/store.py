@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike
@@ -438,6 +439,18 @@ class Store:
         from hybridlog.tf.reader import frame_tree
 
         return frame_tree(self.recordings(recording), topics)
+
+    @of_one_moment
+    def check(self, recording: Texts = None) -> list[TopicCheck]:
+        """How regularly the topics of recordings came, the worst first; see `Query.check`.
+
+        Args:
+            recording: Label, name, id or glob; None for all recordings.
+
+        Raises:
+            TopicError: No such recording.
+        """
+        return self.recordings(recording).check().all_topics().check()
 
     @of_one_moment
     def align(

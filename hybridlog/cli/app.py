@@ -66,6 +66,7 @@ COMMANDS: Final = {
     "resample": "align",
     "rate": "stats",
     "gaps": "intervals",
+    "check": "check",
     "stats": "stats",
     "tf": "tf",
     "plot": "plot",

@@ -160,11 +160,11 @@ def _as_dict(
 
 
 def _rate(channel: ChannelEntry) -> float | None:
-    """Mean rate in Hz: intervals over the time between first and last message."""
+    """Mean rate in Hz."""
+    from hybridlog.query.periods import mean_rate
+
     stats = channel.stats
-    if stats.messages < 2 or stats.first is None or stats.last is None or stats.last <= stats.first:
-        return None
-    return (stats.messages - 1) * 1e9 / (stats.last - stats.first)
+    return mean_rate(stats.messages, stats.first or 0, stats.last or 0)
 
 
 def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from hybridlog.across.align import Aligned
     from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.times import DurationLike
 
 
@@ -129,6 +130,23 @@ class TableAnswers(Steps):
 
         with self.counters.timed():
             return Rates(self.session, self.question, self.counters).rate(window)
+
+    @of_one_moment
+    def check(self) -> list[TopicCheck]:
+        """How regularly the topics came: rate, jitter, gap, late start, early stop, losses.
+
+        Returns:
+            One for each recording and topic, also for topics without messages; those that were
+            silent for most of their usual periods first, then those that have lost most.
+
+        Raises:
+            UsageError: `limit`, `every`, `reverse`, or another clock than the log's.
+            TimeError: a range outside of all recordings.
+        """
+        from hybridlog.query.answers.regularity import check
+
+        with self.counters.timed():
+            return check(self.session, self.question, self.counters)
 
     @of_one_moment
     def stats(self, *fields: str) -> list[FieldStatistics]:

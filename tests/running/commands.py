@@ -337,6 +337,13 @@ COMMANDS: dict[str, list[Asked]] = {
             lambda k: numbers(k, "/said", "x"),
         )
     ],
+    "check": [
+        asked(
+            "check --json",
+            lambda a, _: {row["topic"]: row["messages"] for row in a.json},
+            _there,
+        ),
+    ],
     "plot": [
         asked("plot -t said --fields x -o OUT.png", _page, lambda _: True),
         asked("plot -t said --fields x -o OUT.html", _page, lambda _: True),

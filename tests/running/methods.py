@@ -160,6 +160,13 @@ def rates(known: Known, *topics: str) -> Any:
     return found
 
 
+def _checked(known: Known, topic: str) -> Any:
+    times = [one.log_time for one in known.of(topic)]
+    gap = max(b - a for a, b in pairwise(times))
+    lost = 3 if topic == "/said" else 0
+    return topic, len(times), gap, times[0] - known.span[0], lost
+
+
 def by_window(known: Known, topic: str, size: int) -> Any:
     first, last = known.span
     times = [one.log_time for one in known.of(topic)]
@@ -400,6 +407,13 @@ METHODS: dict[str, Rule] = {
         lambda _: sorted(CHANNELS),
     ),
     "clock": Rule(_clocks, _right_clocks),
+    "check": Rule(
+        lambda s: [
+            (c.topic, c.messages, c.gap_ns, c.late_ns, c.lost)
+            for c in sorted(s.topic("said", "arm").check(), key=lambda c: c.topic)
+        ],
+        lambda k: [_checked(k, topic) for topic in ("/arm", "/said")],
+    ),
     "completeness": Rule(
         _lost,
         lambda _: (

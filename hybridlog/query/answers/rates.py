@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridlog.query.answers.lost import flush_interval_ns
 from hybridlog.query.intervals import MAX_PIECES, Intervals
-from hybridlog.query.periods import GAP_PERIODS, Steps
+from hybridlog.query.periods import GAP_PERIODS, Steps, mean_rate
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
@@ -34,7 +34,7 @@ _MAX_SECOND_LOOK = 1_000_000  # times that are kept for a second look
 _Columns = dict[str, list["NDArray[Any]"]]
 
 
-class _Stretch(NamedTuple):
+class Stretch(NamedTuple):
     """The messages of one topic in one span of one recording.
 
     Attributes:
@@ -109,7 +109,7 @@ class Rates:
         if periods is not None and not 0 < periods < float("inf"):
             raise UsageError(f"A number of periods is more than 0, not {periods}.")
         found: list[tuple[str, NDArray[np.int64]]] = []
-        stretches = [(one, _Times(partial(self._times, one))) for one in self._stretches()]
+        stretches = [(one, _Times(partial(self.times, one))) for one in self._stretches()]
         usual = _usual_periods(stretches) if periods is not None else {}
         for stretch, times in stretches:
             limit = float(least)
@@ -123,15 +123,19 @@ class Rates:
             found += [(stretch.summary.id, rows) for rows in _longer(times, (begin, end), limit)]
         return Intervals.of(found)
 
-    def _stretches(self) -> Iterator[_Stretch]:
+    def stretches_in(self, summary: RecordingSummary, span: Span) -> Iterator[Stretch]:
+        """The topics of the question that have messages in a recording."""
+        is_whole = self._question.is_unbounded
+        for part in self._planner.parts_in(summary, None, None):
+            inner = part if is_whole else replace(part, bounds=span, clock="log")
+            yield Stretch(summary, part.topic, span, inner)
+
+    def _stretches(self) -> Iterator[Stretch]:
         """Topics and spans of the question, by recording."""
         for summary, span in RangeResolver(self._session, self._question).spans():
-            is_whole = self._question.is_unbounded
-            for part in self._planner.parts_in(summary, None, None):
-                inner = part if is_whole else replace(part, bounds=span, clock="log")
-                yield _Stretch(summary, part.topic, span, inner)
+            yield from self.stretches_in(summary, span)
 
-    def _overall(self, stretch: _Stretch) -> tuple[NDArray[Any], ...]:
+    def _overall(self, stretch: Stretch) -> tuple[NDArray[Any], ...]:
         """First and last time, messages and mean rate."""
         part = stretch.part
         if part.predicate is None and part.is_unbounded:
@@ -141,21 +145,21 @@ class Rates:
             last = max((s.last for s in stats if s.last is not None), default=0)
         else:
             count = first = last = 0
-            for times in self._times(stretch):
+            for times in self.times(stretch):
                 first = first if count else int(times[0])
                 last = int(times[-1])
                 count += len(times)
         if not count:
             first, last = stretch.span[0], stretch.span[1] - 1
-        rate = (count - 1) * 1e9 / (last - first) if count > 1 and last > first else np.nan
+        rate = mean_rate(count, first, last)
         return (
             np.array([first], np.int64),
             np.array([min(last + 1, END)], np.int64),
             np.array([count], np.int64),
-            np.array([rate if count else 0.0]),
+            np.array([(np.nan if rate is None else rate) if count else 0.0]),
         )
 
-    def _by_window(self, stretch: _Stretch, size: int) -> tuple[NDArray[Any], ...]:
+    def _by_window(self, stretch: Stretch, size: int) -> tuple[NDArray[Any], ...]:
         low, high = stretch.span
         if (high - low) // size > MAX_PIECES:
             raise UsageError(
@@ -164,7 +168,7 @@ class Rates:
         begin = np.arange(low, high, size, dtype=np.int64)
         end = np.append(begin[1:], high)
         messages = np.zeros(len(begin), np.int64)
-        for times in self._times(stretch):
+        for times in self.times(stretch):
             times = placed(times)  # noqa: PLW2901
             inside = times[(times >= low) & (times < high)]
             if len(inside):
@@ -172,7 +176,7 @@ class Rates:
                 messages[windows[0] : windows[-1] + 1] += np.bincount(windows - windows[0])
         return begin, end, messages, messages * 1e9 / (end - begin)
 
-    def _times(self, stretch: _Stretch) -> Iterator[NDArray[np.int64]]:
+    def times(self, stretch: Stretch) -> Iterator[NDArray[np.int64]]:
         """Log times of the matching messages, ns, ascending, some at a time."""
         for one in self._planner.outcomes(stretch.part):
             times = one.log_time[one.holds]
@@ -226,7 +230,7 @@ def _longer(
         before = int(block[-1])
 
 
-def _usual_periods(stretches: Iterable[tuple[_Stretch, _Times]]) -> dict[str, float]:
+def _usual_periods(stretches: Iterable[tuple[Stretch, _Times]]) -> dict[str, float]:
     """The usual period in each recording, ns; 0 where it is unknown."""
     steps: dict[str, Steps] = defaultdict(Steps)
     for stretch, times in stretches:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _ENTRY_S = 2e-5  # seconds to fetch the entry of a chunk
 _READ_S = 1e-4  # seconds to read the message indexes of a chunk
 _TIME_S = 2e-7  # seconds to sort the log time of a message
+_MAX_KEPT = 4_000_000  # log times of chunks with several channels, until the question is answered
 
 
 class ChunkIndex:
@@ -39,6 +40,8 @@ class ChunkIndex:
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session
         self._counters = counters
+        self._kept: dict[tuple[str, int, int], dict[int, NDArray[np.int64]]] = {}
+        self._room = _MAX_KEPT
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """For counts and times by log time; it grows with the number of chunks in the range."""
@@ -103,8 +106,15 @@ class ChunkIndex:
     def _times(
         self, recording: RecordingEntry, segment: int, chunk: int
     ) -> dict[int, NDArray[np.int64]]:
+        key = recording.id, segment, chunk
+        if key in self._kept:
+            return self._kept[key]
         reader = self._session.segment(recording.id, segment)
         read_before = reader.bytes_read
         times = self._session.times(recording, segment, chunk)
         self._counters.bytes_read += reader.bytes_read - read_before
+        size = sum(map(len, times.values()))
+        if len(times) > 1 and size <= self._room:  # another topic may be asked about next
+            self._kept[key] = times
+            self._room -= size
         return times

@@ -1,0 +1,163 @@
+"""How regularly topics came, against other readers, numpy and rosbag-doctor."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+import hybridlog as hl
+from hybridlog.query.answers.regularity import TopicCheck
+from tests import independent
+from tests.cli.within import answer as run
+from tests.data import DATA, needs_data
+from tests.some import EXHAUSTIVE
+
+MS = 10**6
+SECOND = 10**9
+REAL = ("auv_ros2.mcap", "sick_laser_radar.bag", "tilt_laser.bag", "ouster.mcap")
+MORE = ("auv_ros2_db3", "leg_tracker_positive_7.bag", "robot_localization_test1.bag")
+
+
+def write_mcap(path: Path, messages: dict[str, list[int]], payload: bytes = b"{}") -> Path:
+    """JSON messages at some log times, by topic, all topics in one file in order of time."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Any", "jsonschema", b'{"type":"object"}')
+        ids = {name: writer.register_channel(name, "json", schema) for name in messages}
+        ordered = sorted((time, name) for name, times in messages.items() for time in times)
+        for time, name in ordered:
+            writer.add_message(ids[name], time, payload, time)
+        writer.finish()
+    return path
+
+
+def recorded(log: Path, folder: Path) -> hl.Store:
+    store = hl.open(folder / "store", create=True, mongo="none")
+    store.record(log)
+    return store
+
+
+def right(times: list[int], span: tuple[int, int]) -> tuple[object, ...]:
+    """Messages, rate, jitter, longest gap, late start and early stop, in plain numpy."""
+    at = np.sort(np.array(times, np.int64))
+    steps = np.diff(at)
+    gap = int(steps.max()) if len(steps) else None
+    jitter = float(np.std(steps)) if len(steps) > 1 else None
+    rate = len(steps) * 1e9 / int(at[-1] - at[0]) if len(steps) and at[-1] > at[0] else None
+    period = float(np.sort(steps)[int(0.9 * (len(steps) - 1))]) if len(steps) else None
+    return len(at), rate, jitter, period, gap, int(at[0]) - span[0], span[1] - int(at[-1])
+
+
+def told(one: TopicCheck) -> tuple[object, ...]:
+    periods = one.jitter_ns, one.period_ns
+    return one.messages, one.rate_hz, *periods, one.gap_ns, one.late_ns, one.early_ns
+
+
+@needs_data
+@pytest.mark.parametrize("name", [*REAL, *(pytest.param(n, marks=EXHAUSTIVE) for n in MORE)])
+def test_topics_of_real_logs(name: str, tmp_path: Path) -> None:
+    log = DATA / "real" / name
+    times: dict[str, list[int]] = defaultdict(list)
+    for message in independent.read(log):
+        times[message.topic].append(message.log_time)
+    span = min(map(min, times.values())), max(map(max, times.values()))
+    with recorded(log, tmp_path) as store:
+        found = store.check()
+        assert {one.topic for one in found if one.messages} == {*times}
+        for one in found:
+            assert one.lost == 0
+            if one.messages:
+                assert told(one) == pytest.approx(right(times[one.topic], span)), one.topic
+        begin, end = span[0] + 10 * MS, span[0] + 1_500 * MS
+        part = store.all_topics().between("+10ms", "+1500ms").check()
+        for one in part:
+            inside = [time for time in times[one.topic] if begin <= time < end]
+            if inside:
+                assert told(one) == pytest.approx(right(inside, (begin, min(end, span[1] + 1) - 1)))
+            else:
+                assert not one.messages
+    badness = [one.silent_periods for one in found]
+    assert badness == sorted(badness, reverse=True)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["auv_ros2.mcap", "ouster.mcap"])
+def test_rosbag_doctor_finds_the_same(name: str, tmp_path: Path) -> None:
+    doctor = pytest.importorskip("rosbag_doctor.doctor", reason="NOT run: pip install -e .[dev]")
+    log = DATA / "real" / name
+    with recorded(log, tmp_path) as store:
+        ours = {
+            one.topic: (one.messages, one.rate_hz, one.late_ns, one.early_ns, one.gap_ns or None)
+            for one in store.check()
+            if one.messages
+        }
+    for other in doctor.inspect_bag(log).topics:
+        if other.count:
+            ms = (other.start_delay_ms, other.end_early_ms, other.max_gap_ms)
+            ns = [None if one is None else one * MS for one in ms]
+            wanted = (other.count, other.effective_rate_hz, *ns)
+            assert ours.pop(other.name) == pytest.approx(wanted), other.name
+    assert not ours
+
+
+def test_the_worst_topic_comes_first_and_silent_topics_before_all(tmp_path: Path) -> None:
+    steady = [SECOND + n * 10 * MS for n in range(301)]
+    logs = {
+        "/steady": steady,
+        "/gap": [t for t in steady if not 2 * SECOND < t < 3 * SECOND],
+        "/late": [t for t in steady if t >= 3 * SECOND],
+        "/early": [t for t in steady if t <= 1_500 * MS],
+        "/once": steady[:1],
+        "/never": [],
+    }
+    with recorded(write_mcap(tmp_path / "log.mcap", logs), tmp_path) as store:
+        found = store.check()
+    assert [one.topic for one in found[:4]] == ["/never", "/early", "/late", "/gap"]
+    assert {one.topic for one in found[5:]} == {"/once"}
+    assert [round(one.silent_periods) for one in found[1:]] == [250, 200, 100, 1, 0]
+    assert (found[3].gap_ns, found[3].gap_begin_ns) == (SECOND, 2 * SECOND)
+    shown = run("check", store=tmp_path / "store").lines
+    assert shown[0].split()[:2] == ["topic", "messages"]
+    assert [line.split()[0] for line in shown[1:]] == [one.topic for one in found]
+    as_json = run("check", "-t", "gap", "--json", store=tmp_path / "store").json
+    assert [(row["topic"], row["gap_ns"]) for row in as_json] == [("/gap", SECOND)]
+
+
+def test_losses_stand_beside_the_topic(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("live") as live:
+            from hybridlog.record.losses import Cause
+            from hybridlog_storage.messages import Channel
+
+            channel = Channel("/a", "json", None, {})
+            for n in range(20):
+                live.write(channel, b"{}", log_time=SECOND + n * MS)
+            for cause, count in ((Cause.QUEUE, 3), (Cause.TRANSPORT, 4), (Cause.THROTTLE, 100)):
+                live.ledger.note("/a", cause, count, first=SECOND, last=SECOND)
+            live.ledger.note("/b", Cause.QUEUE, None, first=SECOND, last=SECOND)
+            live.write(Channel("/b", "json", None, {}), b"{}", log_time=SECOND)
+        assert {one.topic: one.lost for one in store.check()} == {"/a": 7, "/b": None}
+
+
+@pytest.mark.parametrize("topics", [1, 20])
+def test_gaps_are_found_in_message_indexes_each_read_once(topics: int, tmp_path: Path) -> None:
+    """Not in payloads, and of chunks with many topics not once a topic."""
+    each = 1000 // topics
+    logs = {f"/t{n}": [SECOND + k * MS + n for k in range(each)] for n in range(topics)}
+    payload = json.dumps({"text": "x" * 10_000}).encode()
+    log = write_mcap(tmp_path / "log.mcap", logs, payload)
+    with recorded(log, tmp_path) as store:
+        query = store.all_topics()
+        found = query.check()
+        stored = sum(entry.stored_bytes for entry in store.recordings())
+        assert query.counters.chunks_read == 0
+        # Sixteen bytes a message, some for each chunk and channel; or a column of times.
+        assert query.counters.bytes_read < 40 * sum(map(len, logs.values())) + 4000 * topics
+        assert stored > 0
+    assert {one.gap_ns for one in found} == {MS}
