@@ -167,7 +167,7 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
         problem = _difference(found, summary, number, recording)
         if problem is not None:
             del found.summaries[number]
-            belongs = numbers.get(_whole_digest(summary))
+            belongs = numbers.get(summary.whole_digest)
             found.misfits.append(Misfit(number, name, problem, belongs=belongs))
         elif state is not None and not _is_listed(found, state, number):
             reason = "the journal does not list it"
@@ -197,18 +197,13 @@ def _difference(
         return f"it is segment {its_number} of this recording"
     state = inventory.state
     sealed = state.sealed.get(number) if state is not None else None
-    whole = _whole_digest(summary)
+    whole = summary.whole_digest
     if whole != summary.digest and (sealed is None or sealed.digest == whole):
         inventory.stored[number] = summary.digest, summary.size
         inventory.summaries[number] = replace(summary, digest=whole)
     elif sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
         return "it is not the segment that the journal lists: an older or a changed one"
     return None
-
-
-def _whole_digest(summary: SegmentSummary) -> str:
-    """The digest of a segment before chunks of it were moved."""
-    return (summary.compacted or {}).get("digest", summary.digest)  # type: ignore[no-any-return]
 
 
 def _is_listed(inventory: Inventory, state: JournalState, number: int) -> bool:
@@ -280,13 +275,11 @@ def describe(
         for channel_id, channel in sorted(channels.items())
     ]
     _fill_stats(entry, inventory, stamps)
-    tables = {number: summary.table for number, summary in inventory.summaries.items()}
     return Described(
         entry,
         summary_of(entry, inventory.listing.look),
         topic_types(entry),
         inventory.listing.print,
-        tables,
         channels,
     )
 

@@ -710,15 +710,6 @@ class Session:
     def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
         try:
             entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
-        except CatalogError:
-            self.catalog.rebuild()
-            self.invalidate()
-            # Not under the lock of `_follow`: who connects may wait for it.
-            if self.connected is not None and summary.status not in UNFINISHED:
-                # Only the index has the list of unreadable chunks now.
-                with suppress(HybridlogError):
-                    self.connect()
-            entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
         except StoreError:
             if self.directory.has(summary.label):
                 raise
@@ -901,8 +892,7 @@ class Session:
         snapshot = self.snapshot()
         unknown = snapshot.schemas - self._schemas.keys()
         if unknown:
-            with suppress(CatalogError):
-                self._schemas |= self.catalog.schemas(unknown)
+            self._schemas |= self.catalog.schemas(unknown)
         names = {digest: schema.name for digest, schema in self._schemas.items()}
         if snapshot.schemas <= names.keys():
             return names
@@ -985,8 +975,7 @@ class Session:
         """All channels of a recording by id, also those without messages."""
         wanted = {c.schema for c in recording.channels if c.schema is not None}
         if not wanted <= self._schemas.keys():
-            with suppress(CatalogError):
-                self._schemas |= self.catalog.schemas(wanted - self._schemas.keys())
+            self._schemas |= self.catalog.schemas(wanted - self._schemas.keys())
         if not wanted <= self._schemas.keys():
             # The catalog has lost a schema.
             return channels_of(take_inventory(self.directory, recording.label).summaries.values())
@@ -1062,7 +1051,7 @@ class Session:
         *args: _P.args,
         **kwargs: _P.kwargs,
     ) -> _T:
-        """An answer of the catalog, whose lost rows are made again."""
+        """An answer of the catalog; the files are read again if they have changed."""
         try:
             return ask(recording, *args, **kwargs)
         except CatalogError:

@@ -84,7 +84,7 @@ ALLOWED = {
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
     "rosbags": ("hybridlog.demo", "hybridlog.formats.rosbag1.writer", "hybridlog.schema"),
-    "sqlite3": ("hybridlog.formats.rosbag2.sqlite", "hybridlog_storage.catalog"),
+    "sqlite3": ("hybridlog.formats.rosbag2.sqlite",),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
     "websockets": (

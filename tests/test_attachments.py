@@ -198,7 +198,7 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         assert report.entry.segments > 3
         store.rename("drive", "other name")
         assert listed(store.attachments("other-name")) == ATTACHMENTS
-    for derived in ("catalog.sqlite", "mongod", "tables"):
+    for derived in ("catalog", "mongod", "tables"):
         shutil.rmtree(tmp_path / "s" / derived, ignore_errors=True)
         (tmp_path / "s" / derived).unlink(missing_ok=True)
     with hl.open(tmp_path / "s") as store:

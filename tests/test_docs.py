@@ -769,7 +769,7 @@ def older(recorded: hl.Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def copied(recorded: hl.Store, store: Path) -> Path:
     """A copy of the files that are the truth; returns the directory of its recordings."""
-    hidden = shutil.ignore_patterns("mongod*", "catalog.sqlite*")
+    hidden = shutil.ignore_patterns("mongod*", "catalog*")
     shutil.copytree(recorded.directory.path, store, ignore=hidden)
     return store / "recordings"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sqlite3
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -33,8 +32,9 @@ from hybridlog.maintenance.opening import current_entry, describe_now, repair_on
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage import catalog, journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
+from hybridlog_storage.catalog_parts import DiskFolder
 from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.journal import JOURNAL, Journal
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
@@ -120,7 +120,7 @@ class Made:
         return take_inventory(self.directory, self.label)
 
     def entry(self, *, is_open: bool = False) -> RecordingEntry:
-        with closing(Catalog(None, "x")) as catalog:
+        with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
             return describe_now(self.directory, catalog, self.label, is_open=is_open).entry
 
     def lines(self) -> list[bytes]:
@@ -532,7 +532,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
     summary = read_summary(made.segments[2], 2)
     chunk, bounds = summary.table.chunks[0], summary.table.part_bounds()
     parts = summary.table.parts[bounds[0] : bounds[1]]
-    with closing(Catalog(None, "x")) as catalog:
+    with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         catalog.put_damage(made.id, {(2, 0): "its checksum differs", (2, 99): "x", (9, 0): "y"})
         entry = describe_now(made.directory, catalog, made.label).entry
     assert entry.status == "damaged"
@@ -553,7 +553,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
 def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
     label = directory.new_recording("x")
     (directory.recording(label) / "000000.mcap").write_bytes(b"nothing")
-    with closing(Catalog(None, "x")) as catalog:
+    with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         with pytest.raises(SegmentError, match="neither a journal nor a segment"):
             describe_now(directory, catalog, label)
 
@@ -655,57 +655,60 @@ def test_a_lost_journal_is_written_again_at_the_opening(made: Made) -> None:
 def test_a_catalog_that_is_gone_or_damaged_changes_nothing(made: Made) -> None:
     Made(made.directory, "other", segments=2)
     before, _ = opened(made.directory)
-    path = made.directory.path / "catalog.sqlite"
+    (path,) = (made.directory.path / "catalog").glob("part-*")
     whole = path.read_bytes()
-    for content in (b"", b"nothing", whole[:5000], whole[:4096] + bytes(4096) + whole[8192:]):
+    for content in (b"", b"nothing", whole[:500], whole[:400] + bytes(400) + whole[800:]):
         path.write_bytes(content)
         for _ in range(2):
             assert opened(made.directory)[0] == before
-    path.unlink()
+    shutil.rmtree(path.parent)
     assert opened(made.directory)[0] == before
 
 
-@pytest.mark.parametrize(
-    "harm",
-    [
-        "delete from segments where number = 2",
-        "update segments set chunks = x'00'",
-        "update segments set digest = 'sha256:x' where number = 0",
-        "update segments set number = number + 1 where number = 3",
-        "drop table segments",
-        "delete from schemas",
-        "update schemas set data = x'00'",
-        "update schemas set data = 1000000000",
-    ],
-)
-def test_an_answer_needs_nothing_that_the_catalog_has_lost(made: Made, harm: str) -> None:
+@pytest.mark.parametrize("kind", ["part", "schema"])
+@pytest.mark.parametrize("harm", ["gone", "changed", "empty"])
+def test_an_answer_needs_nothing_that_the_catalog_has_lost(
+    made: Made, kind: str, harm: str
+) -> None:
     """What it has lost is made again, and no server is asked."""
-    path = made.directory.path / "catalog.sqlite"
     wanted = [payload(n) for n in range(80)]
     with hl.open(made.directory.path) as store:
         assert [m.raw for m in store.all_topics()] == wanted
-    with closing(sqlite3.connect(path)) as db:
-        db.execute(harm)
-        db.commit()
+    paths = [*(made.directory.path / "catalog").glob(f"{kind}-*")]
+    assert paths
+    for path in paths:
+        if harm == "gone":
+            path.unlink()
+        else:
+            path.write_bytes(b"" if harm == "empty" else path.read_bytes().replace(b"/a", b"/x"))
     with hl.open(made.directory.path) as store:
         assert [m.raw for m in store.all_topics()] == wanted
         assert [m.decode().data for m in store.topic("/b")] == [f"{n:04d}" for n in range(1, 80, 3)]
         (entry,) = store.recordings()
         check(entry)
         assert store.session.connected is None
-    if "schemas" not in harm:
-        with closing(sqlite3.connect(path)) as db:
-            assert db.execute("select count(*) from segments").fetchone() == (4,)
+
+
+def test_chunks_of_another_segment_are_refused(made: Made) -> None:
+    """They are read from the footer, which has to be the one that the entry says."""
+    with closing(Catalog(made.directory.path, "x", in_memory=True)) as empty:
+        entry = made.entry()
+        assert len(empty.table(entry, 0).chunks)
+        changed = replace(entry, digests={**entry.digests, "0": entry.digests["1"]})
+        with pytest.raises(CatalogError, match="has changed"):
+            empty.table(changed, 0)
+        with pytest.raises(CatalogError, match="cannot be opened"):
+            empty.table(entry, 99)
 
 
 def test_the_catalog_may_go_while_the_store_is_open(made: Made) -> None:
-    path = made.directory.path / "catalog.sqlite"
+    folder = made.directory.path / "catalog"
     wanted = [payload(n) for n in range(80)]
     with hl.open(made.directory.path) as store, hl.open(made.directory.path) as other:
         for content in (None, b"", b"nothing" * 1000):
-            path.unlink()
+            shutil.rmtree(folder)
             if content is not None:
-                path.write_bytes(content)
+                folder.write_bytes(content)
             for opened_store in (store, other):
                 opened_store.refresh()
                 check(*opened_store.recordings())
@@ -717,22 +720,20 @@ def test_another_process_may_keep_the_catalog_locked(
     made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(catalog, "_BUSY_S", 0.05)
-    path = made.directory.path / "catalog.sqlite"
+    path = made.directory.path / "catalog"
     wanted = [payload(n) for n in range(80)]
-    with (
-        hl.open(made.directory.path) as store,
-        closing(sqlite3.connect(path, isolation_level=None)) as db,
-    ):
-        db.execute("begin exclusive")
-        for opened_store in (store, hl.open(made.directory.path)):
-            with opened_store:
-                check(*opened_store.recordings())
-                assert [m.raw for m in opened_store.all_topics()] == wanted
+    with hl.open(made.directory.path) as store:
+        check(*store.recordings())
+        with DiskFolder(path).lock(0):
+            for opened_store in (store, hl.open(made.directory.path)):
+                with opened_store:
+                    check(*opened_store.recordings())
+                    assert [m.raw for m in opened_store.all_topics()] == wanted
+                    opened_store.tag(opened_store.recordings()[0].label, seen="yes")
+                    assert opened_store.catalog.locked == path
+            with opened_by_command(made.directory.path, None) as opened_store:
                 opened_store.tag(opened_store.recordings()[0].label, seen="yes")
-                assert opened_store.catalog.locked == path
-        with opened_by_command(made.directory.path, None):
             assert f"`fuser -v {path}`" in capsys.readouterr().err
-        db.execute("rollback")
     with hl.open(made.directory.path) as store:
         assert [entry.tags["seen"] for entry in store.recordings()] == ["yes"]
         assert store.catalog.locked is None

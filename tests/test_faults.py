@@ -6,6 +6,7 @@ import math
 import os
 import random
 import resource
+import shutil
 import signal
 import struct
 import subprocess
@@ -226,6 +227,7 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
         listed: Whether the journal had listed it already, whole.
     """
     (entry,) = store.select(["short"])
+    last = chunk_entries(store.catalog, entry)[-1]
     number, path = store.directory.segments("short")[-1]
     path.with_name(path.name + ".open").write_bytes(path.read_bytes()[:size])
     path.unlink()
@@ -244,7 +246,6 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
     state = IndexState(store.database)
     # All chunks are in the index, and it is not done.
     state.put(entry, "open", turn=1)
-    last = chunk_entries(store.catalog, entry)[-1]
     state.put_through(entry.key, Through(last.segment, last.number, last.offset, entry.messages))
 
 
@@ -740,7 +741,7 @@ def test_one_damaged_recording_keeps_no_other_out_of_the_index(
             assert opened.query(sorted(topics_of(said)), [other]).count() == said.total()
         # Of a chunk it is known without the catalog, too.
         before = entry
-    (store.directory.path / "catalog.sqlite").unlink()
+    shutil.rmtree(store.directory.path / "catalog")
     with reopened(store) as opened:
         (entry,) = opened.select(["short"])
         assert (entry.status, entry.end) == (before.status, before.end)

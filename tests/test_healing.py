@@ -532,7 +532,7 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
     # Threads of other tests in this process may take some of the handles.
     for limit in spare[:100]:
         if not has_catalog:
-            (store / "catalog.sqlite").unlink(missing_ok=True)
+            shutil.rmtree(store / "catalog", ignore_errors=True)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
         try:
             assert ask() == want
@@ -544,7 +544,7 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
         if answers == 3:
             break
     assert answers == 3
-    assert len(failures) >= 2
+    assert failures
     assert all("ulimit -n" in failure for failure in failures)
     assert ask() == want
     assert run("verify", store=store).err == ""
@@ -553,36 +553,39 @@ def test_a_store_without_handles_is_not_a_damaged_one(store: Path, *, has_catalo
 # --- catalog and tables ---
 
 
-def zeroed(catalog: Path) -> None:
-    content = catalog.read_bytes()
-    catalog.write_bytes(content[:4096] + bytes(4096) + content[8192:])
+def zeroed(part: Path) -> None:
+    content = part.read_bytes()
+    part.write_bytes(content[:100] + bytes(100) + content[200:])
 
 
 CATALOG: dict[str, Callable[[Path], object]] = {
-    "a zeroed page": zeroed,
-    "text": lambda catalog: catalog.write_text("no catalog\n" * 999),
-    "cut": lambda catalog: os.truncate(catalog, 5000),
-    "a folder": lambda catalog: (catalog.unlink(), catalog.mkdir()),
-    "a folder for its journal": lambda catalog: Path(f"{catalog}-journal").mkdir(),
+    "zeros": lambda catalog: zeroed(catalog / "part-000000"),
+    "text": lambda catalog: (catalog / "part-000000").write_text("no catalog\n" * 999),
+    "cut": lambda catalog: os.truncate(catalog / "part-000000", 500),
+    "a folder": lambda catalog: (
+        (catalog / "part-000000").unlink(),
+        (catalog / "part-000000").mkdir(),
+    ),
+    "a file": lambda catalog: (shutil.rmtree(catalog), catalog.write_text("no catalog")),
 }
 
 
 @pytest.mark.parametrize("way", CATALOG)
 def test_a_damaged_catalog_is_made_again(store: Path, way: str) -> None:
     listed = json.loads(run("ls", "--json", store=store).out)
-    CATALOG[way](store / "catalog.sqlite")
+    CATALOG[way](store / "catalog")
     done = run("ls", "--json", store=store)
     assert json.loads(done.out) == listed
     assert done.err == "The catalog was damaged, and was made again.\n"
     assert run("ls", store=store).err == ""
 
 
-@pytest.mark.parametrize("way", [*CATALOG][:4])
+@pytest.mark.parametrize("way", CATALOG)
 def test_a_catalog_damaged_while_the_store_is_open(store: Path, way: str) -> None:
     with hl.open(store, mongo=NOWHERE) as opened:
         imu = opened.topic(IMU)
         want = imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)
-        CATALOG[way](store / "catalog.sqlite")
+        CATALOG[way](store / "catalog")
         assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
         opened.refresh()
         assert len(opened.recordings()) == 2

@@ -29,10 +29,8 @@ OLD = 1_000_000_000  # a time of reading that any reading changes
 
 FILES = {
     "hybridlog.toml": "hybridlog.toml",
-    "catalog": "catalog.sqlite",
-    "catalog's journal": "catalog.sqlite-journal",
-    "catalog's log": "catalog.sqlite-wal",
-    "catalog's memory": "catalog.sqlite-shm",
+    "part of the catalog": "catalog/part-000000",
+    "new part of the catalog": "catalog/part-000001",
     "journal": "recordings/small/journal",
     "lock": "recordings/small/writer.lock",
     "segment": "recordings/small/000000.mcap",
@@ -46,6 +44,7 @@ FOLDERS = {
     "recordings": "recordings",
     "recording": "recordings/small",
     "new recording": "recordings/live",
+    "catalog": "catalog",
     "removed recording": "recordings/.removed-small-0123abcd",
     "recorders": "recorders",
     "tables": "tables",
@@ -70,7 +69,7 @@ MONGOD_FOLDERS = ("", "data", "data/journal", "data/diagnostic.data")
 
 # Other kinds of files, which mongod alone makes.
 OF_MONGOD = re.compile(r"mongod(-\d+)?(/.*)?")
-OF_TABLES = re.compile(r"tables/.*")
+OF_TABLES = re.compile(r"(tables|catalog)/.*")
 
 
 @pytest.fixture(scope="module")

@@ -345,7 +345,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             assert (mirror["name"], mirror["tags"]) == ("second floor", {"a": "3"})
         store.rebuild_index()
         check(store)
-    (place / "catalog.sqlite").unlink()
+    shutil.rmtree(place / "catalog")
     with hl.open(place, mongo=uri) as store:
         check(store)
 

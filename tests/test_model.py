@@ -13,12 +13,10 @@ import json
 import random
 import re
 import shutil
-import sqlite3
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from itertools import count, cycle
@@ -504,24 +502,20 @@ class Machine(RuleBasedStateMachine):
         assert set(self.store.repairs.indexed) == {k.label for k in self.model.values()}
         self.changed = True
 
-    @rule(how=st.sampled_from(["deleted", "page", "row"]), spot=st.integers(0, SPOTS))
+    @rule(how=st.sampled_from(["deleted", "page", "byte"]), spot=st.integers(0, SPOTS))
     def lose_the_catalog(self, how: str, spot: int) -> None:
         """Whatever of the catalog is gone or changed is made again, and nobody has to ask."""
         self.store.close()
-        path = self.path / "catalog.sqlite"
-        if how == "deleted":
-            path.unlink()
-        elif how == "page":
-            content = bytearray(path.read_bytes())
-            page = spot % (len(content) // 4096)
-            content[page * 4096 : (page + 1) * 4096] = bytes(4096)
-            path.write_bytes(content)
-        else:
-            with closing(sqlite3.connect(path)) as catalog, catalog:
-                table = ("recordings", "segments", "stamps", "schemas")[spot % 4]
-                column = {"recordings": "entry", "segments": "chunks", "stamps": "rows"}
-                changed = column.get(table, "data")
-                catalog.execute(f"update {table} set {changed} = substr({changed}, 2)")
+        folder = self.path / "catalog"
+        for path in [*folder.glob("part-*"), *folder.glob("schema-*")]:
+            if how == "deleted":
+                path.unlink()
+            else:
+                content = bytearray(path.read_bytes())
+                begin = spot % len(content)
+                size = 4096 if how == "page" else 1
+                content[begin : begin + size] = bytes(len(content[begin : begin + size]))
+                path.write_bytes(content)
         self.store = hl.open(self.path, require_database=True)
         topics = tuple(sorted({t for k in self.model.values() for t in k.topics}))
         if topics:

@@ -73,9 +73,8 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.tag("odd", place="lab")
         store.untag("odd", "place")
         store.mark("odd", BASE + STEP, "here")
-    for name in ("mongod", "catalog.sqlite", "catalog.sqlite-journal"):
+    for name in ("mongod", "catalog"):
         shutil.rmtree(path / name, ignore_errors=True)
-        (path / name).unlink(missing_ok=True)
     return path
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.topics import matcher
-from hybridlog_storage.catalog import CATALOG, Catalog
+from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.database import CollectionStats, Database
 from hybridlog_storage.mongo.topic_places import SHARED
@@ -183,13 +182,6 @@ def test_without_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> No
     sizes = store.sizes()
     assert sizes.total.index_bytes is None
     assert sizes.total.total_bytes == sizes.total.segment_bytes + sizes.total.table_bytes
-
-
-def test_a_lost_row_of_the_catalog_is_made_again(place: Path) -> None:
-    with sqlite3.connect(place / CATALOG) as db:
-        db.execute("delete from segments")
-    with hl.open(place) as store:
-        assert store.sizes(["one"]).total.segment_bytes == store.entry("one").stored_bytes
 
 
 def test_as_commands(place: Path) -> None:

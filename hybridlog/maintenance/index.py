@@ -19,7 +19,6 @@ from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
-    CatalogError,
     HeldError,
     HybridlogError,
     SegmentError,
@@ -143,9 +142,8 @@ def _bring_one(
 
 def _restore_damage(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
     """Copy the index's list of unreadable chunks to the catalog; True if it changed."""
-    with suppress(CatalogError):
-        if catalog.damage(entry.id) == indexed.damage:
-            return False
+    if catalog.damage(entry.id) == indexed.damage:
+        return False
     catalog.put_damage(entry.id, indexed.damage)
     return True
 

@@ -65,12 +65,7 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
         in_memory: Use memory in any case, for a full disk.
     """
     store_id = directory.settings.store_id
-    if in_memory or not directory.is_writable:
-        return Catalog(None, store_id)
-    try:
-        return Catalog(directory.path, store_id)
-    except DiskFullError:
-        return Catalog(None, store_id)
+    return Catalog(directory.path, store_id, in_memory=in_memory or not directory.is_writable)
 
 
 def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
@@ -84,14 +79,6 @@ def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairRe
         catalog: Its catalog.
         report: Collects problems and repairs.
     """
-    try:
-        return _repair_on_open(directory, catalog, report)
-    except CatalogError:
-        catalog.rebuild()
-        return _repair_on_open(directory, catalog, report)
-
-
-def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
     from hybridlog.maintenance import tables
 
     # A recording has its directory before it has tables.
@@ -101,6 +88,7 @@ def _repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairR
             if name.startswith(REMOVED):
                 directory.sweep(name)
     rows = catalog.summaries()
+    catalog.drop_damaged()  # before the index is compared with entries, which may be lost then
     known = {summary.label: summary for summary in rows}
     for _ in range(_TRIES):
         names = directory.names()
@@ -197,10 +185,12 @@ def _find(
         report: Collects problems and repairs.
     """
     found: dict[str, list[RecordingSummary]] = {}
+    unchanged: list[RecordingSummary] = []
     for label, look in looks.items():
         summary = known.get(label)
         if summary is None or summary.look != look or summary.status in UNFINISHED:
             try:
+                before = summary
                 summary = _look_again(directory, catalog, label, summary, report)
             except DiskFullError:
                 raise
@@ -208,8 +198,11 @@ def _find(
                 if directory.has(label):  # another process may have removed or renamed it
                     report.unreadable[label] = str(error)
                 continue
+            if summary is not None and before is not None and summary.look != before.look:
+                unchanged.append(summary)
         if summary is not None:
             found.setdefault(summary.id, []).append(summary)
+    catalog.put_looks(unchanged)
     return found
 
 
@@ -225,10 +218,7 @@ def _look_again(
         listing = directory.listing(label)
         row = catalog.recording(summary.id)
         if row is not None and _is_current(directory, row[1], row[0], listing):
-            if summary.look != listing.look:
-                summary = summary._replace(look=listing.look)
-                catalog.put_look(summary)
-            return summary
+            return summary._replace(look=listing.look)
     described = _refresh(directory, catalog, label, report)
     return described.summary if described is not None else None
 
@@ -548,16 +538,6 @@ def put_described(
     directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
 ) -> Described:
     """As `put_entry`, and return all that was read."""
-    try:
-        return _put_described(directory, catalog, label, is_open=is_open)
-    except CatalogError:
-        catalog.rebuild()
-        return _put_described(directory, catalog, label, is_open=is_open)
-
-
-def _put_described(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool
-) -> Described:
     described = describe_now(directory, catalog, label, is_open=is_open)
     if directory.is_writable or catalog.is_in_memory:
         catalog.put(described)
@@ -565,25 +545,20 @@ def _put_described(
 
 
 def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Restore lost catalog rows of a recording.
+    """Read the files of a recording again, after one of them was not what its entry says.
 
     Raises:
-        StoreError: Its files cannot be read, or have changed.
+        StoreError: They cannot be read, or have changed.
     """
-    catalog.mend()
-    for _ in range(2):
-        put_entry(directory, catalog, entry.label, is_open=directory.is_recorded(entry.label))
+    put_entry(directory, catalog, entry.label, is_open=directory.is_recorded(entry.label))
+    for number, _, _ in entry.spans:
         try:
-            for number, _, _ in entry.spans:
-                catalog.table(entry, number)
-        except CatalogError:
-            catalog.rebuild()
-        else:
-            return
-    raise StoreError(
-        f"The files of recording {entry.label!r} have changed since the store was opened. "
-        "Open it again."
-    )
+            catalog.table(entry, number)
+        except CatalogError as error:
+            raise StoreError(
+                f"The files of recording {entry.label!r} have changed since the store was "
+                "opened. Open it again."
+            ) from error
 
 
 def describe_now(

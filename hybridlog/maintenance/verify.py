@@ -102,7 +102,8 @@ def verify(
         progress: Called after each part of a segment.
     """
     result = Verification(index=database is not None)
-    if not catalog.is_sound():
+    labels = None if labels is None else [*labels]
+    if not catalog.is_sound(labels):
         result.findings.append(Finding("", "catalog", "the file is damaged", _REPAIR))
     index = None if database is None else _Index(database, count_all=labels is None)
     checker = tables.TableChecker(directory)

@@ -1,38 +1,53 @@
-"""The catalog: a local file that lists recordings, channels and chunks.
+"""The catalog: what is known of all recordings of a store, without a look at their files.
 
-It is derived from journals and segment summaries, and may be deleted at any time. It is an
-SQLite file, so that listing and choosing recordings, and fetching by topic and time, need
-one file and no server. Each row has a checksum. The row of a recording also stores the
-state of its files (sizes, times). A row is used only while both are unchanged.
+It is derived from journals and segments, and may be deleted at any time. It lists recordings
+with summaries, and says more of those that are asked about: their channels, statistics and
+losses, and what was found out by decoding. It comes in parts, see `catalog_parts`, so a change
+writes little. What it says of a recording also has the state of the files that it was read
+from (sizes, times), and is used only while that is unchanged. Chunks are read from the footers
+of segments.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
-import os
-import sqlite3
 import stat
-from collections import Counter, OrderedDict
+from base64 import b64decode, b64encode
+from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Final
+from zlib import compress, decompress
+from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
 
-from hybridlog_storage.checksum import crc32
+from hybridlog_storage.catalog_parts import (
+    DAMAGE,
+    ENTRY,
+    MAX_PART_BYTES,
+    STAMPS,
+    SUMMARY,
+    TOPICS,
+    DiskFolder,
+    MemoryFolder,
+    PartContent,
+    Version,
+    is_of_another,
+    number_of,
+    part_name,
+)
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
     CatalogError,
-    DiskFullError,
-    HybridlogError,
+    ResourceError,
+    SegmentError,
     StoreError,
     exhausted,
 )
@@ -40,7 +55,8 @@ from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk_table import ChunkTable
-from hybridlog_storage.segments.segment_reader import ChunkPlace
+from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.summary import (
     RecordingSummary,
     TopicType,
@@ -54,27 +70,13 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.segments.open_segment import Flushed
 
-CATALOG: Final = "catalog.sqlite"
-"""Name of the file in the store's directory."""
-_JOURNAL: Final = f"{CATALOG}-journal"
-_VERSION: Final = 4
+CATALOG: Final = "catalog"
+"""Name of the folder in the store's directory."""
+_SCHEMA: Final = "schema-"
+"""Prefix of the files of schemas, by hash."""
+_RECORDINGS: Final = "recordings"
+_TOPICS = RecordingSummary._fields.index("topics")
 _BUSY_S: Final = 1.0
-_NO_DAMAGE: Final = frozenset(
-    {
-        sqlite3.SQLITE_BUSY,
-        sqlite3.SQLITE_CANTOPEN,
-        sqlite3.SQLITE_FULL,
-        sqlite3.SQLITE_INTERRUPT,
-        sqlite3.SQLITE_IOERR,
-        sqlite3.SQLITE_LOCKED,
-        sqlite3.SQLITE_NOMEM,
-        sqlite3.SQLITE_PERM,
-        sqlite3.SQLITE_READONLY,
-    }
-)
-"""SQLite errors that are independent of the file's content."""
-_HEAD: Final = b"SQLite format 3\0\x10\0\1\1"
-"""The first bytes of the file, with its page size and rollback journal mode."""
 _CACHED_BYTES: Final = 64 << 20  # of chunk tables
 _STAMPS = np.dtype(
     [
@@ -89,37 +91,6 @@ _STAMPS = np.dtype(
     ]
 )
 """Results of decoding; one row for each row of `ChunkTable.parts`."""
-_TABLES: Final = """
-create table meta (key text primary key, value text not null) without rowid;
-create table recordings (
-    id text primary key, files text not null, entry text not null,
-    crc integer not null) without rowid;
-create table summaries (
-    id text primary key, summary text not null, crc integer not null,
-    indexed text not null default '', damage integer not null default 0) without rowid;
-create table topics (hash text primary key, topics text not null) without rowid;
-create table fingerprints (
-    fingerprint text not null, id text not null, primary key (fingerprint, id)) without rowid;
-create table segments (
-    id text not null, number integer not null, digest text not null, chunks blob not null,
-    crc integer not null, primary key (id, number));
-create table stamps (
-    id text not null, number integer not null, digest text not null, rows blob not null,
-    crc integer not null, primary key (id, number));
-create table damage (
-    id text primary key, chunks text not null, crc integer not null) without rowid;
-create table schemas (
-    hash text primary key, name text not null, encoding text not null, data blob not null);
-"""
-_BY_RECORDING: Final = (
-    "recordings",
-    "summaries",
-    "fingerprints",
-    "segments",
-    "stamps",
-    "damage",
-)
-"""Tables with rows of recordings, by their `id`."""
 
 
 @dataclass(slots=True)
@@ -352,29 +323,10 @@ class ChunkEntry:
         return sum(stats.messages for stats in self.stats.values())
 
 
-def _damage_crc(db: sqlite3.Connection, recording: str) -> int:
-    """Checksum of a recording's list of unreadable chunks; 0 without one."""
-    row = db.execute("select crc from damage where id = ?", (recording,)).fetchone()
-    if row is None:
-        return 0
-    return row[0] if isinstance(row[0], int) else -1
-
-
-def _put_summary(db: sqlite3.Connection, described: Described) -> None:
-    entry, text = described.entry, described.summary.to_json()
-    topics = described.summary.topics, topics_to_json(described.topics)
-    db.execute("insert or replace into topics values (?, ?)", topics)
-    row = entry.id, text, _text_crc(text), _damage_crc(db, entry.id)
-    db.execute("insert or replace into summaries values (?, ?, ?, '', ?)", row)
-    db.execute("delete from fingerprints where id = ?", (entry.id,))
-    rows = [(fingerprint, entry.id) for fingerprint in _fingerprints(entry)]
-    db.executemany("insert into fingerprints values (?, ?)", rows)
-
-
-def _fingerprints(entry: RecordingEntry) -> set[str]:
+def _fingerprints(source: Mapping[str, Any]) -> set[str]:
     """Fingerprints of the log of a recording and of its parts."""
-    parts = entry.source.get("parts")
-    found = [entry.source.get("fingerprint"), *(parts if isinstance(parts, list) else ())]
+    parts = source.get("parts")
+    found = [source.get("fingerprint"), *(parts if isinstance(parts, list) else ())]
     return {fingerprint for fingerprint in found if isinstance(fingerprint, str)}
 
 
@@ -477,7 +429,6 @@ class Described:
         summary: Its summary.
         topics: Its topics and their types.
         files: State of the files; the row is used while it is unchanged.
-        tables: Chunks of each valid segment, by number.
         channels: By id.
     """
 
@@ -485,432 +436,294 @@ class Described:
     summary: RecordingSummary
     topics: Collection[TopicType]
     files: str
-    tables: Mapping[int, ChunkTable]
     channels: Mapping[int, Channel]
+
+
+@dataclass(slots=True)
+class _Part:
+    """What is known of a part: its list.
+
+    Attributes:
+        version: As of the folder; empty before it was read again.
+        size: Bytes of the file.
+        summaries: By id; None for recordings without one.
+        shared: Sets of topics as text, by kind and hash.
+        damage: Lists of unreadable chunks as text, by id.
+    """
+
+    version: Version = ()
+    size: int = 0
+    summaries: dict[str, RecordingSummary | None] = field(default_factory=dict)
+    shared: dict[tuple[str, str], str] = field(default_factory=dict)
+    damage: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, content: PartContent, version: Version, size: int) -> _Part:
+        """The list of a part."""
+        sets = {key: text for key, text in content.shared.items() if key[0] == TOPICS}
+        found = cls(version, size, shared=sets)
+        for recording, row in content.rows.items():
+            found.summaries[recording] = None
+            if SUMMARY in row:
+                index, _, text = row[SUMMARY].partition(" ")
+                # A list of unreadable chunks may be lost; the index has it, too.
+                index = index.strip("-") if content.is_whole else ""
+                summary = RecordingSummary.from_values(json.loads(text), index)
+                if (TOPICS, summary.topics) in sets:
+                    found.summaries[recording] = summary
+            if DAMAGE in row:
+                found.damage[recording] = row[DAMAGE]
+        return found
 
 
 class Catalog:
     """The catalog of a store. Thread safe.
 
     Args:
-        store: The store's directory; None for a catalog in memory, if this user cannot write
-        the store.
-        store_id: The store's id; the catalog of another store is rebuilt.
+        store: The store's directory.
+        store_id: The store's id; what is of another store is removed.
+        in_memory: Leave no file, for a store that this user cannot write.
 
     Attributes:
-        was_damaged: True if a damaged file was replaced by an empty one.
-        locked: The file, if another process keeps it locked; a catalog in memory replaces it.
+        was_damaged: True if something damaged was found since this was last set to False.
+        locked: The folder, if another process keeps it locked; a catalog in memory replaces it.
     """
 
-    def __init__(self, store: Path | None, store_id: str) -> None:
+    def __init__(self, store: Path, store_id: str, *, in_memory: bool = False) -> None:
         self.was_damaged = False
         self.locked: Path | None = None
-        self._path = store / CATALOG if store is not None else None
+        self._store = store
         self._store_id = store_id
         self._lock = taken_by_forks(RLock())
-        self._file: tuple[int, int] | None = None
+        self._folder = MemoryFolder()
+        self._parts: dict[int, _Part] = {}
+        self._places: dict[str, int] = {}  # number of its part, by id of a recording
+        self._by_fingerprint: dict[str, list[str]] | None = None
+        self._odd: set[str] = set()  # names of files that are not ours, or left over
+        self._damaged: set[int] = set()  # numbers of parts
         self._tables: OrderedDict[tuple[str, int, str], tuple[ChunkTable, NDArray[np.void] | None]]
         self._tables = OrderedDict()
         self._cached = 0
-        self._db = self._open()
+        if not in_memory:
+            self._folder = DiskFolder(store / CATALOG)
+            self._check_folder()
+
+    @property
+    def path(self) -> Path:
+        """Its folder."""
+        return self._store / CATALOG
 
     @property
     def is_in_memory(self) -> bool:
         """True if it exists in the memory of this process only."""
-        return self._path is None
+        return not isinstance(self._folder, DiskFolder)
 
     def close(self) -> None:
-        """Close the file."""
-        with self._lock:
-            self._db.close()
-            self._forget()
-
-    # Opening.
-
-    def _open(self) -> sqlite3.Connection:
-        try:
-            return self._connect()
-        except sqlite3.Error as error:
-            if _is_locked(error):
-                self.locked, self._path = self._path, None
-                return self._connect()
-            if not _is_damage(error) and not self._has_odd_journal():
-                raise self._told(error, "opened") from error
-            self.was_damaged = True
-            self._delete()
-        try:
-            return self._connect()
-        except sqlite3.Error as error:
-            raise self._told(error, "made") from error
-
-    def _connect(self) -> sqlite3.Connection:
-        if self._path is None:
-            db = sqlite3.connect(":memory:", check_same_thread=False, isolation_level=None)
-        else:
-            # SQLite itself follows only a symlink in place of the file.
-            path = Path(os.path.realpath(self._path.parent)) / CATALOG
-            try:
-                # The group may write it if it may write the store.
-                fd = files.open_file(path, os.O_RDWR | os.O_CREAT, depth=files.IN_STORE)
-                try:
-                    self._file = _identity(os.fstat(fd))
-                    head = os.pread(fd, len(_HEAD), 0)
-                finally:
-                    os.close(fd)
-            except IsADirectoryError as error:
-                raise sqlite3.DatabaseError("it is a directory") from error
-            except OSError as error:
-                raise durability.explain(error, self._path, "opening") from error
-            if head and (head[:16] != _HEAD[:16] or head[18:] != _HEAD[18:]):
-                raise sqlite3.DatabaseError("it is not a catalog")
-            db = sqlite3.connect(
-                path, timeout=_BUSY_S, check_same_thread=False, isolation_level=None
-            )
-            ((_, _, opened),) = db.execute("pragma database_list").fetchall()
-            if opened != str(path):
-                db.close()
-                raise StoreError(f"{self._path} is a symlink. Delete it: the catalog is rebuilt.")
-        try:
-            db.execute("pragma synchronous = off")  # a catalog broken by a power cut is rebuilt
-            db.execute("pragma cell_size_check = on")
-            # Damaged text invalidates its row, not the whole catalog.
-            db.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")
-            if not self._is_ours(db):
-                self._make(db)
-        except BaseException:
-            db.close()
-            raise
-        return db
-
-    def _is_ours(self, db: sqlite3.Connection) -> bool:
-        """True if the tables have this version and belong to this store."""
-        found = db.execute("select count(*) from sqlite_master where name = 'meta'").fetchone()
-        if not found[0]:
-            return False
-        made = db.execute("select key, value from meta").fetchall()
-        return sorted(made) == [("store", self._store_id), ("version", str(_VERSION))]
-
-    def _make(self, db: sqlite3.Connection, *, anew: bool = False) -> None:
-        """Create the tables, unless another process has just done so."""
-        db.execute("begin immediate")
-        try:
-            if anew or not self._is_ours(db):
-                tables = db.execute("select name from sqlite_master where type = 'table'")
-                for (name,) in tables.fetchall():
-                    db.execute(f'drop table "{name}"')
-                for statement in _TABLES.split(";"):
-                    db.execute(statement)
-                db.executemany(
-                    "insert into meta values (?, ?)",
-                    [("version", str(_VERSION)), ("store", self._store_id)],
-                )
-            db.execute("commit")
-        except BaseException:
-            with suppress(sqlite3.Error):
-                db.execute("rollback")
-            raise
-
-    def _delete(self) -> None:
-        if self._path is not None:
-            for name in (CATALOG, _JOURNAL):
-                files.remove_tree(self._path.with_name(name), depth=files.IN_STORE)
-
-    def _has_odd_journal(self) -> bool:
-        """True if a directory is in the place of SQLite's journal."""
-        if self._path is None:
-            return False
-        try:
-            about = files.status(self._path.with_name(_JOURNAL), depth=files.IN_STORE)
-        except OSError:
-            return False
-        return stat.S_ISDIR(about.st_mode)
-
-    def rebuild(self) -> None:
-        """Replace the catalog with an empty one.
-
-        Raises:
-            StoreError: It cannot be written.
-        """
+        """Drop what was read, and remove what was found to be damaged."""
         with self._lock:
             self._forget()
-            self.was_damaged = self._path is not None
-            try:
-                if self._is_sound():
-                    # Other processes may still use the open file.
-                    self._make(self._db, anew=True)
-                    return
-            except sqlite3.Error as error:
-                if not _is_damage(error):
-                    told = self._told(error, "made")
-                    if self._path is None:
-                        return
-                    raise told from error
-            self._db.close()
-            self._delete()
-            self._db = self._open()
+            self.drop_damaged()
 
-    def mend(self) -> None:
-        """Replace the catalog with an empty one, unless only single rows are damaged.
+    def _check_folder(self) -> None:
+        try:
+            kind = files.status(self.path, depth=files.IN_STORE).st_mode
+            if stat.S_ISLNK(kind):
+                raise StoreError(f"{self.path} is a symlink. Delete it: the catalog is rebuilt.")
+            if not stat.S_ISDIR(kind):
+                self.was_damaged = True
+                files.remove_tree(self.path, depth=files.IN_STORE)
+        except FileNotFoundError:
+            pass  # it is made with the first recording
+        except OSError as error:
+            raise durability.explain(error, self.path, "opening") from error
 
-        Writing into a damaged file would damage other rows.
-
-        Raises:
-            StoreError: It cannot be read or written.
-        """
-        with self._lock:
-            try:
-                if self._is_sound():
-                    return
-            except sqlite3.Error as error:
-                if not _is_damage(error):
-                    raise self._told(error, "read") from error
-            self.rebuild()
-
-    def is_sound(self) -> bool:
-        """True if the file structure is intact; rows are checked when they are read.
-
-        Raises:
-            StoreError: It cannot be read.
-        """
-        with self._lock:
-            try:
-                return self._is_sound()
-            except sqlite3.Error as error:
-                if _is_damage(error):
-                    return False
-                raise self._told(error, "read") from error
-
-    def _is_sound(self) -> bool:
-        return bool(self._db.execute("pragma quick_check(1)").fetchone() == ("ok",))
+    # Parts.
 
     def _follow(self) -> None:
-        """Reopen the file if another process replaced it."""
-        if self._path is None:
+        """Read the lists of parts that have changed.
+
+        Raises:
+            StoreError: The folder cannot be read.
+        """
+        if not self._folder.has_changed():
             return
         try:
-            now = _identity(files.status(self._path, depth=files.IN_STORE))
-        except OSError:
-            now = None
-        if now != self._file:
-            self._db.close()
-            self._forget()
-            self._db = self._open()
+            versions = self._folder.versions()
+        except NotADirectoryError:  # ELOOP for a symlink
+            self._check_folder()
+            versions = {}
+        except OSError as error:
+            raise durability.explain(error, self.path, "reading") from error
+        parts: dict[int, _Part] = {}
+        self._odd = set()
+        for name, version in versions.items():
+            number = number_of(name)
+            if number is None:
+                if not name.startswith(_SCHEMA):
+                    self._odd.add(name)
+                continue
+            known = self._parts.get(number)
+            is_known = known is not None and known.version == version
+            found = known if is_known else self._read_list(name, version)
+            if found is not None:
+                parts[number] = found
+        self._parts = parts
+        self._place()
 
-    def _told(self, error: sqlite3.Error, what: str) -> HybridlogError:
-        """Map an SQLite error to a hybridlog error."""
-        short = exhausted(_system_error(error), f"using {self._path}")
-        if short is not None:
-            return short
-        if _is_locked(error):
-            with self._lock:
-                self._db.close()
-                self._forget()
-                self.locked, self._path = self._path, None
-                self._db = self._connect()
-            return CatalogError(f"Another process keeps the catalog {self.locked} locked.")
-        name = getattr(error, "sqlite_errorname", "")
-        if name == "SQLITE_FULL" or "is full" in str(error):
-            return DiskFullError(
-                f"No space left while writing {self._path}. Free some space and run the "
-                "command again."
-            )
-        if _is_damage(error):
-            return CatalogError(
-                f"The catalog {self._path} is damaged: {error}. `hybridlog index rebuild` makes "
-                "it again."
-            )
-        return StoreError(
-            f"The catalog {self._path} cannot be {what}: {error}. Delete it while no "
-            "process uses the store; it is rebuilt."
-        )
+    def _place(self) -> None:
+        self._by_fingerprint = None
+        self._places = {
+            recording: number
+            for number, part in sorted(self._parts.items())
+            for recording in part.summaries
+        }
+
+    def _read_list(self, name: str, version: Version) -> _Part | None:
+        data = self._data_of(name)
+        if data is None:
+            return None
+        if is_of_another(self._store_id, data):
+            self._odd.add(name)
+            return None
+        found = PartContent.from_bytes(self._store_id, data, is_list=True)
+        self._check(number_of(name) or 0, found)
+        return _Part.of(found, version, len(data))
+
+    def _read(self, number: int) -> PartContent:
+        """Everything in a part but what is damaged; nothing if it does not exist."""
+        data = self._data_of(part_name(number))
+        if data is None or is_of_another(self._store_id, data):
+            return PartContent()
+        found = PartContent.from_bytes(self._store_id, data)
+        self._check(number, found)
+        return found
+
+    def _check(self, number: int, content: PartContent) -> None:
+        if not content.is_whole:
+            self.was_damaged = True
+            self._damaged.add(number)
+
+    def _data_of(self, name: str) -> bytes | None:
+        """The content of a file; nothing if it cannot be read, None if it does not exist."""
+        try:
+            return self._folder.read(name)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            short = exhausted(error.errno, f"reading {self.path / name}")
+            if short is not None:
+                raise short from error
+            return b""
 
     @contextmanager
-    def _reading(self) -> Iterator[sqlite3.Connection]:
-        """A context for reading.
-
-        Raises:
-            CatalogError: The file is damaged.
-            StoreError: It cannot be read.
-        """
-        with self._lock:
-            try:
-                yield self._db
-            except sqlite3.Error as error:
-                raise self._told(error, "read") from error
-
-    def _change(self, work: Callable[[sqlite3.Connection], None]) -> None:
-        """A transaction; a damaged catalog is replaced first.
-
-        The end of a recording must not fail because of data that can be rebuilt.
+    def _changing(self) -> Iterator[None]:
+        """A change of some parts, without other writers.
 
         Raises:
             DiskFullError: There is no room.
             StoreError: They cannot be written.
         """
-        try:
-            with self._changing() as db:
-                work(db)
-        except CatalogError:
-            self.rebuild()
-            with self._changing() as db:
-                work(db)
-
-    def _note(self, work: Callable[[sqlite3.Connection], None]) -> None:
-        """A transaction that saves work later; left out if another process writes just now."""
-        with self._lock, suppress(sqlite3.Error):
+        with self._lock, ExitStack() as stack:
             try:
-                self._db.execute("pragma busy_timeout = 0")
-                with self._writing() as db:
-                    work(db)
-            finally:
-                self._db.execute(f"pragma busy_timeout = {int(_BUSY_S * 1000)}")
-
-    @contextmanager
-    def _changing(self) -> Iterator[sqlite3.Connection]:
-        """A transaction.
-
-        Raises:
-            CatalogError: The file is damaged.
-            DiskFullError: There is no room.
-            StoreError: They cannot be written.
-        """
-        try:
-            with self._writing() as db:
-                yield db
-        except sqlite3.Error as error:
-            self._forget()
-            raise self._told(error, "written") from error
-
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        with self._lock:
-            self._follow()
-            self._db.execute("begin immediate")
+                try:
+                    stack.enter_context(self._folder.lock(_BUSY_S))
+                except NotADirectoryError:
+                    self._check_folder()
+                    stack.enter_context(self._folder.lock(_BUSY_S))
+            except BlockingIOError:
+                self.locked, copy = self.path, MemoryFolder()
+                for name in self._folder.versions():
+                    copy.write(name, self._data_of(name) or b"")
+                self._folder = copy
+            except OSError as error:
+                raise durability.explain(error, self.path, "writing") from error
             try:
-                yield self._db
-            except BaseException:
-                with suppress(sqlite3.Error):
-                    self._db.execute("rollback")
-                raise
-            self._db.execute("commit")
+                self._follow()
+                self._tidy()
+                yield
+            except OSError as error:
+                raise durability.explain(error, self.path, "writing") from error
 
-    def _forget(self, recording: str | None = None) -> None:
-        for key in [k for k in self._tables if recording in {None, k[0]}]:
-            table, _ = self._tables.pop(key)
-            self._cached -= _size(table)
+    def _tidy(self) -> None:
+        """Remove files that are not ours, and what is damaged."""
+        for name in self._odd:
+            self._folder.remove(name)
+        self._odd.clear()
+        for number in self._damaged & self._parts.keys():
+            content = self._read(number)
+            for row in content.rows.values():  # what is lost is not known
+                row.pop(ENTRY, None)
+                if SUMMARY in row:
+                    row[SUMMARY] = f"- {row[SUMMARY].partition(' ')[2]}"
+            self._write(number, content)
+        self._damaged.clear()
 
-    # Recordings.
+    def _write(self, number: int, content: PartContent) -> None:
+        """Replace a part."""
+        name = part_name(number)
+        # A recording that got another part is listed there.
+        rows = {r: row for r, row in content.rows.items() if self._places.get(r, number) == number}
+        if not rows:
+            self._folder.remove(name)
+            self._parts.pop(number, None)
+            return
+        texts = [row[SUMMARY] for row in rows.values() if SUMMARY in row]
+        sets = {json.loads(text.partition(" ")[2])[_TOPICS] for text in texts}
+        shared = {key: text for key, text in content.shared.items() if key[1] in sets}
+        whole = PartContent(rows, shared)
+        data = whole.to_bytes(self._store_id)
+        self._folder.write(name, data)
+        self._parts[number] = _Part.of(whole, (), len(data))
 
-    def put(self, described: Described) -> None:
-        """Insert or replace a recording and all its chunks."""
-        entry = described.entry
-        # In ASCII: a directory's name may not be UTF-8.
-        text = json.dumps(entry.to_document(), separators=(",", ":"))
-        row = (entry.id, described.files, text)
-
-        def work(db: sqlite3.Connection) -> None:
-            self._forget(entry.id)
-            db.execute("delete from segments where id = ?", (entry.id,))
-            for number, table in described.tables.items():
-                part = (entry.id, number, entry.digests[str(number)], table.to_bytes())
-                db.execute("insert into segments values (?, ?, ?, ?, ?)", (*part, _crc(*part)))
-            db.executemany(
-                "insert or replace into schemas values (?, ?, ?, ?)",
-                [
-                    (schema_hash(s), s.name, s.encoding, s.data)
-                    for s in {c.schema for c in described.channels.values()}
-                    if s is not None
-                ],
-            )
-            db.execute("insert or replace into recordings values (?, ?, ?, ?)", (*row, _crc(*row)))
-            _put_summary(db, described)
-
-        self._change(work)
-
-    def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
-        """Summaries of recordings, unordered; without damaged ones.
+    def _change(self, recording: str, change: Callable[[dict[str, str]], None], *sets: str) -> None:
+        """Change the row of a recording; an empty one is removed.
 
         Args:
-            recordings: Their ids; None for all.
-
-        Raises:
-            CatalogError: More than single rows is damaged.
+            recording: Its id.
+            change: Changes its texts by kind.
+            sets: Sets of topics that it may have, as text.
         """
-        with self._reading():
-            self._follow()
-            rows = self._rows("summary, crc, indexed, damage, id", "summaries", recordings)
-            lists = self._rows("id, chunks, crc", "damage", recordings)
-            whole = {row[0]: row[2] for row in lists if _crc(*row[:2]) == row[2]}
-            # The index has the list of unreadable chunks, too.
-            good = [
-                (text, index if whole.get(recording, 0) == damage else "")
-                for text, crc, index, damage, recording in rows
-                if _text_crc(text) == crc
-            ]
-            if len(good) < len(rows) and not self._is_sound():
-                raise CatalogError(f"The catalog {self._path} is damaged.")
-        values = json.loads(f"[{','.join(text for text, _ in good)}]")
-        return [
-            RecordingSummary.from_values(row, index)
-            for row, (_, index) in zip(values, good, strict=True)
-        ]
+        with self._changing():
+            number = self._places.get(recording)
+            if number is None:  # the smallest part takes it
+                sizes = {n: part.size for n, part in self._parts.items()}
+                number = min(sizes, key=sizes.__getitem__, default=0)
+            content = self._read(number)
+            row = content.rows.setdefault(recording, {})
+            change(row)
+            content.shared.update(((TOPICS, hash_of(text)), text) for text in sets)
+            self._by_fingerprint = None
+            self._places.pop(recording, None)
+            if not row:
+                del content.rows[recording]
+            elif len(content.rows) > 1 and content.size > MAX_PART_BYTES:
+                self._places[recording] = free = max(self._parts) + 1
+                self._write(free, PartContent({recording: row}, content.shared))
+            else:
+                self._places[recording] = number
+            self._write(number, content)
 
-    def _rows(
-        self, columns: str, table: str, recordings: Collection[str] | None
-    ) -> list[tuple[Any, ...]]:
-        asked = f"select {columns} from {table}"  # noqa: S608 - names of ours
-        if recordings is None:
-            return self._db.execute(asked).fetchall()
-        found = [self._db.execute(f"{asked} where id = ?", (one,)) for one in recordings]
-        return [row for rows in found for row in rows]
+    # Changes.
 
-    def topics(self, digest: str) -> tuple[TopicType, ...]:
-        """A set of topics and their types, by its hash.
+    def put(self, described: Described) -> None:
+        """Insert or replace a recording."""
+        entry = described.entry
+        # In ASCII: a directory's name may not be UTF-8.
+        text = json.dumps([described.files, entry.to_document()], separators=(",", ":"))
 
-        Raises:
-            CatalogError: The catalog has lost it.
-        """
-        with self._reading() as db:
-            row = db.execute("select topics from topics where hash = ?", (digest,)).fetchone()
-        if row is None or type(row[0]) is not str or hash_of(row[0]) != digest:
-            raise CatalogError(
-                f"The catalog {self._path} has lost the topics of recordings. "
-                "`hybridlog index rebuild` rebuilds it."
-            )
-        return topics_from_json(row[0])
+        def change(row: dict[str, str]) -> None:
+            row[ENTRY] = text
+            row[SUMMARY] = f"- {described.summary.to_json()}"
 
-    def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
-        """State of the files and entry of a recording; None if it is missing or damaged."""
-        with self._reading() as db:
-            asked = "select id, files, entry, crc from recordings where id = ?"
-            row = db.execute(asked, (recording,)).fetchone()
-        if row is None or _crc(*row[:3]) != row[3]:
-            return None
-        with suppress(KeyError, TypeError, ValueError):
-            return row[1], RecordingEntry.from_document(json.loads(row[2]))
-        return None
+        with self._lock:
+            self._forget(entry.id)
+        self._put_schemas({c.schema for c in described.channels.values() if c.schema is not None})
+        self._change(entry.id, change, topics_to_json(described.topics))
 
-    def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
-        """A recording of a log with this content, or of one of which it is a part."""
-        with self._reading():
-            self._follow()
-            asked = "select id from fingerprints where fingerprint = ?"
-            rows = self._db.execute(asked, (fingerprint,)).fetchall()
-        for (recording,) in rows:
-            found = self.recording(recording)
-            if found is not None and fingerprint in _fingerprints(found[1]):
-                return found[1]
-        return None
-
-    def put_look(self, summary: RecordingSummary) -> None:
-        """Note that a recording is unchanged although its directory looks different."""
-        text = summary.to_json()
-
-        def work(db: sqlite3.Connection) -> None:
-            asked = "update summaries set summary = ?, crc = ? where id = ?"
-            db.execute(asked, (text, _text_crc(text), summary.id))
-
-        self._note(work)
+    def put_looks(self, summaries: Iterable[RecordingSummary]) -> None:
+        """Note that recordings are unchanged although their directories look different."""
+        texts = {one.id: one.to_json() for one in summaries}
+        self._note(texts, lambda recording, row: f"{row.partition(' ')[0]} {texts[recording]}")
 
     def put_indexed(self, recordings: Iterable[str], index: str) -> None:
         """Note which index is complete for recordings.
@@ -919,24 +732,31 @@ class Catalog:
             recordings: Their ids.
             index: The id of the index; empty if none is.
         """
+        self._note(recordings, lambda _, row: f"{index or '-'} {row.partition(' ')[2]}")
 
-        def work(db: sqlite3.Connection) -> None:
-            asked = "update summaries set indexed = ? where id = ?"
-            db.executemany(asked, [(index, recording) for recording in recordings])
-
-        self._note(work)
+    def _note(self, recordings: Iterable[str], change: Callable[[str, str], str]) -> None:
+        """Change summaries; this saves work later, and is left out if it fails."""
+        wanted = [*recordings]
+        if not wanted:
+            return
+        with suppress(StoreError, ResourceError), self._changing():
+            by_part: dict[int, list[str]] = defaultdict(list)
+            for recording in wanted:
+                if recording in self._places:
+                    by_part[self._places[recording]].append(recording)
+            for number, own in by_part.items():
+                content = self._read(number)
+                for recording in own:
+                    row = content.rows.get(recording, {})
+                    if SUMMARY in row:
+                        row[SUMMARY] = change(recording, row[SUMMARY])
+                self._write(number, content)
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
-
-        def work(db: sqlite3.Connection) -> None:
+        with self._lock:
             self._forget(recording)
-            for table in _BY_RECORDING:
-                db.execute(f"delete from {table} where id = ?", (recording,))  # noqa: S608
-
-        self._change(work)
-
-    # Results of decoding.
+        self._change(recording, dict.clear)
 
     def put_stamps(
         self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
@@ -948,88 +768,184 @@ class Catalog:
             stamps: Number and digest of a segment, and a row for each of the `parts` of its
                 chunk table.
         """
-        rows_of = [(recording, number, digest, rows.tobytes()) for number, digest, rows in stamps]
-
-        def work(db: sqlite3.Connection) -> None:
+        texts = {
+            f"{STAMPS}{number}": f"{digest} {b64encode(compress(rows.tobytes(), 1)).decode()}"
+            for number, digest, rows in stamps
+        }
+        with self._lock:
             self._forget(recording)
-            db.executemany(
-                "insert or replace into stamps values (?, ?, ?, ?, ?)",
-                [(*row, _crc(*row)) for row in rows_of],
-            )
-
-        self._change(work)
+        self._change(recording, lambda row: row.update(texts))
 
     def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
         """Store the unreadable chunks of a recording: reason by segment and number."""
+        text = json.dumps([(*place, reason) for place, reason in sorted(damage.items())])
+        self._change(recording, lambda row: row.update({DAMAGE: text}))
 
-        def work(db: sqlite3.Connection) -> None:
-            db.execute("delete from damage where id = ?", (recording,))
-            if damage:
-                rows = [(*place, reason) for place, reason in sorted(damage.items())]
-                row = (recording, json.dumps(rows))
-                db.execute("insert into damage values (?, ?, ?)", (*row, _crc(*row)))
-            asked = "update summaries set damage = ? where id = ?"
-            db.execute(asked, (_damage_crc(db, recording), recording))
-
-        self._change(work)
-
-    def damage(self, recording: str) -> dict[tuple[int, int], str]:
-        """The unreadable chunks of a recording: reason by segment and number.
+    def rebuild(self) -> None:
+        """Replace the catalog with an empty one.
 
         Raises:
-            CatalogError: The list is damaged.
+            StoreError: It cannot be written.
         """
-        with self._reading() as db:
-            row = db.execute(
-                "select id, chunks, crc from damage where id = ?", (recording,)
-            ).fetchone()
-        if row is None:
-            return {}
-        if _crc(*row[:2]) != row[2] or row[0] != recording:
+        with self._lock:
+            self.was_damaged |= not self.is_in_memory
+            self._forget()
+            with self._changing():
+                for name in self._folder.versions():
+                    self._folder.remove(name)
+            self._parts, self._places = {}, {}
+
+    def mend(self) -> None:
+        """Look at everything, and remove what is damaged.
+
+        Raises:
+            StoreError: It cannot be read or written.
+        """
+        if not self.is_sound():
+            with self._changing():
+                pass
+
+    def drop_damaged(self) -> None:
+        """Remove what was found to be damaged, if it can be written."""
+        with self._lock:
+            if self._damaged:
+                with suppress(StoreError, ResourceError), self._changing():
+                    pass
+
+    # Answers.
+
+    def is_sound(self, labels: Collection[str] | None = None) -> bool:
+        """True if nothing in it is damaged.
+
+        Args:
+            labels: Look at parts with these recordings only; None for all.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        with self._lock:
+            self._follow()
+            chosen = {*self._parts}
+            if labels is not None:
+                wanted = {one.id for one in self.summaries() if one.label in labels}
+                chosen = {self._places[recording] for recording in wanted}
+            whole = [self._read(number).is_whole for number in [*chosen]]
+            return all(whole) and not self._odd and not self._damaged
+
+    def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
+        """Summaries of recordings, unordered; without damaged ones.
+
+        Args:
+            recordings: Their ids; None for all.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        with self._lock:
+            self._follow()
+            wanted = self._places if recordings is None else self._places.keys() & {*recordings}
+            found = [self._parts[self._places[one]].summaries[one] for one in wanted]
+        return [summary for summary in found if summary is not None]
+
+    def topics(self, digest: str) -> tuple[TopicType, ...]:
+        """A set of topics and their types, by its hash.
+
+        Raises:
+            CatalogError: The catalog has lost it.
+        """
+        with self._lock:
+            key = TOPICS, digest
+            found = next((p.shared[key] for p in self._parts.values() if key in p.shared), "")
+        if hash_of(found) != digest:
             raise CatalogError(
-                f"The catalog's list of damaged chunks of recording {recording} is damaged. "
+                f"The catalog {self.path} has lost the topics of recordings. "
                 "`hybridlog index rebuild` rebuilds it."
             )
-        return {(segment, chunk): reason for segment, chunk, reason in json.loads(row[1])}
+        return topics_from_json(found)
+
+    def _row(self, recording: str) -> dict[str, str]:
+        """All texts of a recording by kind."""
+        with self._lock:
+            if recording not in self._places:
+                self._follow()
+            number = self._places.get(recording)
+            row = self._read(number).rows.get(recording) if number is not None else None
+            if row is None and number is not None:  # another process may have moved it
+                self._follow()
+                row = self._read(self._places.get(recording, number)).rows.get(recording)
+            return row or {}
+
+    def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
+        """State of the files and entry of a recording; None if it is missing or damaged."""
+        row = self._row(recording)
+        with suppress(KeyError, TypeError, ValueError):
+            looks, document = json.loads(row[ENTRY])
+            return looks, RecordingEntry.from_document(document)
+        return None
+
+    def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
+        """A recording of a log with this content, or of one of which it is a part."""
+        with self._lock:
+            summaries = self.summaries()
+            if self._by_fingerprint is None:
+                self._by_fingerprint = defaultdict(list)
+                for one in summaries:
+                    for known in _fingerprints(one.source):
+                        self._by_fingerprint[known].append(one.id)
+            recordings = self._by_fingerprint.get(fingerprint, [])
+        found = (self.recording(recording) for recording in recordings)
+        return next((row[1] for row in found if row is not None), None)
+
+    def damage(self, recording: str) -> dict[tuple[int, int], str]:
+        """The unreadable chunks of a recording: reason by segment and number."""
+        with self._lock:
+            self._follow()
+            part = self._parts.get(self._places.get(recording, -1))
+            rows = json.loads(part.damage.get(recording, "[]")) if part is not None else []
+        return {(segment, chunk): reason for segment, chunk, reason in rows}
 
     def stamps(
         self, entry: RecordingEntry, number: int, table: ChunkTable
     ) -> NDArray[np.void] | None:
         """Decoding results of a segment; None before its messages are decoded."""
-        with self._reading() as db:
-            row = db.execute(
-                "select id, number, digest, rows, crc from stamps where id = ? and number = ?",
-                (entry.id, number),
-            ).fetchone()
-        if row is None or _crc(*row[:4]) != row[4] or row[2] != entry.digests.get(str(number)):
-            return None
-        if len(row[3]) != len(table.parts) * _STAMPS.itemsize:
-            return None
-        return np.frombuffer(row[3], _STAMPS)
+        digest, _, text = self._row(entry.id).get(f"{STAMPS}{number}", "").partition(" ")
+        with suppress(ValueError, ZlibError):
+            rows = np.frombuffer(decompress(b64decode(text)), _STAMPS)
+            if digest == entry.digests.get(str(number)) and len(rows) == len(table.parts):
+                return rows
+        return None
 
     # Schemas.
+
+    def _put_schemas(self, schemas: Collection[Schema]) -> None:
+        known = {schema_hash(schema): schema for schema in schemas}
+        missing = known.keys() - self.schemas(known).keys()
+        if missing:
+            with self._changing():
+                for digest in missing:
+                    schema = known[digest]
+                    head = json.dumps([schema.name, schema.encoding]).encode()
+                    self._folder.write(f"{_SCHEMA}{digest}", head + b"\n" + bytes(schema.data))
 
     def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
         """Schemas by hash, without missing or damaged ones."""
         found: dict[str, Schema] = {}
-        with self._reading() as db:
-            for digest in hashes:
-                row = db.execute(
-                    "select name, encoding, data from schemas where hash = ?", (digest,)
-                ).fetchone()
-                if row is not None and list(map(type, row)) == [str, str, bytes]:
-                    schema = Schema(*row)
-                    if schema_hash(schema) == digest:
-                        found[digest] = schema
+        for digest in hashes:
+            head, _, text = (self._data_of(f"{_SCHEMA}{digest}") or b"").partition(b"\n")
+            with suppress(TypeError, ValueError):
+                name, encoding = json.loads(head)
+                schema = Schema(name, encoding, text)
+                if schema_hash(schema) == digest:
+                    found[digest] = schema
         return found
 
     # Chunks.
 
     def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment.
+        """The chunks of a segment, from its footer.
 
         Raises:
-            CatalogError: The catalog has lost them.
+            CatalogError: The segment is not the one of the entry, or cannot be read.
         """
         return self.decoded_table(entry, number)[0]
 
@@ -1039,38 +955,34 @@ class Catalog:
         """The chunks of a segment, and the results of decoding for each row of its parts.
 
         Raises:
-            CatalogError: The catalog has lost them.
+            CatalogError: The segment is not the one of the entry, or cannot be read.
         """
         if number in entry.flushed:
             return entry.flushed[number].table, None
         key = entry.id, number, entry.digests.get(str(number), "")
-        with self._reading() as db:
+        with self._lock:
             cached = self._tables.get(key)
             if cached is not None:
                 self._tables.move_to_end(key)
                 return cached
-            row = db.execute(
-                "select id, number, digest, chunks, crc from segments where id = ? and number = ?",
-                key[:2],
-            ).fetchone()
-            if row is None or _crc(*row[:4]) != row[4] or row[:3] != key:
-                raise CatalogError(
-                    f"The catalog has lost the chunks of segment {number} of recording "
-                    f"{entry.label}. `hybridlog index rebuild` rebuilds it."
-                )
-            table = ChunkTable.from_bytes(row[3])
+        path = self._store / _RECORDINGS / entry.label / sealed_name(number)
+        try:
+            with SegmentReader(path, number) as reader:
+                summary = reader.summary()
+        except SegmentError as error:
+            raise CatalogError(str(error)) from error
+        if summary.recording.get("id") != entry.id or summary.whole_digest != key[2]:
+            raise CatalogError(f"Segment {path} has changed since the store was opened.")
+        table = summary.table
+        with self._lock:
             cached = table, self.stamps(entry, number, table)
-            if cached[1] is None and entry.is_decoded and len(table.parts):
-                # Without its row the next opening reads the recording's files again.
-                with suppress(sqlite3.Error):
-                    for name in ("recordings", "summaries"):
-                        db.execute(f"delete from {name} where id = ?", (entry.id,))  # noqa: S608
-            self._tables[key] = cached
-            self._cached += _size(table)
+            if key not in self._tables:
+                self._tables[key] = cached
+                self._cached += _size(table)
             while self._cached > _CACHED_BYTES and len(self._tables) > 1:
                 _, (oldest, _) = self._tables.popitem(last=False)
                 self._cached -= _size(oldest)
-            return cached
+        return cached
 
     def chunk_stats(
         self, entry: RecordingEntry, segment: int, number: int
@@ -1083,13 +995,18 @@ class Catalog:
             number: Number of the chunk in it.
 
         Raises:
-            CatalogError: The catalog has lost them.
+            CatalogError: As for `table`.
         """
         table, stamps = self.decoded_table(entry, segment)
         begin, end = table.part_bounds()[number : number + 2].tolist()
         own = replace(table, chunks=table.chunks[number : number + 1], parts=table.parts[begin:end])
         silent = {c.id for c in entry.channels if not c.has_publish_time}
         return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
+
+    def _forget(self, recording: str | None = None) -> None:
+        for key in [k for k in self._tables if recording in {None, k[0]}]:
+            table, _ = self._tables.pop(key)
+            self._cached -= _size(table)
 
 
 def schema_hash(schema: Schema) -> str:
@@ -1115,54 +1032,8 @@ def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> Chan
     )
 
 
-def _crc(*values: object) -> int:
-    """Checksum of the values of a row."""
-    crc = 0
-    for value in values:
-        # A value that SQLite stores as another type is a different value.
-        kind = type(value).__name__.encode()
-        data = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
-        crc = crc32(data, crc32(kind + len(data).to_bytes(8, "little"), crc))
-    return crc
-
-
-def _text_crc(text: object) -> int:
-    """Checksum of the text of a summary; -1 for a value of another type."""
-    return crc32(text.encode("utf-8", "surrogateescape")) if isinstance(text, str) else -1
-
-
 def _size(table: ChunkTable) -> int:
     return int(table.chunks.nbytes + table.parts.nbytes + table.others.nbytes)
-
-
-def _is_damage(error: sqlite3.Error) -> bool:
-    """True if an error comes from the file's content."""
-    code = getattr(error, "sqlite_errorcode", None)
-    if code is None:
-        return "is full" not in str(error) and "I/O error" not in str(error)
-    return code & 0xFF not in _NO_DAMAGE
-
-
-def _is_locked(error: sqlite3.Error) -> bool:
-    """True if another process has kept the file locked for too long."""
-    return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
-
-
-def _system_error(error: sqlite3.Error) -> int | None:
-    """The system's error number behind an SQLite error, which does not tell it."""
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    if code == sqlite3.SQLITE_NOMEM:
-        return errno.ENOMEM
-    if code == sqlite3.SQLITE_CANTOPEN:
-        try:
-            os.close(os.open(os.devnull, os.O_RDONLY))
-        except OSError as refused:
-            return refused.errno
-    return None
-
-
-def _identity(about: os.stat_result) -> tuple[int, int]:
-    return about.st_dev, about.st_ino
 
 
 def _least(a: int | None, b: int | None) -> int | None:

@@ -2,19 +2,17 @@
 
 `Stepper` runs commands in processes of their own, which are forked from one that has
 imported everything, so that a process takes a few hundredths of a second. In these, each
-call that changes files or the database, and each change of the catalog, is a step.
+call that changes files or the database is a step.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
 import select
 import signal
 import socket
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -44,7 +42,7 @@ Fault = Literal[
 ]
 TORN = ("write", "insert", "delete", "replace all")
 """Steps of which half can be done."""
-ALLOCATES = ("create", "write", "mkdir", "catalog", "sync")
+ALLOCATES = ("create", "write", "mkdir", "sync")
 """Steps that a full disk fails."""
 
 DATABASE = ("insert", "delete", "replace", "update", "collection")
@@ -241,12 +239,8 @@ class Seam:
         if fault == "database" and is_database:
             raise DatabaseError("MongoDB does not answer")
         if fault == "ENOSPC" and kind in ALLOCATES:
-            if kind == "catalog":
-                raise sqlite3.OperationalError("database or disk is full")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if fault == "EIO" and not is_database:
-            if kind == "catalog":
-                raise sqlite3.OperationalError("disk I/O error")
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
@@ -360,22 +354,6 @@ def step_database(seam: Seam) -> None:
         stepped(method, "collection")
 
 
-def step_catalog(seam: Seam) -> None:
-    """Make each change of the catalog two steps: one before it begins, one before it is kept."""
-    from hybridlog_storage.catalog import Catalog
-
-    original = Catalog._writing
-
-    @contextlib.contextmanager
-    def writing(self: Catalog) -> Iterator[sqlite3.Connection]:
-        seam.step("catalog", "begin", lambda: None)
-        with original(self) as db:
-            yield db
-            seam.step("catalog", "commit", lambda: None)
-
-    Catalog._writing = writing  # type: ignore[method-assign]
-
-
 Command = Callable[[Callable[[], None], Path, str, Sequence[str]], None]
 """Gets what makes steps count from now on, the store, its database, and arguments."""
 
@@ -447,7 +425,6 @@ def _run(job: Mapping[str, Any], tell: Callable[[str], None]) -> tuple[str, str]
         seam = Seam(point, tell, pauses)
         files.system = SteppedSystem(seam)
         step_database(seam)
-        step_catalog(seam)
 
     try:
         COMMANDS[name](arm, Path(job["store"]), job["uri"], args)

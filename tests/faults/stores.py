@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import shutil
-import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -24,7 +22,7 @@ from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
-from hybridlog_storage.catalog import _crc as crc_of
+from hybridlog_storage.catalog_parts import ENTRY, PartContent
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database
@@ -101,16 +99,13 @@ class Prepared:
         if not (path / CATALOG).exists():
             return
         old, new = StoreDirectory(self.path), StoreDirectory(path)
-        with contextlib.closing(sqlite3.connect(path / CATALOG)) as db, db:
-            rows = db.execute("select id, files, entry from recordings").fetchall()
-            for recording, looks, entry in rows:
-                label = json.loads(entry)["label"]
-                if looks == old.listing(label).print:
-                    row = recording, new.listing(label).print, entry
-                    db.execute(
-                        "update recordings set files = ?, crc = ? where id = ?",
-                        (row[1], crc_of(*row), recording),
-                    )
+        for file in (path / CATALOG).glob("part-*"):
+            content = PartContent.from_bytes(new.settings.store_id, file.read_bytes())
+            for row in content.rows.values():
+                looks, entry = json.loads(row[ENTRY])
+                if looks == old.listing(entry["label"]).print:
+                    row[ENTRY] = json.dumps([new.listing(entry["label"]).print, entry])
+            file.write_bytes(content.to_bytes(new.settings.store_id))
 
     @contextmanager
     def copy(self, server: Server, path: Path) -> Iterator[Case]:
@@ -310,7 +305,7 @@ def _files(path: Path) -> frozenset[str]:
     found = {str(p.relative_to(recordings)) for p in recordings.rglob("*")}
     found |= {f"../{p.name}" for p in path.iterdir()}
     return frozenset(name for name in found if Path(name).name not in _ANY_FILE) - {
-        "../catalog.sqlite",
+        "../catalog",
         "../hybridlog.toml",
         "../recordings",
         "../tables",

@@ -32,7 +32,7 @@ def compacted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(compacted: Path, tmp_path: Path) -> Path:
-    hidden = shutil.ignore_patterns("catalog.sqlite*", "tables*")
+    hidden = shutil.ignore_patterns("catalog*", "tables*")
     shutil.copytree(compacted, tmp_path / "store", ignore=hidden)
     return tmp_path / "store"
 

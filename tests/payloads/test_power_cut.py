@@ -171,7 +171,7 @@ def run(way: Way, path: Path, stores: Path, calls: int | None, **model: Any) -> 
     """Do some work until the power fails."""
     shutil.rmtree(path, ignore_errors=True)
     way.prepare(path, stores)
-    for name in ("tables", "tables.part", "mongod", "catalog.sqlite"):
+    for name in ("tables", "tables.part", "mongod", "catalog"):
         shutil.rmtree(path / name, ignore_errors=True)
         with suppress(OSError):
             (path / name).unlink()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from hybridlog_storage.disk import files
 from tests.servers.commands import commands
 
 
@@ -21,7 +22,7 @@ class Cost:
 
     Attributes:
         commands: Commands that MongoDB got.
-        statements: SQL statements that the catalog got.
+        written: Bytes written to files of the store.
         opened: Files and folders opened or listed, below the store.
         bytes_read: Bytes read from files of the store.
         looks: Files whose status was asked for.
@@ -30,7 +31,7 @@ class Cost:
 
     root: str
     commands: list[str] = field(default_factory=list)
-    statements: list[str] = field(default_factory=list)
+    written: int = 0
     opened: list[str] = field(default_factory=list)
     bytes_read: int = 0
     looks: int = 0
@@ -40,7 +41,6 @@ class Cost:
         """How many of each."""
         return {
             "commands": len(self.commands),
-            "statements": len(self.statements),
             "opened": len(self.opened),
         }
 
@@ -73,7 +73,20 @@ def _counting_reads(cost: Cost) -> Iterator[None]:
         patch.setattr(os, "stat", looked)
         for name in ("pread", "preadv", "read"):
             patch.setattr(os, name, _counted(getattr(os, name), cost))
+        patch.setattr(files, "system", _CountedSystem(cost))
         yield
+
+
+class _CountedSystem(files.System):
+    """Counts the bytes that are written."""
+
+    def __init__(self, cost: Cost) -> None:
+        self._cost = cost
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        done = super().writev(fd, parts)
+        self._cost.written += done
+        return done
 
 
 def _counted(read: Callable[..., Any], cost: Cost) -> Callable[..., Any]:
@@ -89,13 +102,11 @@ def cost_of(store: hl.Store, work: Callable[[], object]) -> Cost:
     """The cost of some work on an open store whose index is connected with `commands` heard."""
     cost = Cost(str(store.directory.path))
     with commands() as sent:
-        store.catalog._db.set_trace_callback(cost.statements.append)
         _heard.append(cost)
         try:
             with _counting_reads(cost):
                 work()
         finally:
             _heard.pop()
-            store.catalog._db.set_trace_callback(None)
     cost.commands = [one.name for one in sent]
     return cost

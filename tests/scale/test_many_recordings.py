@@ -14,6 +14,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.sql import topic_view
+from hybridlog_storage.catalog_parts import MAX_PART_BYTES
 from tests.imports import ROOT
 from tests.scale.cost import Cost, cost_of
 
@@ -112,7 +113,8 @@ def test_questions_about_little_cost_little(stores: dict[int, Path], name: str) 
     # What is compressed has another size on another day. The file of tables that the recording
     # shares with others is read as far as it is needed, in blocks that columns share.
     shared = sum(path.stat().st_size for path in stores[MANY].glob("tables/*/shared-*"))
-    assert costs[MANY].bytes_read < 1.1 * costs[FEW].bytes_read + 200 + 2 * shared
+    # The catalog's part of a recording is read, which has others, too.
+    assert costs[MANY].bytes_read < 1.1 * costs[FEW].bytes_read + 2 * shared + 4 * MAX_PART_BYTES
 
 
 def test_answers_are_right(stores: dict[int, Path]) -> None:
@@ -205,7 +207,6 @@ def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) 
         store.tag("day00004", place="roof")
         cost = cost_of(store, asked.count)
     assert cost.looks < 20
-    assert len(cost.statements) < 5
     assert not [path for path in cost.opened if path.endswith(".parquet")]
 
 
@@ -219,7 +220,7 @@ def test_sql_of_a_day_tests_groups_of_recordings(
         asked = f"select count(*) from pose where t >= {day(4)[0]} and t < {day(4)[1]}"
         cost = cost_of(store, lambda: store.sql(asked).rows())
         assert store.sql(asked).rows() == [(MESSAGES,)]
-        assert len(cost.statements) < 50  # of recordings from which sizes are estimated
+        assert len([path for path in cost.opened if path.startswith("part-")]) < 50
         named = "select count(*) from pose where recording = 'day00007'"
         assert store.sql(named).rows() == [(MESSAGES,)]
     assert len(made) < MANY / 2
@@ -238,7 +239,7 @@ def test_many_at_once_are_counted_in_each_file_once(stores: dict[int, Path]) -> 
 
 def test_a_small_recording_takes_little_room(stores: dict[int, Path]) -> None:
     path = stores[MANY]
-    kept = ["catalog.sqlite", "recordings", "tables"]
+    kept = ["catalog", "recordings", "tables"]
     found = [f for name in kept for f in [path / name, *(path / name).rglob("*")] if f.is_file()]
     assert sum(f.stat().st_size for f in found) <= MANY * 30_000
     assert len(found) <= MANY * 4

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import random
-import shutil
-import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, replace
 from itertools import combinations
 from pathlib import Path
@@ -36,11 +35,12 @@ from hybridlog_storage.catalog import (
     schema_hash,
     stamps_of,
 )
-from hybridlog_storage.errors import CatalogError, DiskFullError, StoreError
+from hybridlog_storage.catalog_parts import MAX_PART_BYTES, DiskFolder
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.chunk_table import CHUNK, OTHER, PART, ChunkTable
 from tests.imports import ROOT
-from tests.storage.chunk_entries import chunk_entries
 
 STORE = "5" * 32
 CHANNELS = range(1, 6)
@@ -154,7 +154,6 @@ class Model:
             summary_of(entry, f"outside of {self.id}"),
             topic_types(entry),
             f"looks of {self.id}",
-            self.tables,
             channels,
         )
 
@@ -255,7 +254,8 @@ def test_chunks_by_channel_time_and_clock(
         got = []
         timed = [c for c in CHANNELS if c != SILENT]
         for number in model.tables:
-            table, stamps = catalog.decoded_table(model.entry, number)
+            table = model.tables[number]
+            stamps = catalog.stamps(model.entry, number, table)
             columns = ChunkColumns(number, table, channels)
             got += columns.chunks(columns.within(bounds, clock, stamps=stamps, timed=timed))
         assert [(c.segment, c.number) for c in got] == [(c.segment, c.number) for c in want]
@@ -264,14 +264,18 @@ def test_chunks_by_channel_time_and_clock(
         assert kinds == {(True, True), (True, False), (False, True)}
 
 
-def test_a_segment_without_messages_is_not_looked_for(catalog: Catalog, model: Model) -> None:
-    empty = ChunkTable(np.empty(0, CHUNK), np.empty(0, PART), np.array([(0, 20, 7)], OTHER))
-    assert channel_totals(empty, None) == {}
-    entry = replace(model.entry, digests={**model.entry.digests, "3": "sha256:3"})
-    tables = {**model.tables, 3: empty}
-    catalog.put(replace(model.described, entry=entry, tables=tables))
-    assert len(chunk_entries(catalog, entry)) == 36
-    assert catalog.table(entry, 3).end == 20
+def decoded_of(catalog: Catalog, model: Model) -> list[bytes | None]:
+    """What a catalog says of the decoding of each segment."""
+    found = [catalog.stamps(model.entry, number, table) for number, table in model.tables.items()]
+    return [None if one is None else one.tobytes() for one in found]
+
+
+def decoded_in(model: Model) -> list[bytes | None]:
+    """What it should say."""
+    return [
+        stamps_of(table, dict(enumerate(model.told[number]))).tobytes()
+        for number, table in model.tables.items()
+    ]
 
 
 def test_a_chunk_says_where_it_lies_and_when(catalog: Catalog, model: Model) -> None:
@@ -348,19 +352,15 @@ def test_totals_of_a_segment_are_those_of_its_chunks(model: Model) -> None:
         assert channel_totals(table, None, {SILENT}) == {c: undecoded(s) for c, s in want.items()}
 
 
-def test_what_replaces_a_segment_is_what_counts(catalog: Catalog, model: Model) -> None:
-    """A list of chunks belongs to one content of the segment, and to no other."""
+def test_results_belong_to_one_content_of_a_segment(catalog: Catalog, model: Model) -> None:
     model.put(catalog)
-    assert chunk_entries(catalog, model.entry) == model.chunks()
+    assert decoded_of(catalog, model) == decoded_in(model)
     again = Model(3, segments=2)
     again.id = again.entry.id = model.id
-    with pytest.raises(CatalogError, match="segment 0"):
-        chunk_entries(catalog, again.entry)
+    assert decoded_of(catalog, again) == [None, None]
     again.put(catalog)
-    assert chunk_entries(catalog, again.entry) == again.chunks()
-    # Also for whoever asks with what was known before, and has the old lists at hand.
-    with pytest.raises(CatalogError, match="segment 0"):
-        chunk_entries(catalog, model.entry)
+    assert decoded_of(catalog, again) == decoded_in(again)
+    assert decoded_of(catalog, model)[:2] == [None, None]
 
 
 def test_stamps_of_other_bytes_are_not_believed(catalog: Catalog, model: Model) -> None:
@@ -415,34 +415,67 @@ def test_a_recording_is_removed_without_a_trace(
     catalog.remove(model.id)
     assert rows_of(catalog).keys() == {other.id}
     assert catalog.damage(model.id) == {}
-    with pytest.raises(CatalogError):
-        chunk_entries(catalog, model.entry)
-    assert chunk_entries(catalog, other.entry) == other.chunks()
-    with closing(sqlite3.connect(tmp_path / CATALOG)) as db:
-        for table in ("recordings", "segments", "stamps", "damage"):
-            assert {i for (i,) in db.execute(f"select distinct id from {table}")} == {other.id}
+    assert decoded_of(catalog, model) == [None] * 3
+    assert decoded_of(catalog, other) == decoded_in(other)
+    parts = (tmp_path / CATALOG).glob("part-*")
+    assert not [path for path in parts if model.id.encode() in path.read_bytes()]
+    catalog.remove(other.id)
+    assert not [*(tmp_path / CATALOG).glob("part-*")]
 
 
-def test_so_many_lists_of_chunks_are_kept_at_hand(
-    catalog: Catalog, model: Model, monkeypatch: pytest.MonkeyPatch
+class Counting(files.System):
+    """Counts the bytes that are written."""
+
+    count = 0
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        done = super().writev(fd, parts)
+        self.count += done
+        return done
+
+
+def test_a_change_writes_little(
+    catalog: Catalog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model.put(catalog)
-    size = module._size(model.tables[0])
-    monkeypatch.setattr(module, "_CACHED_BYTES", 2 * size + size // 2)
-    for _ in range(2):
-        assert chunk_entries(catalog, model.entry) == model.chunks()
-        assert [key[1] for key in catalog._tables] == [1, 2]
-        assert catalog._cached == sum(module._size(table) for table, _ in catalog._tables.values())
-    assert catalog.table(model.entry, 2) is catalog.table(model.entry, 2)
-    catalog.remove(model.id)
-    assert (len(catalog._tables), catalog._cached) == (0, 0)
+    """However many recordings there are: one part, or two, of bounded size."""
+    models = [Model(number, f"run{number}", segments=1, chunks=3) for number in range(100)]
+    for model in models:
+        model.put(catalog)
+    parts = {path: path.stat() for path in (tmp_path / CATALOG).glob("part-*")}
+    assert len(parts) > 5
+    sizes = sorted(about.st_size for about in parts.values())
+    assert sizes[-1] <= 1.2 * MAX_PART_BYTES
+    assert sizes[len(sizes) // 4] > MAX_PART_BYTES / 4
+    for change in (
+        lambda: catalog.put(models[7].described),
+        lambda: catalog.put_damage(models[50].id, {(0, 0): "x"}),
+        lambda: catalog.remove(models[80].id),
+    ):
+        with monkeypatch.context() as patch:
+            written = Counting()
+            patch.setattr(files, "system", written)
+            change()
+        assert 0 < written.count <= 1.2 * MAX_PART_BYTES
+    assert len(catalog.summaries()) == 99
+
+
+def test_a_large_recording_has_a_part_of_its_own(catalog: Catalog, tmp_path: Path) -> None:
+    small, large = Model(1), Model(2, "large")
+    large.entry.source["text"] = "x" * MAX_PART_BYTES
+    small.put(catalog)
+    for _ in range(3):
+        large.put(catalog)
+        assert len([*(tmp_path / CATALOG).glob("part-*")]) == 2
+        assert rows_of(catalog).keys() == {small.id, large.id}
+    small.put(catalog)
+    assert rows_of(catalog)[large.id][1] == large.entry
 
 
 def test_one_in_memory_leaves_no_file(tmp_path: Path, model: Model) -> None:
-    with closing(Catalog(None, STORE)) as made:
+    with closing(Catalog(tmp_path, STORE, in_memory=True)) as made:
         assert made.is_in_memory
         model.put(made)
-        assert chunk_entries(made, model.entry) == model.chunks()
+        assert decoded_of(made, model) == decoded_in(model)
         made.rebuild()
         assert rows_of(made) == {}
         model.put(made)
@@ -506,12 +539,11 @@ class Truth:
     """A small catalog, and everything that it may say."""
 
     def __init__(self, folder: Path) -> None:
-        self.models = [Model(n, f"run{n}", segments=2, chunks=4) for n in range(3)]
+        self.models = [Model(n, f"run{n}", segments=2, chunks=2) for n in range(3)]
         self.damage = {(0, 1): "unreadable", (1, 0): "gone"}
         with closing(Catalog(folder, STORE)) as made:
             self.fill(made)
-        self.path = folder / CATALOG
-        self.bytes = self.path.read_bytes()
+        self.files = {path.name: path.read_bytes() for path in (folder / CATALOG).iterdir()}
 
     def fill(self, catalog: Catalog) -> None:
         for model in self.models:
@@ -520,75 +552,27 @@ class Truth:
 
     def check(self, catalog: Catalog) -> bool:
         """That nothing that it says is wrong; returns whether it says all."""
-        known = rows_of(catalog)
         summaries = {one.id: one for one in catalog.summaries()}
         assert summaries.items() <= {m.id: m.described.summary for m in self.models}.items()
         complete = len(summaries) == len(self.models)
         same = catalog.with_fingerprint("f")
         assert same is None or same in [model.entry for model in self.models]
-        complete &= same is not None
         for model in self.models:
-            row = known.pop(model.id, None)
-            if row is not None:
-                assert row == (f"looks of {model.id}", model.entry)
-            complete &= row is not None
-            for told in (
-                lambda model=model: self._chunks(catalog, model),
-                lambda model=model: self._topics(catalog, model),
-                lambda model=model: catalog.damage(model.id) in ({}, self.damage),
-                lambda model=model: self._schemas(catalog),
-            ):
-                try:
-                    assert told()
-                except CatalogError:
-                    complete = False
-            for number, table in model.tables.items():
-                try:
-                    found = catalog.stamps(model.entry, number, table)
-                except CatalogError:
-                    complete = False
-                else:
-                    want = stamps_of(table, dict(enumerate(model.told[number])))
-                    assert found is None or found.tobytes() == want.tobytes()
-        assert known == {}
-        return complete
-
-    @staticmethod
-    def _topics(catalog: Catalog, model: Model) -> bool:
-        described = model.described
-        return set(catalog.topics(described.summary.topics)) == described.topics
-
-    @staticmethod
-    def _chunks(catalog: Catalog, model: Model) -> bool:
-        got = chunk_entries(catalog, model.entry)
-        assert len(got) == 8
-        for one, decoded, plain in zip(
-            got, model.chunks(), model.chunks(decoded=False), strict=True
-        ):
-            assert one in (decoded, plain)
-        return True
-
-    @staticmethod
-    def _schemas(catalog: Catalog) -> bool:
+            row = catalog.recording(model.id)
+            assert row in (None, (f"looks of {model.id}", model.entry))
+            damage = catalog.damage(model.id)
+            assert damage in ({}, self.damage)
+            decoded = decoded_of(catalog, model)
+            assert all(
+                one in (None, want) for one, want in zip(decoded, decoded_in(model), strict=True)
+            )
+            complete &= row is not None and bool(damage) and None not in decoded
+            if model.id in summaries:
+                assert {*catalog.topics(summaries[model.id].topics)} == model.described.topics
         known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
         found = catalog.schemas(known)
-        return all(known[digest] == schema for digest, schema in found.items())
-
-    def is_whole(self, catalog: Catalog) -> bool:
-        """The same, whatever is damaged."""
-        try:
-            return self.check(catalog)
-        except CatalogError:
-            return False
-
-    def make_again(self, catalog: Catalog) -> None:
-        """What a store does when something is damaged, or missing."""
-        catalog.mend()
-        self.fill(catalog)
-        if not self.is_whole(catalog):
-            # What is written into a damaged file makes it anew, and lacks what was there before.
-            self.fill(catalog)
-        assert self.check(catalog)
+        assert found.items() <= known.items()
+        return complete and found == known
 
 
 @pytest.fixture(scope="module")
@@ -596,198 +580,121 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     return Truth(tmp_path_factory.mktemp("truth"))
 
 
-def open_and_ask(truth: Truth, folder: Path) -> None:
+def open_and_ask(truth: Truth, folder: Path, *, is_told: bool = True) -> None:
     """Nothing wrong is said of a file that was changed, and it can be made again."""
     with closing(Catalog(folder, STORE)) as opened:
-        truth.is_whole(opened)
-        truth.make_again(opened)
+        complete = truth.check(opened)
+        assert opened.was_damaged or not (complete or is_told)
+        opened.mend()
+        assert opened.is_sound()
+        truth.fill(opened)
+        assert truth.check(opened)
     with closing(Catalog(folder, STORE)) as opened:
         assert truth.check(opened)
-        assert opened._is_sound()
+        assert opened.is_sound()
+        assert not opened.was_damaged
 
 
-def spots(truth: Truth) -> list[int]:
-    rng = random.Random(6)
-    size = 4096
-    pages = len(truth.bytes) // size
-    # The head of the file and of each page, and samples of the rest.
-    found = {*range(0, 108, 3)}
-    for page in range(pages):
-        found.update(page * size + n for n in (0, 3, 5, 7, 8, 9, 11))
-        found.update(rng.sample(range(page * size, (page + 1) * size), 4))
-    return sorted(found)
-
-
-def test_whatever_byte_of_the_file_changes_nothing_wrong_is_said(
+def test_whatever_byte_of_a_part_changes_nothing_wrong_is_said(
     truth: Truth, tmp_path: Path
 ) -> None:
     rng = random.Random(5)
-    path = tmp_path / CATALOG
-    for spot in spots(truth):
-        data = bytearray(truth.bytes)
+    content = truth.files["part-000000"]
+    (tmp_path / CATALOG).mkdir()
+    for name, data in truth.files.items():
+        (tmp_path / CATALOG / name).write_bytes(data)
+    for spot in sorted({*rng.sample(range(len(content)), 30), *range(0, 70, 10)}):
+        data = bytearray(content)
         data[spot] ^= rng.choice([1, 1 << rng.randrange(8), 0xFF])
-        path.write_bytes(data)
+        (tmp_path / CATALOG / "part-000000").write_bytes(data)
         try:
-            open_and_ask(truth, tmp_path)
+            # A part with another head may be one of another store.
+            open_and_ask(truth, tmp_path, is_told=spot > content.index(b"\n"))
         except Exception as error:
             raise AssertionError(f"byte {spot} of {len(data)}") from error
 
 
-@pytest.mark.parametrize("kind", ["zeros", "random", "another", "cut", "empty", "text"])
-def test_whatever_page_of_the_file_is_lost_nothing_wrong_is_said(
+@pytest.mark.parametrize("kind", ["zeros", "lines", "cut", "empty", "text", "folder", "link"])
+def test_whatever_is_lost_of_a_part_nothing_wrong_is_said(
     truth: Truth, tmp_path: Path, kind: str
 ) -> None:
-    rng = random.Random(7)
-    path = tmp_path / CATALOG
-    size = 4096
-    pages = len(truth.bytes) // size
-    assert pages > 10
-    for page in range(pages) if kind in {"zeros", "random", "another"} else [rng.randrange(pages)]:
-        data = bytearray(truth.bytes)
-        where = slice(page * size, (page + 1) * size)
-        if kind == "zeros":
-            data[where] = bytes(size)
-        elif kind == "random":
-            data[where] = rng.randbytes(size)
-        elif kind == "another":
-            other = rng.randrange(pages)
-            data[where] = truth.bytes[other * size : (other + 1) * size]
-        elif kind == "cut":
-            del data[page * size + 77 :]
-        else:
-            data = bytearray(b"" if kind == "empty" else b"what somebody has written" * 500)
-        path.write_bytes(data)
-        try:
-            open_and_ask(truth, tmp_path)
-        except Exception as error:
-            raise AssertionError(f"page {page} of {pages}") from error
+    content = truth.files["part-000000"]
+    (tmp_path / CATALOG).mkdir()
+    path = tmp_path / CATALOG / "part-000000"
+    lines = content.splitlines(keepends=True)
+    changed = {
+        "zeros": content[:200] + bytes(500) + content[700:],
+        "lines": b"".join(lines[:3] + lines[4:]),
+        "cut": content[: len(content) // 2],
+        "text": b"what somebody has written\n" * 50,
+    }
+    for name, data in truth.files.items():
+        if name != path.name:
+            path.with_name(name).write_bytes(data)
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "link":
+        path.symlink_to("elsewhere")
+    else:
+        path.write_bytes(changed.get(kind, b""))
+    open_and_ask(truth, tmp_path)
 
 
-CHANGES = {
-    "recordings": ("files", "entry", "crc"),
-    "summaries": ("summary", "crc"),
-    "topics": ("topics",),
-    "segments": ("digest", "chunks", "crc"),
-    "stamps": ("digest", "rows", "crc"),
-    "damage": ("chunks", "crc"),
-    "schemas": ("name", "encoding", "data"),
-}
-
-
-def altered(value: object, rng: random.Random) -> Iterator[object]:
-    """A value that is almost the same, or of another type."""
-    if isinstance(value, int):
-        yield from (value ^ 1, -value, f"{value}x", None)
-        return
-    data = bytearray(value if isinstance(value, bytes) else str(value).encode())
-    if data:
-        data[rng.randrange(len(data))] ^= 1 << rng.randrange(7)
-    yield bytes(data)
-    yield bytes(data).decode("utf-8", "replace")
-    yield bytes(data[:-1])
-    yield 5
-    # The same bytes, as another type.
-    yield value.decode("latin-1") if isinstance(value, bytes) else str(value).encode()
-
-
-@pytest.mark.parametrize(
-    ("table", "column"), [(table, column) for table, of in CHANGES.items() for column in of]
-)
-def test_a_row_that_was_changed_is_not_believed(
-    truth: Truth, tmp_path: Path, table: str, column: str
-) -> None:
-    rng = random.Random(3)
-    path = tmp_path / CATALOG
-    with closing(sqlite3.connect(truth.path)) as db:
-        (value,) = db.execute(f"select {column} from {table} limit 1").fetchone()
-    for other in altered(value, rng):
-        shutil.copy(truth.path, path)
-        with closing(sqlite3.connect(path)) as db:
-            try:
-                db.execute(f"update {table} set {column} = ? where {column} = ?", (other, value))
-            except sqlite3.IntegrityError:
-                continue
-            db.commit()
-        with closing(Catalog(tmp_path, STORE)) as opened:
-            complete = truth.is_whole(opened)
-            if table in {"recordings", "summaries", "topics", "segments", "damage"}:
-                assert not complete, other
-            truth.make_again(opened)
-
-
-@pytest.mark.parametrize("table", [*CHANGES, "fingerprints"])
-def test_rows_that_changed_places_or_are_gone_are_not_believed(
-    truth: Truth, tmp_path: Path, table: str
-) -> None:
-    """As they are, checksums and all."""
-    keys = {"topics": "hash", "schemas": "hash"}.get(table, "id")
-    path = tmp_path / CATALOG
-    for change in ("exchange", "delete", "drop"):
-        shutil.copy(truth.path, path)
-        with closing(sqlite3.connect(path)) as db:
-            found = [k for (k,) in db.execute(f"select distinct {keys} from {table} limit 2")]
-            one, other = found[0], found[-1]
-            if change == "exchange":
-                for old, new in ((one, "x"), (other, one), ("x", other)):
-                    db.execute(f"update {table} set {keys} = ? where {keys} = ?", (new, old))
-            elif change == "delete":
-                db.execute(f"delete from {table} where {keys} = ?", (one,))
-            else:
-                db.execute(f"drop table {table}")
-            db.commit()
-        open_and_ask(truth, tmp_path)
+@pytest.mark.parametrize("change", ["gone", "empty", "changed", "another"])
+def test_a_schema_that_is_lost_is_written_again(truth: Truth, tmp_path: Path, change: str) -> None:
+    (tmp_path / CATALOG).mkdir()
+    for name, data in truth.files.items():
+        (tmp_path / CATALOG / name).write_bytes(data)
+    one, other, *_ = sorted((tmp_path / CATALOG).glob("schema-*"))
+    if change == "gone":
+        one.unlink()
+    else:
+        changed = {"changed": one.read_bytes() + b"x", "another": other.read_bytes()}
+        one.write_bytes(changed.get(change, b""))
+    with closing(Catalog(tmp_path, STORE)) as opened:
+        assert not truth.check(opened)
+        truth.fill(opened)
+        assert truth.check(opened)
 
 
 # Files that are not ours.
 
 
-def test_the_catalog_of_another_store_is_made_anew(tmp_path: Path, model: Model) -> None:
+@pytest.mark.parametrize("old", ["store", "version"])
+def test_a_part_of_another_catalog_is_removed(tmp_path: Path, model: Model, old: str) -> None:
+    path = tmp_path / CATALOG / "part-000000"
     with closing(Catalog(tmp_path, STORE)) as made:
         model.put(made)
-    with closing(Catalog(tmp_path, STORE)) as same:
-        assert rows_of(same).keys() == {model.id}
-    with closing(Catalog(tmp_path, "6" * 32)) as other:
+    if old == "version":
+        path.write_bytes(path.read_bytes().replace(b"catalog 5", b"catalog 4", 1))
+    with closing(Catalog(tmp_path, STORE if old == "version" else "6" * 32)) as other:
         assert rows_of(other) == {}
-        with pytest.raises(CatalogError):
-            chunk_entries(other, model.entry)
-        model.put(other)
-        assert chunk_entries(other, model.entry) == model.chunks()
+        assert not other.was_damaged
+        another = Model(2, "another")
+        another.put(other)
+        assert rows_of(other).keys() == {another.id}
+        assert model.id.encode() not in path.read_bytes()
 
 
-@pytest.mark.parametrize("version", ["1", "", "5", None])
-def test_the_catalog_of_another_version_is_made_anew(
-    tmp_path: Path, model: Model, version: str | None
-) -> None:
+def test_files_that_are_left_over_are_removed(tmp_path: Path, model: Model) -> None:
+    (tmp_path / CATALOG).mkdir()
+    (tmp_path / CATALOG / ".part-000000.0123").write_bytes(b"half")
     with closing(Catalog(tmp_path, STORE)) as made:
         model.put(made)
-    with closing(sqlite3.connect(tmp_path / CATALOG)) as db:
-        if version is None:
-            db.execute("delete from meta where key = 'version'")
-        else:
-            db.execute("update meta set value = ? where key = 'version'", (version,))
-        db.execute("create table sequence (n integer primary key autoincrement)")
-        db.execute("insert into sequence values (7)")
-        db.execute('create table "of ""theirs" (n)')
-        db.commit()
-    with closing(Catalog(tmp_path, STORE)) as again:
-        assert rows_of(again) == {}
-        model.put(again)
-    with closing(Catalog(tmp_path, STORE)) as again:
-        assert chunk_entries(again, model.entry) == model.chunks()
+        assert {path.name[:5] for path in (tmp_path / CATALOG).iterdir()} == {"part-", "schem"}
 
 
-@pytest.mark.parametrize("target", ["file", "nothing"])
+@pytest.mark.parametrize("target", ["folder", "nothing"])
 def test_a_symlink_in_its_place_is_refused(tmp_path: Path, target: str) -> None:
     elsewhere = tmp_path / "elsewhere"
-    if target == "file":
-        elsewhere.write_bytes(b"not yours")
+    if target == "folder":
+        elsewhere.mkdir()
     store = tmp_path / "store"
     store.mkdir()
     (store / CATALOG).symlink_to(elsewhere)
     with pytest.raises(StoreError, match=CATALOG):
         Catalog(store, STORE)
-    assert elsewhere.exists() == (target == "file")
-    assert target != "file" or elsewhere.read_bytes() == b"not yours"
+    assert not elsewhere.exists() or not [*elsewhere.iterdir()]
 
 
 def test_a_symlink_to_the_store_is_no_hindrance(tmp_path: Path, model: Model) -> None:
@@ -796,73 +703,72 @@ def test_a_symlink_to_the_store_is_no_hindrance(tmp_path: Path, model: Model) ->
     with closing(Catalog(tmp_path / "link", STORE)) as made:
         model.put(made)
     with closing(Catalog(tmp_path / "real", STORE)) as same:
-        assert chunk_entries(same, model.entry) == model.chunks()
+        assert rows_of(same).keys() == {model.id}
 
 
-USES: dict[str, Callable[[Catalog, Model], object]] = {
-    "opened": lambda _, __: None,
-    "written": lambda made, model: model.put(made),
-    "read": lambda made, _: made.summaries(),
-    "rebuilt": lambda made, _: made.rebuild(),
-}
-
-
-@pytest.mark.parametrize("use", USES)
-def test_one_in_memory_takes_the_place_of_a_locked_file(
-    tmp_path: Path, model: Model, monkeypatch: pytest.MonkeyPatch, use: str
+def test_one_in_memory_takes_the_place_of_a_locked_one(
+    tmp_path: Path, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Somebody writes for longer than one waits: that is told, and nothing is deleted."""
     monkeypatch.setattr(module, "_BUSY_S", 0.05)
+    other = Model(2, "other")
     with closing(Catalog(tmp_path, STORE)) as made:
         model.put(made)
-    with closing(sqlite3.connect(tmp_path / CATALOG, isolation_level=None)) as db:
-        other = None if use == "opened" else Catalog(tmp_path, STORE)
-        db.execute("begin exclusive")
-        with closing(other or Catalog(tmp_path, STORE)) as made:
-            for _ in range(2):
-                with suppress(CatalogError):  # what is asked for is read from the files
-                    USES[use](made, model)
+        with DiskFolder(tmp_path / CATALOG).lock(0):
+            assert made.locked is None
+            other.put(made)
             assert made.locked == tmp_path / CATALOG
             assert made.is_in_memory
             assert not made.was_damaged
-            assert rows_of(made).keys() == ({model.id} if use == "written" else set())
-            model.put(made)
-            assert chunk_entries(made, model.entry) == model.chunks()
-        db.execute("rollback")
+            assert rows_of(made).keys() == {model.id, other.id}
+            made.rebuild()
+            assert rows_of(made) == {}
     with closing(Catalog(tmp_path, STORE)) as same:
         assert rows_of(same).keys() == {model.id}
         assert same.locked is None
 
 
-def test_a_full_disk_leaves_it_as_it_was(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    (pages,) = catalog._db.execute("pragma page_count").fetchone()
-    catalog._db.execute(f"pragma max_page_count = {pages}")
-    with pytest.raises(DiskFullError, match="No space left"):
-        Model(4, "other").put(catalog)
-    catalog._db.execute("pragma max_page_count = 1000000")
-    assert rows_of(catalog).keys() == {model.id}
-    assert chunk_entries(catalog, model.entry) == model.chunks()
+class Failing(files.System):
+    """A disk that is full, or a process that is stopped, when a part is written."""
+
+    def __init__(self, error: BaseException) -> None:
+        self._error = error
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        super().writev(fd, [parts[0][:10]])
+        raise self._error
 
 
-def test_what_is_interrupted_leaves_it_as_it_was(
-    catalog: Catalog, model: Model, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(errno.ENOSPC, "full"), DiskFullError),
+        (OSError(errno.EIO, "broken"), StoreError),
+        (KeyboardInterrupt(), KeyboardInterrupt),
+    ],
+    ids=["full", "broken", "interrupted"],
+)
+def test_a_change_that_fails_leaves_it_as_it_was(
+    catalog: Catalog,
+    model: Model,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    told: type[BaseException],
 ) -> None:
     model.put(catalog)
-
-    def stop(_: object) -> bytes:
-        raise KeyboardInterrupt
-
     again = Model(3, segments=2)
     again.id = again.entry.id = model.id
     with monkeypatch.context() as patch:
-        patch.setattr(ChunkTable, "to_bytes", stop)
-        with pytest.raises(KeyboardInterrupt):
-            again.put(catalog)
-    assert rows_of(catalog)[model.id][1] == model.entry
-    assert chunk_entries(catalog, model.entry) == model.chunks()
+        patch.setattr(files, "system", Failing(error))
+        for one in (again, Model(4, "other")):
+            with pytest.raises(told):
+                one.put(catalog)
+    for opened in (catalog, Catalog(tmp_path, STORE)):
+        assert rows_of(opened) == {model.id: (f"looks of {model.id}", model.entry)}
+        assert decoded_of(opened, model) == decoded_in(model)
     again.put(catalog)
-    assert chunk_entries(catalog, again.entry) == again.chunks()
+    assert rows_of(catalog)[model.id][1] == again.entry
 
 
 # Several at once.
@@ -872,47 +778,20 @@ def test_two_that_have_it_open_see_what_the_other_does(tmp_path: Path, model: Mo
     with closing(Catalog(tmp_path, STORE)) as one, closing(Catalog(tmp_path, STORE)) as other:
         model.put(one)
         assert rows_of(other).keys() == {model.id}
-        assert chunk_entries(other, model.entry) == model.chunks()
+        assert decoded_of(other, model) == decoded_in(model)
         other.remove(model.id)
         assert rows_of(one) == {}
         model.put(other)
         one.rebuild()
         assert rows_of(other) == {}
         model.put(other)
-        assert chunk_entries(one, model.entry) == model.chunks()
-
-
-@pytest.mark.parametrize("how", ["deleted", "damaged"])
-def test_one_that_was_made_anew_is_taken_up(tmp_path: Path, model: Model, how: str) -> None:
-    """Whoever has the old file open must not go on with it."""
-    with closing(Catalog(tmp_path, STORE)) as one:
-        model.put(one)
-        if how == "deleted":
-            (tmp_path / CATALOG).unlink()
-        else:
-            # The tree of the recordings is no tree any more.
-            with closing(sqlite3.connect(tmp_path / CATALOG)) as db:
-                (root,) = db.execute(
-                    "select rootpage from sqlite_master where name = 'recordings'"
-                ).fetchone()
-            with (tmp_path / CATALOG).open("r+b") as file:
-                file.seek((root - 1) * 4096)
-                file.write(b"\xff" * 4096)
-        with closing(Catalog(tmp_path, STORE)) as other:
-            if how == "damaged":
-                other.rebuild()
-            other_model = Model(8, "other")
-            other_model.put(other)
-            assert rows_of(one).keys() == {other_model.id}
-            model.put(one)
-            assert rows_of(other).keys() == {model.id, other_model.id}
-            assert chunk_entries(other, model.entry) == model.chunks()
+        assert decoded_of(one, model) == decoded_in(model)
 
 
 WRITER = """
 import sys
 from pathlib import Path
-from tests.storage.test_catalog import STORE, Catalog, Model, chunk_entries, rows_of
+from tests.storage.test_catalog import STORE, Catalog, Model, decoded_in, decoded_of, rows_of
 
 first, count = int(sys.argv[2]), int(sys.argv[3])
 catalog = Catalog(Path(sys.argv[1]), STORE)
@@ -920,7 +799,7 @@ for number in range(first, first + count):
     model = Model(number, f"run{number}", segments=2, chunks=3)
     model.put(catalog)
     catalog.put_damage(model.id, {(0, number): "x"})
-    assert chunk_entries(catalog, model.entry) == model.chunks()
+    assert decoded_of(catalog, model) == decoded_in(model)
     assert rows_of(catalog)[model.id][1] == model.entry
     if number % 5 == 0:
         catalog.remove(model.id)
@@ -929,7 +808,7 @@ print("done")
 
 
 def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
-    """From the first moment on: they also make the file at the same time."""
+    """From the first moment on: they also make the folder at the same time."""
     count = 40
     processes = [
         subprocess.Popen(
@@ -953,7 +832,7 @@ def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
     with closing(Catalog(tmp_path, STORE)) as opened:
         assert rows_of(opened).keys() == want.keys()
         for model in want.values():
-            assert chunk_entries(opened, model.entry) == model.chunks()
+            assert decoded_of(opened, model) == decoded_in(model)
             assert len(opened.damage(model.id)) == 1
 
 
@@ -965,7 +844,7 @@ def test_several_threads_use_one(catalog: Catalog) -> None:
             for number in range(first, first + 10):
                 model = Model(number, f"run{number}", segments=2, chunks=3)
                 model.put(catalog)
-                assert chunk_entries(catalog, model.entry) == model.chunks()
+                assert decoded_of(catalog, model) == decoded_in(model)
                 catalog.remove(model.id)
         except BaseException as error:
             failures.append(error)

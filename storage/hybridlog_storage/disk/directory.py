@@ -4,7 +4,7 @@
 <store>/
   hybridlog.toml        format version, id of the store, settings
   recordings/<label>/   one recording: journal, segments, columns; writer.lock while it is written
-  catalog.sqlite        derived: recordings, channels and chunks
+  catalog/              derived: recordings and channels
   mongod/               derived: data of the embedded MongoDB
 ```
 

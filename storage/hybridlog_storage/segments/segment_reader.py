@@ -147,6 +147,11 @@ class SegmentSummary:
         """Position of each chunk, in file order."""
         return places_of(self.table)
 
+    @property
+    def whole_digest(self) -> str:
+        """Its digest before chunks of it were moved."""
+        return (self.compacted or {}).get("digest", self.digest)  # type: ignore[no-any-return]
+
 
 @dataclass(slots=True)
 class _Records:
