@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import by_uri, real_peers
+from tests import by_uri, durations, real_peers
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in (
@@ -33,50 +34,6 @@ settings.register_profile(
 )
 settings.load_profile("any machine")
 
-LONGEST = (
-    "test_identity",
-    "test_healing",
-    "test_faults",
-    "test_commands",
-    "test_stopping",
-    "test_style",
-    "test_writer",
-    "test_bounds",
-    "test_segments",
-    "test_catalog_by_hand",
-    "test_record_live",
-    "test_mongod",
-    "test_recording",
-    "test_methods",
-    "test_groups",
-    "test_backends",
-    "test_wire",
-    "test_catalog",
-    "test_states",
-    "test_docs",
-    "test_model",
-    "test_engines",
-    "test_many_recordings",
-    "test_replica_set",
-    "test_uri",
-    "test_benchmarks",
-    "test_follow",
-    "test_hostile_store",
-    "test_definitions_of_logs",
-    "test_no_index",
-    "test_fetch",
-    "test_tls",
-    "test_reader",
-    "test_maintenance",
-    "test_queries",
-    "test_attachments",
-    "test_real_logs",
-    "test_ros2_live",
-    "test_smoke",
-    "test_mutants",
-)
-"""Files that take long, by seconds: they begin first, or one processor would wait at the end."""
-
 # Whoever runs the tests in the background may have had signals ignored; programs that the
 # tests start would inherit that, and Ctrl-C would do nothing.
 for number, handler in (
@@ -96,104 +53,6 @@ def signals_as_before() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
-
-
-SLOW = frozenset(
-    (
-        "across/test_align.py",
-        "across/test_bins.py",
-        "across/test_lost.py",
-        "across/test_near.py",
-        "across/test_rates.py",
-        "across/test_sync.py",
-        "benchmarks/test_backends.py",
-        "benchmarks/test_harness.py",
-        "benchmarks/test_live.py",
-        "benchmarks/test_queries.py",
-        "benchmarks/test_throughput.py",
-        "payloads/test_compact.py",
-        "payloads/test_drop.py",
-        "payloads/test_format.py",
-        "cli/test_coverage.py",
-        "cli/test_export.py",
-        "cli/test_fetch.py",
-        "cli/test_info.py",
-        "cli/test_intervals.py",
-        "cli/test_maintain.py",
-        "cli/test_open.py",
-        "cli/test_record.py",
-        "cli/test_record_live.py",
-        "cli/test_serve.py",
-        "cli/test_start.py",
-        "cli/test_stopping.py",
-        "cli/test_terminal.py",
-        "demo/test_tour.py",
-        "drawing/test_plot.py",
-        "formats/test_writing.py",
-        "faults/test_some.py",
-        "live/sources/test_ros2_live.py",
-        "live/test_killed.py",
-        "live/test_recording.py",
-        "live/test_rehearsal.py",
-        "view/playback/test_server.py",
-        "query/test_chunk_counts.py",
-        "query/test_counting.py",
-        "query/test_engines.py",
-        "query/test_intervals.py",
-        "query/test_latest.py",
-        "scale/test_many_recordings.py",
-        "schema/test_codec.py",
-        "schema/test_wire.py",
-        "servers/test_commands.py",
-        "servers/test_replica_set.py",
-        "servers/test_resets.py",
-        "servers/test_tls.py",
-        "servers/test_uri.py",
-        "formats/test_bounds.py",
-        "formats/test_rosbag1.py",
-        "formats/test_rosbag2.py",
-        "sql/test_command.py",
-        "sql/test_engine.py",
-        "sql/test_paper.py",
-        "sql/test_running.py",
-        "sql/test_views.py",
-        "storage/test_catalog.py",
-        "storage/test_mongod.py",
-        "storage/test_segments.py",
-        "tables/test_maintenance.py",
-        "tables/test_reader.py",
-        "tables/test_writer.py",
-        "test_benchmarks.py",
-        "test_cache_size.py",
-        "test_catalog_by_hand.py",
-        "test_consent.py",
-        "test_definitions_of_logs.py",
-        "test_docs.py",
-        "test_exact_values.py",
-        "test_faults.py",
-        "test_field_indexes.py",
-        "test_groups.py",
-        "test_healing.py",
-        "test_hostile_store.py",
-        "test_many_topics.py",
-        "test_model.py",
-        "test_mutants.py",
-        "test_no_index.py",
-        "test_packaging.py",
-        "test_power_cut.py",
-        "test_reader.py",
-        "test_real_logs.py",
-        "test_second_opinion.py",
-        "test_sensor_messages.py",
-        "test_sizes.py",
-        "test_style.py",
-        "view/test_guard.py",
-        "view/test_mcap.py",
-        "view/test_panels.py",
-        "view/test_spatial.py",
-    )
-)
-"""Files left out by `-m "not slow"`: with them, a run takes ten minutes instead of one."""
 
 
 EMBEDDED = (
@@ -222,6 +81,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="MongoDB for the tests' stores (default: HYBRIDLOG_TESTS_MONGO), each in a database "
         "of its own that is dropped at the end; tests about the embedded one are left out",
     )
+    parser.addoption(
+        "--measure", action="store_true", help="note how long each test takes, in durations.json"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -231,6 +93,8 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "peer(kind): speaks with a real peer, not one of ours")
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(real_peers.Attendance())
+        if config.getoption("--measure"):
+            config.pluginmanager.register(durations.Measuring())
 
 
 def pytest_unconfigure() -> None:
@@ -256,8 +120,10 @@ def mongo_by_uri(request: pytest.FixtureRequest) -> Iterator[None]:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     real_peers.mark(items)
     here = Path(__file__).parent
+    seconds = durations.measured()
+    slow = durations.slow_ones(seconds)
     for item in items:
-        if item.path.relative_to(here).as_posix() in SLOW or item.get_closest_marker("exhaustive"):
+        if durations.name_of(item.nodeid) in slow or item.get_closest_marker("exhaustive"):
             item.add_marker(pytest.mark.slow)
         if item.path.relative_to(here).as_posix().startswith(EMBEDDED):
             item.add_marker(pytest.mark.embedded)
@@ -265,5 +131,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         left = [item for item in items if item.get_closest_marker("embedded")]
         config.hook.pytest_deselected(items=left)
         items[:] = [item for item in items if not item.get_closest_marker("embedded")]
-    rank = {name: at for at, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+    # The longest files begin first, or one processor would wait at the end.
+    files = Counter[str]()
+    for name, one in seconds.items():
+        files[name.split("::")[0]] += one
+    items.sort(key=lambda item: -files[durations.name_of(item.nodeid).split("::")[0]])

@@ -70,7 +70,6 @@ def test_at_rest(
     assert same(found, wanted), (found, wanted, done.err)
 
 
-@pytest.mark.slow
 @asked_in_turn([rules[0] for rules in COMMANDS.values()])
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
@@ -94,7 +93,6 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, int]]:
     return found
 
 
-@pytest.mark.slow
 @asked_in_turn(EVERY)
 def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]

@@ -131,7 +131,6 @@ CALLS: dict[str, Callable[[hl.Store], list[int]]] = {
 MAX_BEHIND_S = 2.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("running", "mongo"), in_turn(["one", "many"], [None, NO_MONGODB]), indirect=["running"]
 )

@@ -67,7 +67,6 @@ def test_a_copy_is_recovered(running: Running, tmp_path: Path) -> None:
     assert running.before.entry(LABEL).status == "open"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["one", "many"])
 def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "store"
