@@ -13,6 +13,7 @@ from hybridlog.cli.completion import install_completion, show_completion
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
 INTERNAL: Final = 70
+_ALL: Final = "hybridlog.all"  # whether `--all` was given
 
 EXIT_CODES: Final = {
     0: "done",
@@ -101,6 +102,23 @@ class _LazyGroup(click.Group):
         return command
 
 
+def _note_all(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
+    context.meta[_ALL] = wanted
+
+
+def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
+    if wanted and context.meta[_ALL]:
+        from hybridlog.cli.installed import print_installed
+
+        print_installed()
+        context.exit()
+    if wanted:
+        click.echo(f"hybridlog {__version__}")
+        context.exit()
+    if context.meta[_ALL]:
+        raise click.UsageError("--all belongs to --version.", context)
+
+
 def _print_script(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
     if wanted:
         click.echo(show_completion(context), nl=False)
@@ -124,7 +142,16 @@ def _install_script(context: click.Context, _: click.Parameter, wanted: bool) ->
         f"\b\nExit codes:\n{as_text()}"
     ),
 )
-@click.version_option(__version__, message="hybridlog %(version)s", help="Print the version.")
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Print the version; with --all of everything, and what is missing for which command.",
+)
+@click.option(
+    "--all", is_flag=True, is_eager=True, expose_value=False, callback=_note_all, hidden=True
+)
 @click.option(
     "--install-completion",
     is_flag=True,

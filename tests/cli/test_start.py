@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
 from typing import cast
 
@@ -12,10 +15,12 @@ import pytest
 
 from hybridlog.cli import options
 from hybridlog.cli.app import COMMANDS, app
+from hybridlog.cli.installed import NEEDED_FOR
 from hybridlog.cli.main import EXIT_CODES
 
 from .running import COMMAND, complete, environment, run
 
+ROOT = Path(__file__).parents[2]
 HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard", "rich"}
 
 LISTED = """
@@ -71,6 +76,29 @@ def test_version() -> None:
     from hybridlog import __version__
 
     assert run("--version").out == f"hybridlog {__version__}\n"
+    assert run("--all", code=2).err.endswith("--all belongs to --version.\n")
+
+
+def test_what_is_installed(tmp_path: Path) -> None:
+    """A package whose metadata is not there is missing, and the cure is named."""
+    shown = run("--version", "--all").out
+    assert re.match(r"hybridlog \S+, Python 3\S+, ", shown)
+    assert re.search(r"\nMongoDB: \d+\.\d+\.\d+ \(/.*mongod\)\n", shown)
+    for name in ("mcap", "pyarrow", "rosbags", "duckdb", "matplotlib"):
+        assert f"{name} {metadata.version(name)}" in shown
+    assert "pip install" not in shown
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {*NEEDED_FOR} == {*project["optional-dependencies"]} - {"all", "bench", "dev"}
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.metadata as m\nfound = m.version\n"
+        "def version(name):\n    if name == 'duckdb': raise m.PackageNotFoundError(name)\n"
+        "    return found(name)\nm.version = version\n"
+    )
+    shown = run(
+        "--version", "--all", PYTHONPATH=str(tmp_path), HYBRIDLOG_MONGOD=str(tmp_path / "none")
+    ).out
+    assert "pip install 'hybridlog[sql]'" in shown
+    assert "which is not a program that can be run" in shown
 
 
 @pytest.mark.parametrize(
