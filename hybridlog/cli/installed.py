@@ -70,7 +70,7 @@ def mongodb() -> str:
     except MissingDependencyError as error:
         return str(error)
     try:
-        asked = subprocess.run(  # noqa: S603: the program that stores run, too
+        asked = subprocess.run(  # noqa: S603
             [path, "--version"], capture_output=True, text=True, timeout=_LIMIT_S, check=True
         )
     except (OSError, subprocess.SubprocessError) as error:
