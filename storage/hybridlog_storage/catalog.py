@@ -22,8 +22,8 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Final
-from zlib import compress, decompress
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+from zlib import compress, decompressobj
 from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
@@ -58,6 +58,7 @@ from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.summary import (
+    MAX_INT,
     RecordingSummary,
     TopicType,
     hash_of,
@@ -263,13 +264,47 @@ class RecordingEntry:
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> RecordingEntry:
-        """The entry from such a mapping."""
+        """The entry from such a mapping.
+
+        Raises:
+            KeyError: A value is missing.
+            TypeError: A value is missing, of another type, or there is one too many.
+            ValueError: A segment has no span of its times.
+        """
         values = dict(document)
         values["channels"] = [
-            ChannelEntry(**{**c, "stats": ChannelStats(**c["stats"])}) for c in values["channels"]
+            _checked(ChannelEntry(**{**c, "stats": _checked(ChannelStats(**c["stats"]))}))
+            for c in values["channels"]
         ]
-        values["spans"] = [tuple(span) for span in values["spans"]]
-        return cls(**values)
+        values["spans"] = [(number, first, last) for number, first, last in values["spans"]]
+        if not all(_is_number(one) for span in values["spans"] for one in span):
+            raise TypeError("a span is no pair of times")
+        return _checked(cls(**values))
+
+
+_JSON: Final = {"str": str, "int": int, "float": float, "bool": bool, "dict": dict, "list": list}
+_E = TypeVar("_E", RecordingEntry, ChannelEntry, ChannelStats)
+
+
+def _is_number(value: object) -> bool:
+    """True for a whole number of 64 bits."""
+    return type(value) is int and -MAX_INT <= value <= MAX_INT
+
+
+def _checked(item: _E) -> _E:
+    """An item whose values have the types of its attributes.
+
+    Raises:
+        TypeError: One has another type.
+    """
+    for name, kind in type(item).__annotations__.items():
+        value = getattr(item, name)
+        wanted = _JSON.get(kind.partition("[")[0].partition(" ")[0])
+        if (value is None and "None" in kind) or wanted is None:
+            continue
+        if type(value) is not wanted or (wanted is int and not _is_number(value)):
+            raise TypeError(f"{name} is no {kind}")
+    return item
 
 
 @dataclass(frozen=True, slots=True)
@@ -460,7 +495,7 @@ class _Part:
     @classmethod
     def of(cls, content: PartContent, version: Version, size: int) -> _Part:
         """The list of a part."""
-        sets = {key: text for key, text in content.shared.items() if key[0] == TOPICS}
+        sets = {key: text for key, text in content.shared.items() if _are_topics(*key, text)}
         found = cls(version, size, shared=sets)
         for recording, row in content.rows.items():
             found.summaries[recording] = None
@@ -468,9 +503,10 @@ class _Part:
                 index, _, text = row[SUMMARY].partition(" ")
                 # A list of unreadable chunks may be lost; the index has it, too.
                 index = index.strip("-") if content.is_whole else ""
-                summary = RecordingSummary.from_values(json.loads(text), index)
-                if (TOPICS, summary.topics) in sets:
-                    found.summaries[recording] = summary
+                with suppress(TypeError, ValueError):
+                    summary = RecordingSummary.from_values(json.loads(text), index)
+                    if (TOPICS, summary.topics) in sets and summary.id == recording:
+                        found.summaries[recording] = summary
             if DAMAGE in row:
                 found.damage[recording] = row[DAMAGE]
         return found
@@ -880,7 +916,9 @@ class Catalog:
         row = self._row(recording)
         with suppress(KeyError, TypeError, ValueError):
             looks, document = json.loads(row[ENTRY])
-            return looks, RecordingEntry.from_document(document)
+            entry = RecordingEntry.from_document(document)
+            if isinstance(looks, str) and entry.id == recording:
+                return looks, entry
         return None
 
     def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
@@ -901,8 +939,11 @@ class Catalog:
         with self._lock:
             self._follow()
             part = self._parts.get(self._places.get(recording, -1))
-            rows = json.loads(part.damage.get(recording, "[]")) if part is not None else []
-        return {(segment, chunk): reason for segment, chunk, reason in rows}
+            text = part.damage.get(recording, "[]") if part is not None else "[]"
+        with suppress(TypeError, ValueError):
+            rows = json.loads(text)
+            return {(int(segment), int(chunk)): str(reason) for segment, chunk, reason in rows}
+        return {}
 
     def stamps(
         self, entry: RecordingEntry, number: int, table: ChunkTable
@@ -910,7 +951,8 @@ class Catalog:
         """Decoding results of a segment; None before its messages are decoded."""
         digest, _, text = self._row(entry.id).get(f"{STAMPS}{number}", "").partition(" ")
         with suppress(ValueError, ZlibError):
-            rows = np.frombuffer(decompress(b64decode(text)), _STAMPS)
+            most = len(table.parts) * _STAMPS.itemsize
+            rows = np.frombuffer(decompressobj().decompress(b64decode(text), most + 1), _STAMPS)
             if digest == entry.digests.get(str(number)) and len(rows) == len(table.parts):
                 return rows
         return None
@@ -1007,6 +1049,15 @@ class Catalog:
         for key in [k for k in self._tables if recording in {None, k[0]}]:
             table, _ = self._tables.pop(key)
             self._cached -= _size(table)
+
+
+def _are_topics(kind: str, key: str, text: str) -> bool:
+    """True for the set of topics that a hash belongs to."""
+    if kind != TOPICS or hash_of(text) != key:
+        return False
+    with suppress(TypeError, ValueError):
+        return all(isinstance(word, str) for one in topics_from_json(text) for word in one)
+    return False
 
 
 def schema_hash(schema: Schema) -> str:

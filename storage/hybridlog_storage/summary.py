@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 
 class TopicType(NamedTuple):
@@ -83,18 +83,30 @@ class RecordingSummary(NamedTuple):
         """The summary from the values of its text.
 
         Raises:
-            TypeError: A value is missing, or there is one too many.
-            ValueError: A span is no pair.
+            TypeError: A value is missing, of another type, or there is one too many.
+            ValueError: A span is no pair, or a number has more than 64 bits.
         """
+        if [type(value) for value in values] not in (_TYPES, _TYPES_WITHOUT_SPAN):
+            raise TypeError("the values are no summary")
         span, (begin, end) = values[_SPAN : _SPAN + 2]
+        numbers = [begin, end, *(value for value in values if type(value) is int)]
         if span is not None:
             first, last = span
             span = first, last
+            numbers += span
+        if any(type(one) is not int or not -MAX_INT <= one <= MAX_INT for one in numbers):
+            raise ValueError("a time or a count is no number of 64 bits")
         rest = values[_SPAN + 2 :]
         return cls._make([*values[:_SPAN], span, (begin, end), *rest, indexed_by])
 
 
-_SPAN = RecordingSummary._fields.index("span")  # the extent follows
+MAX_INT: Final = 2**63 - 1
+"""The greatest time and count, without the sign."""
+_SPAN: Final = RecordingSummary._fields.index("span")  # the extent follows
+_TYPES: Final[list[type]] = [
+    *(str, str, str, dict, dict, int, str, list, list, str, int, int, int, int, bool, bool, str)
+]
+_TYPES_WITHOUT_SPAN: Final = [*_TYPES[:_SPAN], type(None), *_TYPES[_SPAN + 1 :]]
 
 
 def topics_to_json(topics: Iterable[TopicType]) -> str:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import errno
+import json
 import math
 import os
 import random
 import subprocess
 import sys
 import threading
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
+from zlib import compress
 
 import numpy as np
 import pytest
@@ -35,7 +39,16 @@ from hybridlog_storage.catalog import (
     schema_hash,
     stamps_of,
 )
-from hybridlog_storage.catalog_parts import MAX_PART_BYTES, DiskFolder
+from hybridlog_storage.catalog_parts import (
+    DAMAGE,
+    ENTRY,
+    MAX_PART_BYTES,
+    STAMPS,
+    SUMMARY,
+    TOPICS,
+    DiskFolder,
+    PartContent,
+)
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
@@ -638,6 +651,77 @@ def test_whatever_is_lost_of_a_part_nothing_wrong_is_said(
     else:
         path.write_bytes(changed.get(kind, b""))
     open_and_ask(truth, tmp_path)
+
+
+def changed_anywhere(value: Any) -> Iterator[Any]:
+    """The value with one of the values in it replaced by one of another type, or gone."""
+    yield from (None, 7, "x", [], {}, 1.5, [[]], 10**30)
+    if not isinstance(value, dict | list):
+        return
+    items = [*(value.items() if isinstance(value, dict) else enumerate(value))]
+    for at, (place, one) in enumerate(items):
+        for other in ([], *([(place, it)] for it in changed_anywhere(one))):
+            found = [*items[:at], *other, *items[at + 1 :]]
+            yield dict(found) if isinstance(value, dict) else [it for _, it in found]
+
+
+@pytest.mark.parametrize("kind", [SUMMARY, ENTRY, DAMAGE, TOPICS, f"{STAMPS}0"])
+def test_a_forged_line_is_no_error(truth: Truth, tmp_path: Path, kind: str) -> None:
+    """Its checksum is right. Of types that do not fit nothing is believed."""
+    folder = tmp_path / CATALOG
+    folder.mkdir()
+    for name, data in truth.files.items():
+        (folder / name).write_bytes(data)
+    content = PartContent.from_bytes(STORE, truth.files["part-000000"])
+    recording = truth.models[0].id
+    if kind == TOPICS:
+        ((key, text),) = [(k, t) for k, t in content.shared.items() if k[0] == TOPICS]
+        texts: Iterator[str] = (json.dumps(one) for one in changed_anywhere(json.loads(text)))
+    elif kind.startswith(STAMPS):
+        digest, _, rows = content.rows[recording][kind].partition(" ")
+        bomb = b64encode(compress(bytes(1 << 24))).decode()
+        texts = iter((digest, f"{digest} x", f"{digest} {rows[:-8]}", f"{digest} {bomb}", rows))
+    else:
+        first, _, rest = content.rows[recording][kind].partition(" ")
+        head, text = (f"{first} ", rest) if kind == SUMMARY else ("", f"{first} {rest}".strip())
+        texts = (head + json.dumps(one) for one in changed_anywhere(json.loads(text)))
+    for forged in some_of(texts, 150):
+        if kind == TOPICS:
+            content.shared[key] = forged
+        else:
+            content.rows[recording][kind] = forged
+        (folder / "part-000000").write_bytes(content.to_bytes(STORE))
+        with closing(Catalog(tmp_path, STORE)) as opened:
+            known = {one.id: one for one in opened.summaries()}
+            for one in known.values():
+                assert opened.topics(one.topics)
+                assert one.span is None or all(type(time) is int for time in one.span)
+                assert [type(value) for value in one if value is not None] == [
+                    type(value)
+                    for value, has in zip(truth.models[0].described.summary, one, strict=True)
+                    if has is not None
+                ]
+            assert known.keys() <= {model.id for model in truth.models}
+            opened.with_fingerprint("f")
+            row = opened.recording(recording)
+            if row is not None:
+                assert types_of(row[1]) == types_of(truth.models[0].entry)
+                for channel in row[1].channels:
+                    assert type(channel.stats.messages) is type(channel.id) is int
+                    assert type(channel.topic) is type(channel.message_encoding) is str
+            opened.damage(recording)
+            decoded = decoded_of(opened, truth.models[0])
+            wanted = decoded_in(truth.models[0])
+            assert all(one in (None, it) for one, it in zip(decoded, wanted, strict=True))
+
+
+def types_of(entry: RecordingEntry) -> list[type]:
+    return [type(getattr(entry, name)) for name in entry.__slots__]
+
+
+def some_of(texts: Iterator[str], count: int) -> list[str]:
+    everything = [*texts]
+    return random.Random(7).sample(everything, min(count, len(everything)))
 
 
 @pytest.mark.parametrize("change", ["gone", "empty", "changed", "another"])
