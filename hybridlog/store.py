@@ -25,6 +25,7 @@ from hybridlog.query.question import Question
 from hybridlog.query.times import parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Session, of_one_moment
+from hybridlog.wording import listed
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -438,7 +439,13 @@ class Store:
         """
         from hybridlog.tf.reader import frame_tree
 
-        return frame_tree(self.recordings(recording), topics)
+        chosen = self.recordings(recording).check()
+        if len(chosen) > 1:
+            raise TopicError(
+                f"Frames belong to one recording: name one of {listed(chosen.labels)}."
+            )
+        names = chosen.topic(*topics).topics if topics else chosen.topics()
+        return frame_tree(self.session, chosen.summaries[0], names)
 
     @of_one_moment
     def check(self, recording: Texts = None) -> list[TopicCheck]:

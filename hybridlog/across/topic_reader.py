@@ -13,7 +13,6 @@ import pyarrow as pa
 
 from hybridlog.across.interpolate import quaternion_paths
 from hybridlog.across.match import UNKNOWN
-from hybridlog.frames.answer import stream
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import lost_times
@@ -22,6 +21,7 @@ from hybridlog.query.intervals import joined
 from hybridlog.query.planner import Planner
 from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog.schema.column import STAMP
+from hybridlog.tf.in_frame import stream
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.times import BEGIN, END

@@ -232,3 +232,34 @@ POINT_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
     "foxglove.PointCloud": _foxglove_cloud,
 }
 """Makers of arrays by the type of a message, of ROS without `msg`."""
+
+
+def positions(points: NDArray[Any]) -> NDArray[np.float64]:
+    """Where points are: float64[..., 3], m; those of a scan in its plane.
+
+    Args:
+        points: Records with `x`, `y` and `z`, or with `range` and `angle`.
+
+    Raises:
+        PayloadError: They are no points.
+    """
+    names = points.dtype.names or ()
+    if {"x", "y", "z"} <= set(names):
+        return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    if not {"range", "angle"} <= set(names):
+        raise PayloadError("these are no points: they have neither x, y and z nor range and angle")
+    distance, angle = (points[name].astype(np.float64) for name in ("range", "angle"))
+    with np.errstate(invalid="ignore"):
+        flat = [distance * np.cos(angle), distance * np.sin(angle), np.zeros_like(distance)]
+    return np.stack(flat, axis=-1)
+
+
+def point_columns(points: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The fields of points, each of shape (n,); those of several numbers become as many."""
+    columns: dict[str, NDArray[Any]] = {}
+    for name in points.dtype.names or ():
+        values = points[name].reshape(points.size, -1)
+        for place in range(values.shape[1]):
+            own = name + (f"_{place}" if values.shape[1] > 1 else "")
+            columns[_unique(own, list(columns))] = values[:, place]
+    return columns

@@ -79,6 +79,7 @@ if TYPE_CHECKING:
     metavar="TOPIC: A,B.C",
     help="Only these fields of a topic, with commas between them. Repeatable.",
 )
+@options.in_frame
 @table_options
 @options.verbose
 def align_command(
@@ -94,6 +95,7 @@ def align_command(
     choice: Choice,
     beside: tuple[str, ...],
     fields: tuple[str, ...],
+    frame: str | None,
     to: Destination,
     strict: bool,
     mongo: str | None,
@@ -111,6 +113,8 @@ def align_command(
         for predicates, add in ((where, _where), (fields, _fields)):
             for text in predicates:
                 add(opened, queries, text)
+        if frame is not None:
+            queries = [query.in_frame(frame) for query in queries]
         if between is not None:
             queries[0] = queries[0].between(*between)
         if strict:

@@ -293,6 +293,9 @@ def write_answer(
         query.counters.reset()
         yield from lines(Planner(query.session, query.question, query.counters))
 
+    if query.question.frame is not None:
+        _write_in_frame(query, form, target)
+        return 0
     content = OUTPUTS[form].content
     total = 0 if quiet else payload_bytes(query)
     with progress_bar(form, total, quiet=quiet) as bar:
@@ -316,6 +319,26 @@ def write_answer(
     for name in json_columns(columns):
         output.note(f"{name} has values of several types: it is written as JSON text.")
     return counters.messages - counters.reduced - written
+
+
+def _write_in_frame(query: Query, form: str, target: Target) -> None:
+    """Write points and poses in the frame of the question."""
+    if OUTPUTS[form].content != "payloads":
+        tables = query.to_tables()
+        rows = Rows(
+            lines=lambda: chain.from_iterable(map(_lines_of, tables)),
+            tables=lambda: tables,
+            schema=lambda: None,
+        )
+        _write_rows(rows, form, target, lambda: None)
+        return
+    from hybridlog.tf.in_frame import points_of
+
+    query.counters.reset()
+    with OUTPUTS[form].open(target) as writer:
+        for one in points_of(query.session, query.question, query.counters):
+            message = one.message
+            writer.add_points(one.points, message.topic, message.type, message.log_time_ns)
 
 
 def write_following(following: Following, form: str) -> None:

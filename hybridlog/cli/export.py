@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,7 @@ from hybridlog.cli.answers import (
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.split import pieces, split_by
 from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
 from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
@@ -59,6 +61,7 @@ _TABLES = formats_of("table", "lines")
 @click.option(
     "--no-attachments", is_flag=True, help="Leave out attachments; they are in MCAP files only."
 )
+@split_by
 @options.tag_columns
 @options.force
 @options.mongo
@@ -74,6 +77,7 @@ def export_command(
     no_latched: bool,
     original_times: bool,
     no_attachments: bool,
+    split: str | None,
     tags: str | None,
     force: bool,
     mongo: str | None,
@@ -84,7 +88,7 @@ def export_command(
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
     options.check_tags(tags, form)
-    if form in _LOGS:
+    if form in _LOGS and split is None:
         check_room(target, force=force)
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = query_of(opened, topic, choice)
@@ -94,15 +98,20 @@ def export_command(
             query = query.between(*between)
         if tags is not None:
             query = query.tags(*parse_fields(tags, "--tags"))
-        if form in _LOGS:
-            extras = query.extras()
-            if no_attachments:
-                extras = extras._replace(attachments=[], left_out=0)
-            _write_file(query, form, target, front, extras, force=force, quiet=quiet)
-        else:
-            _write_directory(query, form, target, force=force, quiet=quiet)
-        if not quiet:
-            print_remarks(query, topic, is_empty=None if form in _LOGS else False)
+        parts: Iterable[tuple[Path, Query]] = [(target, query)]
+        if split is not None:
+            folder = False if form in _LOGS else None
+            parts = pieces(opened, query, split, target, force=force, is_directory=folder)
+        for path, one in parts:
+            if form in _LOGS:
+                extras = one.extras()
+                if no_attachments:
+                    extras = extras._replace(attachments=[], left_out=0)
+                _write_file(one, form, path, front, extras, force=force, quiet=quiet)
+            else:
+                _write_directory(one, form, path, force=force, quiet=quiet)
+            if not quiet:
+                print_remarks(one, topic, is_empty=None if form in _LOGS else False)
 
 
 def _form(target: Path) -> str:

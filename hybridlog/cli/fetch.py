@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from hybridlog.cli.answers import (
     answer_query,
     format_of,
     format_option,
+    latched,
     output_option,
     print_cost,
     print_lost,
@@ -25,7 +26,8 @@ from hybridlog.cli.answers import (
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import Stopped
-from hybridlog.formats import OUTPUTS, formats_of
+from hybridlog.cli.split import pieces, split_by
+from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog.formats.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -54,6 +56,8 @@ class _Choices:
     reverse: bool
     follow: bool
     fields: str | None
+    frame: str | None
+    split: str | None
     tags: str | None
     within: str | None
     before: str | None
@@ -100,6 +104,8 @@ class _Choices:
     "of --between, until the recordings end or Ctrl-C.",
 )
 @click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
+@options.in_frame
+@split_by
 @options.tag_columns
 @click.option(
     "--within",
@@ -156,7 +162,12 @@ def fetch_command(**parameters: Any) -> None:
                 latched=not choices.no_latched and choices.at is None,
                 original_times=choices.original_times,
             )
+            if choices.split is not None:
+                _write_pieces(store, query, choices.split, to, front)
+                return
             query = answer_query(query, to, front=front)
+            if choices.strict and choices.frame is not None:
+                query.completeness().check(payloads=True)
         sys.stdout.flush()
         if not choices.quiet:
             cost = query.counters.copy()
@@ -165,6 +176,19 @@ def fetch_command(**parameters: Any) -> None:
             print_remarks(query, choices.topic)
             if count is not None:
                 print_lost(query, count)
+
+
+def _write_pieces(store: Store, query: Query, how: str, to: Destination, front: Front) -> None:
+    """Write a file for each part of the answer, and a line about each."""
+    assert to.path is not None
+    folder = is_directory(to.form, to.path)
+    for path, one in pieces(store, query, how, to.path, force=to.force, is_directory=folder):
+        answer_query(one, replace(to, path=path), front=front)
+        if not to.quiet:
+            counters = one.counters
+            given = output.counted(counters.messages - counters.reduced, "message")
+            output.note(f"{path}: {given}{latched(counters)}")
+            output.notes(one.completeness().sentences)
 
 
 def _follow(query: Query, choices: _Choices, form: str) -> None:
@@ -202,6 +226,8 @@ def _query(store: Store, choices: _Choices) -> Query:
         query = query.where(predicate, near if _names_topics(predicate) else None)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
+    if choices.frame is not None:
+        query = query.in_frame(choices.frame)
     if choices.tags is not None:
         query = query.tags(*parse_fields(choices.tags, "--tags"))
     if choices.every > 1:
@@ -223,8 +249,13 @@ def _destination(choices: _Choices) -> Destination:
         no_latched=choices.no_latched, original_times=choices.original_times, form=form
     )
     options.check_tags(choices.tags, form)
+    as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures"}
+    if choices.frame is not None and (as_it_came or form == "raw"):
+        raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
     to = Destination(form=form, path=choices.output, force=choices.force, quiet=choices.quiet)
-    if not choices.count:
+    if choices.split is not None and to.path is None:
+        raise UsageError("--split-by writes files: name them with -o.")
+    if not choices.count and choices.split is None:
         to.check()
     return to
 
@@ -233,6 +264,14 @@ def _check_together(choices: _Choices) -> None:
     """Refuse options that --at or --follow make no sense with."""
     with_others = any(map(_names_topics, choices.where)), "--where with other topics"
     alone: dict[str, list[tuple[bool, str]]] = {}
+    if choices.split is not None:
+        alone["--split-by writes files"] = [
+            (choices.count, "--count"),
+            (choices.at is not None, "--at"),
+            (choices.follow, "--follow"),
+            (choices.reverse, "--reverse"),
+            (choices.form == "table", "--format table"),
+        ]
     if choices.at is not None:
         alone["--at gives one message, by log time"] = [
             (choices.between is not None, "--between"),
@@ -250,6 +289,7 @@ def _check_together(choices: _Choices) -> None:
             (choices.count, "--count"),
             (choices.at is not None, "--at"),
             (choices.strict, "--strict"),
+            (choices.frame is not None, "--in-frame"),
             with_others,
         ]
     for reason, others in alone.items():

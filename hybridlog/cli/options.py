@@ -224,6 +224,12 @@ near = click.option(
     metavar="DURATION",
     help="Greatest distance in time, such as 20ms; without, any.",
 )
+in_frame = click.option(
+    "--in-frame",
+    "frame",
+    metavar="FRAME",
+    help="Points and poses in this frame, such as map, at the times of their headers.",
+)
 tag_columns = click.option(
     "--tags", metavar="A,B", help="Tags of the recordings as columns, with commas between them."
 )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.arrays.message_arrays import to_numpy
+from hybridlog.arrays.point_arrays import point_columns, positions
 from hybridlog.formats.raw import DirectoryWriter
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import UsageError
@@ -67,13 +68,17 @@ class PlyWriter(DirectoryWriter):
                 self._codecs[channel] = codec_for(channel)
             name = channel.schema.name if channel.schema else ""
             points = to_numpy(name, self._codecs[channel].decode(batch.payload(row)))
-            about = {
-                "topic": channel.topic,
-                "type": name,
-                "log_time_ns": int(batch.log_time[row]),
-                "points": points.size,
-            }
-            self.add(ply_of(points), ".ply", about)
+            self.add_points(points, channel.topic, name, int(batch.log_time[row]))
+
+    def add_points(self, points: NDArray[Any], topic: str, kind: str, log_time: int) -> None:
+        """Append the points of a message.
+
+        Raises:
+            UsageError: They are no points.
+            DiskFullError: No space left.
+        """
+        about = {"topic": topic, "type": kind, "log_time_ns": log_time, "points": points.size}
+        self.add(ply_of(points), ".ply", about)
 
 
 def ply_of(points: NDArray[Any]) -> bytes:
@@ -88,19 +93,16 @@ def ply_of(points: NDArray[Any]) -> bytes:
     """
     names = points.dtype.names or ()
     columns: dict[str, NDArray[Any]] = {}
-    if "range" in names and "angle" in names:
-        distance, angle = points["range"].reshape(-1), points["angle"].reshape(-1)
-        columns = {"x": distance * np.cos(angle), "y": distance * np.sin(angle)}
-        columns["z"] = np.zeros_like(columns["x"])
+    if "x" not in names and {"range", "angle"} <= set(names):
+        place = positions(points).reshape(-1, 3).astype(points["range"].dtype)
+        columns = dict(zip("xyz", place.T, strict=True))
     elif not {"x", "y", "z"} <= set(names):
         raise UsageError("ply takes clouds and scans: messages with points.")
-    for name in names:
-        values = points[name].reshape(points.size, -1)
-        for place in range(values.shape[1]):
-            own = _NO_WORD.sub("_", name) + (f"_{place}" if values.shape[1] > 1 else "")
-            while own in columns:
-                own += "_"
-            columns[own] = values[:, place]
+    for name, values in point_columns(points).items():
+        own = _NO_WORD.sub("_", name)
+        while own in columns:
+            own += "_"
+        columns[own] = values
     types = [(name, _little(column.dtype)) for name, column in columns.items()]
     rows = np.empty(points.size, types)
     for name, column in columns.items():

@@ -94,7 +94,7 @@ def _array(column: pa.ChunkedArray[Any]) -> Any:
         return _string_dtype().__from_arrow__(column.cast(pa.large_string()))
     cells = np.empty(len(column), object)
     place, shared = 0, None
-    for chunk in column.chunks:
+    for chunk in filter(len, column.chunks):
         rows = slice(place, place + len(chunk))
         place += len(chunk)
         if is_list(kind) and _is_plain(chunk):

@@ -26,6 +26,8 @@ class Counters:
         reduced: Messages left out because only their fields were recorded.
         unreadable: Messages of the predicate's topics that do not fit their definition.
         unindexed: Messages of running recordings that the index lacks, if it has answered.
+        no_transform: Reasons why points or poses are not in the frame asked for, and numbers
+            of messages.
         elapsed_s: Wall time, seconds.
     """
 
@@ -38,6 +40,7 @@ class Counters:
     reduced: int = 0
     unreadable: int = 0
     unindexed: int = 0
+    no_transform: tuple[tuple[str, int], ...] = ()
     elapsed_s: float = 0.0
 
     def reset(self) -> None:

@@ -166,15 +166,26 @@ class MessageAnswers(Steps):
         return index_documents(self.session, self.question, self.counters)
 
     @of_one_moment
-    def to_numpy(self) -> NDArray[Any] | list[NDArray[Any]]:
+    def to_numpy(self, frame: str | None = None) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked if all are alike.
 
         Messages that cannot be arrays are left out; `counters.unreadable` counts them.
+
+        Args:
+            frame: The frame of points; see `in_frame`. Their `x`, `y` and `z` are float64, NaN
+                without a transform, before their other fields. None for that of each message.
 
         Raises:
             PayloadError: None of the messages can be an array.
             DefinitionError: The first of them has no definition.
         """
+        frame = self.question.frame if frame is None else frame
+        if frame is not None:
+            from hybridlog.tf.in_frame import points_of
+
+            self.counters.reset()
+            asked = replace(self.question, frame=frame)
+            return _stacked([one.points for one in points_of(self.session, asked, self.counters)])
         scans = self._scans()
         if scans is not None:
             return scans
@@ -190,8 +201,7 @@ class MessageAnswers(Steps):
         if refused is not None and not arrays:
             raise refused
         self.counters.unreadable += unreadable
-        alike = {(a.shape, a.dtype) for a in arrays}
-        return np.stack(arrays) if len(alike) == 1 else arrays
+        return _stacked(arrays)
 
     def _scans(self) -> NDArray[Any] | None:
         """Laser scans of one length as an array, from columns; None for everything else."""
@@ -203,3 +213,8 @@ class MessageAnswers(Steps):
         question = replace(self.question, fields=FIELDS, tags=())
         found = scans_in(Planner(self.session, question, self.counters))
         return None if self.counters.unreadable or self.counters.reduced else found
+
+
+def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any] | list[NDArray[Any]]:
+    alike = {(a.shape, a.dtype) for a in arrays}
+    return np.stack(arrays) if len(alike) == 1 else arrays

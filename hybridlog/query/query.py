@@ -79,6 +79,8 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
             found["predicate"] = f"where {text if len(text) <= 200 else text[:200] + '…'}"
         if question.fields is not None:
             found["fields"] = f"fields {listed(question.fields, 5)}"
+        if question.frame is not None:
+            found["frame"] = f"in frame {question.frame}"
         if question.every > 1:
             found["every"] = f"every {question.every}th"
         if question.limit is not None:

@@ -44,6 +44,7 @@ class Question:
         tags: Keys of tags of recordings that are columns of tables.
         names_recording: Tables have the column `recording` even if there is only one.
         during: Intervals of log time that messages must lie in; None for all times.
+        frame: Frame of points and poses in the answer; None for that of each message.
     """
 
     topics: tuple[str, ...]
@@ -58,6 +59,7 @@ class Question:
     tags: tuple[str, ...] = ()
     names_recording: bool = False
     during: Intervals | None = None
+    frame: str | None = None
 
     @property
     def returns_all(self) -> bool:

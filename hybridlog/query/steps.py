@@ -238,6 +238,17 @@ class Steps:
                 raise TopicError(_no_field(path, known, self.topics))
         return self._with(fields=tuple(paths))
 
+    def in_frame(self, frame: str) -> Self:
+        """Points and poses in tables and arrays in another frame, at the times of their headers.
+
+        By the rules of tf2. A message without a transform keeps its row, without a place;
+        `remarks` says why. Scans and clouds become lists of the fields of their points.
+
+        Args:
+            frame: Its name.
+        """
+        return self._with(frame=frame)
+
     def __getitem__(self, fields: str | tuple[str, ...]) -> Self:
         """`query["header.stamp", "ranges.min"]` is `query.fields("header.stamp", "ranges.min")`."""
         return self.fields(*((fields,) if isinstance(fields, str) else fields))

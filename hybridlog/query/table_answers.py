@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.query.steps import Steps
 from hybridlog.session import of_one_moment
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,22 +27,32 @@ class TableAnswers(Steps):
     @of_one_moment
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
+        import pyarrow as pa
+
         from hybridlog.frames.answer import to_arrow
 
+        if self.question.frame is not None:
+            return pa.concat_tables(self.to_tables(), promote_options="permissive")
         return to_arrow(self._planner())
 
     @of_one_moment
     def to_pandas(self) -> pd.DataFrame:
         """A frame of the same columns, indexed by log time (UTC, ns)."""
         from hybridlog.frames.answer import to_pandas
+        from hybridlog.frames.frame import frame_of
 
-        frame = to_pandas(self._planner())
+        if self.question.frame is not None:
+            table = self.to_arrow()
+            names = [name for name in table.column_names if name != "log_time"]
+            frame = frame_of(table["log_time"], ((name, table[name]) for name in names))
+        else:
+            frame = to_pandas(self._planner())
         frame.attrs["hybridlog"] = asdict(self.counters)
         return frame
 
     def to_tables(self) -> Iterator[pa.Table]:
         """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
-        from hybridlog.frames.answer import stream
+        from hybridlog.tf.in_frame import stream
 
         return stream(self._planner())
 
@@ -49,6 +60,7 @@ class TableAnswers(Steps):
         """The answer in order as lines of JSON, many at a time."""
         from hybridlog.frames.lines import lines
 
+        self._as_they_came("Lines")
         for batch in lines(self._planner()):
             yield [line if isinstance(line, str) else "".join(line) for line in batch]
 
@@ -75,6 +87,7 @@ class TableAnswers(Steps):
         """
         from hybridlog.drawing.figure import new_axes, plot
 
+        self._as_they_came("Plots")
         axes = new_axes() if ax is None else ax
         plot(axes, self, fields)
         return axes
@@ -163,6 +176,11 @@ class TableAnswers(Steps):
         """
         from hybridlog.query.answers.field_statistics import statistics
 
+        self._as_they_came("Statistics")
         query = self.fields(*fields) if fields else self
         with self.counters.timed():
             return statistics(self.session, query.question, self.counters)
+
+    def _as_they_came(self, what: str) -> None:
+        if self.question.frame is not None:
+            raise UsageError(f"{what} are of messages as they came: leave out in_frame.")

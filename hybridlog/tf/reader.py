@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -11,7 +12,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.frames.answer import stream, to_arrow
+from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Question
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import Frame, FrameTree
 from hybridlog.wording import listed
@@ -20,8 +26,9 @@ from hybridlog_storage.errors import TopicError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.query import Query
-    from hybridlog.recordings import Recordings
+    from hybridlog.query.steps import Steps
+    from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
 
 TYPES: Final = (
     "tf2_msgs/TFMessage",
@@ -41,24 +48,23 @@ def is_of_transforms(type_name: str) -> bool:
     return plain_type(type_name) in TYPES
 
 
-def frame_tree(recordings: Recordings, topics: Sequence[str] = ()) -> FrameTree:
+def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[str]) -> FrameTree:
     """The frames of one recording.
 
     Args:
-        recordings: The recording.
-        topics: Names of topics with transforms; empty for all topics of such types. Those
-            whose names end in `tf_static` hold at all times.
+        session: The open store.
+        recording: The recording.
+        topics: Full names of topics that may have transforms. Those whose names end in
+            `tf_static` hold at all times.
 
     Raises:
-        TopicError: Several recordings are chosen, or none; no topic has transforms.
+        TopicError: No topic has transforms.
     """
-    if len(recordings.check()) > 1:
-        raise TopicError(
-            f"Frames belong to one recording: name one of {listed(recordings.labels)}."
-        )
-    query = recordings.topic(*topics) if topics else recordings.all_topics()
+    question = Question(tuple(topics), (recording.id,))
     types = {
-        one.channel.topic: one.channel.schema.name for one in query.channels() if one.channel.schema
+        one.channel.topic: one.channel.schema.name
+        for one in Planner(session, question, Counters()).channels()
+        if one.channel.schema
     }
     names = [topic for topic, name in types.items() if is_of_transforms(name)]
     if not names:
@@ -66,15 +72,15 @@ def frame_tree(recordings: Recordings, topics: Sequence[str] = ()) -> FrameTree:
             "No topic has transforms: they are messages of tf2_msgs/TFMessage or "
             "foxglove.FrameTransform."
         )
-    builder, remarks = _Builder(), dict.fromkeys(query.remarks(*names))
+    builder = _Builder()
     for topic in names:
-        for table in recordings.topic(topic).to_tables():
+        for table in stream(Planner(session, replace(question, topics=(topic,)), Counters())):
             builder.add(table, is_static=topic.endswith(_STATIC))
-    summary = recordings.summaries[0]
-    return FrameTree(builder.frames(), summary.extent, dict(builder.invalid), [*remarks])
+    lacks = completeness_of(session, replace(question, topics=tuple(names))).sentences
+    return FrameTree(builder.frames(), recording.extent, dict(builder.invalid), [*lacks])
 
 
-def frames_and_stamps(query: Query) -> tuple[list[str], NDArray[np.int64]]:
+def frames_and_stamps(query: Steps) -> tuple[list[str], NDArray[np.int64]]:
     """The frames that the headers of a topic name, and its times.
 
     Returns:
@@ -85,7 +91,7 @@ def frames_and_stamps(query: Query) -> tuple[list[str], NDArray[np.int64]]:
     if "header.stamp" not in wanted:  # no message has to be read
         times = match_times(query.session, query.question, query.counters)
         return [], np.concatenate([np.empty(0, np.int64), *(one.log_time for one in times)])
-    table = query.fields(*wanted).to_arrow()
+    table = to_arrow(Planner(query.session, query.fields(*wanted).question, query.counters))
     frames = table["header.frame_id"].unique().to_pylist() if len(wanted) == 2 else []
     return frames, table["header.stamp"].cast(pa.int64()).to_numpy()
 

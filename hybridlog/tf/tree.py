@@ -248,7 +248,7 @@ class FrameTree:
             TopicError: no such frame.
             TimeError: `extrapolate` is no duration.
         """
-        wanted, given = self._name(target), self._name(source)
+        wanted, given = self.check(target), self.check(source)
         times = _nanoseconds(times)
         hold = 0 if extrapolate is None else parse_duration(extrapolate)
         made = identity(len(times))
@@ -277,7 +277,7 @@ class FrameTree:
         """
         end = np.array([self.span[1] - 1])
         ways = [
-            next(self._paths(self._name(name), end, np.arange(1), ()))[1]
+            next(self._paths(self.check(name), end, np.arange(1), ()))[1]
             for name in (source, target)
         ]
         used = _until_common(*ways)
@@ -335,7 +335,12 @@ class FrameTree:
             )
         return Transform(found.translation[0], found.rotation[0])
 
-    def _name(self, name: str) -> str:
+    def check(self, name: str) -> str:
+        """The name of a frame as the tree has it.
+
+        Raises:
+            TopicError: There is no such frame.
+        """
         wanted = name.removeprefix("/")
         if wanted not in self.frames and all(wanted not in f.parents for f in self.frames.values()):
             raise TopicError(f"There is no frame {name}; there are {listed(self.names) or 'none'}.")

@@ -446,6 +446,10 @@ METHODS: dict[str, Rule] = {
         ),
     ),
     "directory": Rule(lambda s: s.topic("arm").directory == s.directory.path, lambda _: True),
+    "in_frame": Rule(  # the recording has no transforms
+        lambda s: refusal(lambda: s.topic("said").in_frame("map").to_arrow()),
+        lambda k: "UsageError",
+    ),
     "during": Rule(
         lambda s: _thrice(s.topic("said", "cam").during(_during(s))),
         lambda k: _right_thrice(_second(k, "/said", "/cam")),

@@ -6,6 +6,7 @@ not read. `lost.py` finds them.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -39,6 +40,7 @@ class Completeness:
         unwritten: Messages that a running recorder has taken and not written yet, which are not
             lost; None for an unknown number.
         unindexed: Messages that the index lacks, where MongoDB must answer.
+        untransformed: Messages whose points or poses are not in the frame asked for.
         late: Sentences about messages that are not written or not indexed yet.
         sentences: Everything that the answer lacks, in sentences, those of `late` included.
     """
@@ -49,6 +51,7 @@ class Completeness:
     rows: tuple[Mapping[str, Any], ...] = ()
     unwritten: int | None = 0
     unindexed: int = 0
+    untransformed: int = 0
     late: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
 
@@ -89,6 +92,8 @@ class Completeness:
     def check(self, *, payloads: bool = False) -> None:
         """Check that no message of the range is lost, or not written or indexed yet.
 
+        Nor may any lack a transform to the frame asked for.
+
         Args:
             payloads: True to check that no payload is missing, too.
 
@@ -102,6 +107,11 @@ class Completeness:
             )
         if self.late:
             raise IncompleteError(" ".join(self.late))
+        if self.untransformed:
+            raise IncompleteError(
+                f"{counted(self.untransformed, 'message')} without a transform. Without --strict "
+                "the rest is given."
+            )
         if payloads and self.reduced:
             raise IncompleteError(
                 f"Of {self.reduced} messages in this range only the fields are stored. Without "
@@ -131,6 +141,11 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
             f"{counted(counters.reduced, 'message')} {has} no payload, which was dropped under "
             "pressure: not in this answer; --where and --fields find the fields."
         )
+    reasons: Counter[str] = Counter()
+    for why, number in counters.no_transform:
+        reasons[why] += number
+    for why, number in reasons.items():
+        yield f"{counted(number, 'message')} without a transform to {question.frame}: {why}."
 
 
 def _unreadable(messages: int, question: Question) -> str:

@@ -86,6 +86,7 @@ def completeness_of(
         rows=tuple(lost),
         unwritten=unwritten,
         unindexed=unindexed,
+        untransformed=sum(n for _, cost in asked if cost for _, n in cost.no_transform),
         late=tuple(dict.fromkeys(late)),
         sentences=tuple(dict.fromkeys(sentences)),
     )

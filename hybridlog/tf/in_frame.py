@@ -1,0 +1,326 @@
+"""Answers in another frame: points and poses of messages, at the times of their headers.
+
+The rules are those of tf2. Positions are of 64 bits. A message without a transform at its time
+keeps its row: its points and poses are NaN or null, and `Counters.no_transform` says why.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
+from hybridlog.frames import answer
+from hybridlog.message import messages_in
+from hybridlog.query.planner import Planner
+from hybridlog.tf.reader import frame_tree
+from hybridlog.tf.transform import Transform
+from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Question
+    from hybridlog.session import Session
+    from hybridlog.tf.tree import FrameTree
+
+_STAMPS: Final = ("header.stamp", "timestamp")
+_FRAMES: Final = ("header.frame_id", "frame_id", "parent_frame_id")
+_XYZ: Final = ("x", "y", "z")
+_PAIRS: Final = {"position": "orientation", "translation": "rotation"}
+_UNKNOWN: Final = "messages without a frame or a time"
+
+
+class _Pose(NamedTuple):
+    """Columns of a pose.
+
+    Attributes:
+        position: Path above x, y and z; of a vector the same.
+        rotation: Path above x, y, z and w; empty for a point or a vector.
+        covariance: Path of the 36 numbers of its covariance; empty without.
+        is_vector: It is only turned.
+    """
+
+    position: str
+    rotation: str
+    covariance: str
+    is_vector: bool
+
+
+class Points(NamedTuple):
+    """The points of a message in the frame.
+
+    Attributes:
+        message: The message.
+        points: Records with `x`, `y`, `z` (float64), and its further fields; any shape.
+    """
+
+    message: Message
+    points: NDArray[Any]
+
+
+def stream(planner: Planner) -> Iterator[pa.Table]:
+    """The tables of an answer, see `frames.answer.stream`; in the frame of the question, if any.
+
+    Scans and clouds are lists then, one for each field of their points.
+
+    Raises:
+        UsageError: The messages have neither points nor poses, or are of several topics.
+        TopicError: There is no such frame in a recording, or no transforms.
+    """
+    if planner.question.frame is None:
+        return answer.stream(planner)
+    if has_points(planner):
+        return _tables_of_points(planner)
+    return _tables_of_poses(planner)
+
+
+def has_points(planner: Planner) -> bool:
+    """True if the messages are scans or clouds."""
+    if len(planner.question.topics) != 1:
+        raise UsageError("An answer in a frame is of one topic; `align` takes several.")
+    types = {one.channel.schema.name for one in planner.examples if one.channel.schema}
+    return bool(types) and all(plain_type(name) in POINT_MAKERS for name in types)
+
+
+def points_of(session: Session, question: Question, counters: Counters) -> Iterator[Points]:
+    """The points of messages in the frame of the question, in order.
+
+    Messages that cannot be arrays are left out; `counters.unreadable` counts them.
+
+    Raises:
+        TopicError: There is no such frame in a recording, or no transforms.
+    """
+    looked = _Looked(session, question, counters)
+    for run in Planner(session, replace(question, frame=None), counters).runs():
+        found: list[tuple[Message, NDArray[Any]]] = []
+        for message in messages_in(run):
+            if message.is_reduced:
+                counters.reduced += 1
+                continue
+            try:
+                found.append((message, message.to_numpy()))
+            except (PayloadError, DefinitionError):
+                counters.unreadable += 1
+        times = np.array([_stamp_of(one) for one, _ in found], np.int64)
+        frames = [str(_field(one, _FRAMES) or "") for one, _ in found]
+        recordings = [one.recording for one, _ in found]
+        poses = looked.transforms(recordings, frames, times)
+        for row, (message, array) in enumerate(found):
+            pose = Transform(poses.translation[row], poses.rotation[row])
+            own = message.fields.get("pose")  # of the points, in Foxglove's messages
+            if isinstance(own, dict):
+                pose = pose @ _transform(own)
+            yield Points(message, _moved(array, pose))
+
+
+class _Looked:
+    """Looks up transforms to the frame of a question, and counts what is missing."""
+
+    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+        self._session = session
+        self._counters = counters
+        self._target = str(question.frame)
+        self._trees: dict[str, FrameTree] = {}
+
+    def _tree(self, recording: str) -> FrameTree:
+        if recording not in self._trees:
+            snapshot = self._session.look([recording])
+            summary = snapshot.summaries[snapshot.by_id[recording]]
+            topics = sorted(snapshot.topics_of(summary))
+            self._trees[recording] = frame_tree(self._session, summary, topics)
+        return self._trees[recording]
+
+    def transforms(
+        self, recordings: Sequence[str], frames: Sequence[str], times: NDArray[np.int64]
+    ) -> Transform:
+        """The transforms from some frames at some times; NaN where there are none."""
+        made = Transform(np.full((len(times), 3), np.nan), np.full((len(times), 4), np.nan))
+        missing: Counter[str] = Counter()
+        pairs = [*zip(recordings, frames, strict=True)]
+        for pair in dict.fromkeys(pairs):
+            recording, frame = pair
+            tree = self._tree(recording)
+            tree.check(self._target)
+            rows = np.flatnonzero([one == pair for one in pairs])
+            if frame.removeprefix("/") not in tree.names:
+                missing[f"no frame {frame!r} among the transforms"] += len(rows)
+                continue
+            found = tree.lookup(self._target, frame, times[rows])
+            made.translation[rows], made.rotation[rows] = found.translation, found.rotation
+            missing.update(found.missing)
+        self._counters.no_transform += tuple(missing.items())
+        return made
+
+
+def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
+    question = planner.question
+    if question.fields is not None:
+        raise UsageError("Points in a frame have the fields of their points: leave out fields.")
+    several = question.names_recording or len(planner.session.chosen(question)) > 1
+    summaries = planner.session.snapshot().summaries
+    labels = {one.id: one.label for one in summaries}
+    stamp = pa.timestamp("ns", "UTC")
+    given = False
+    for message, points in points_of(planner.session, question, planner.counters):
+        time = _stamp_of(message)
+        own = {
+            "log_time": pa.array([message.log_time_ns], stamp),
+            **({"recording": pa.array([labels[message.recording]])} if several else {}),
+            "header.stamp": pa.array([time], stamp),
+            "header.frame_id": pa.array([question.frame]),
+        }
+        columns = point_columns(points)
+        own |= {
+            name: pa.ListArray.from_arrays(np.array([0, len(values)], np.int32), values)
+            for name, values in columns.items()
+            if name not in own
+        }
+        yield pa.table(own)
+        given = True
+    if not given:
+        yield pa.table({"log_time": pa.array([], stamp)})
+
+
+def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
+    session, question = planner.session, planner.question
+    looked = _Looked(session, question, planner.counters)
+    known = session.field_types(question.topics, question.recordings) or {}
+    poses = [*_poses_among(known)]
+    stamp = next((name for name in _STAMPS if name in known), None)
+    frame = next((name for name in _FRAMES if name in known), None)
+    if not poses or stamp is None or frame is None:
+        raise UsageError(
+            f"{question.topics[0]} has no points or poses with a frame and a time of their own, "
+            "so it cannot be in another frame."
+        )
+    several = question.names_recording or len(session.chosen(question)) > 1
+    plain = replace(question, frame=None)
+    asked, hidden = question.fields, set() if several else {"recording"}
+    if asked is not None:
+        needed = [stamp, frame, *_columns_of(poses)]
+        added = [one for one in needed if not _is_in(one, asked)]
+        hidden |= {*added}
+        plain = replace(plain, fields=(*asked, *added))
+    ids = {one.label: one.id for one in session.snapshot().summaries}
+    inner = Planner(session, replace(plain, names_recording=True), planner.counters)
+    for table in answer.stream(inner):
+        recordings = [ids[label] for label in table["recording"].to_pylist()]
+        frames = [str(name or "") for name in table[frame].to_pylist()]
+        times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
+        moved = looked.transforms(recordings, frames, times)
+        columns = dict(zip(table.column_names, table.columns, strict=True))
+        for pose in poses:
+            columns |= _pose_in_frame(columns, pose, moved)
+        columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
+        yield pa.table({name: column for name, column in columns.items() if name not in hidden})
+
+
+def _pose_in_frame(
+    columns: Mapping[str, Any], pose: _Pose, moved: Transform
+) -> dict[str, pa.Array[Any]]:
+    """New columns of a pose; null where there is no transform."""
+    made: dict[str, pa.Array[Any]] = {}
+    lost = ~moved.is_known
+    given = _numbers(columns, pose.position, "xyz")
+    zero = Transform(np.zeros_like(moved.translation), moved.rotation)
+    place = (zero if pose.is_vector else moved).apply(given)
+    if pose.rotation:
+        own = Transform(given, _numbers(columns, pose.rotation, "xyzw"))
+        for axis, values in zip("xyzw", (moved @ own).rotation.T, strict=True):
+            made[f"{pose.rotation}.{axis}"] = pa.array(values, mask=lost)
+    for axis, values in zip("xyz", place.T, strict=True):
+        made[f"{pose.position}.{axis}"] = pa.array(values, mask=lost)
+    if pose.covariance in columns:
+        found = columns[pose.covariance].combine_chunks()
+        turn = np.zeros((len(lost), 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = moved.matrix()[:, :3, :3]
+        turned = np.full_like(turn, np.nan)
+        there = found.is_valid().to_numpy(zero_copy_only=False)
+        turned[there] = found.flatten().to_numpy().reshape(-1, 6, 6)
+        turned = turn @ turned @ turn.transpose(0, 2, 1)
+        made[pose.covariance] = pa.FixedSizeListArray.from_arrays(
+            turned.reshape(-1), 36, mask=pa.array(lost)
+        )
+    return made
+
+
+def _numbers(columns: Mapping[str, Any], path: str, axes: str) -> NDArray[np.float64]:
+    found = [columns[f"{path}.{axis}"].cast(pa.float64()).to_numpy() for axis in axes]
+    return np.stack(found, axis=1)
+
+
+def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
+    """The poses, points and vectors of a message that are in the frame of its header."""
+    for path in paths:
+        stem, _, last = path.rpartition(".")
+        above, _, word = stem.rpartition(".")
+        if last != "x" or not all(f"{stem}.{axis}" in paths for axis in _XYZ) or "[" in path:
+            continue
+        turn = f"{above}.{_PAIRS.get(word)}".lstrip(".")
+        if word in _PAIRS and all(f"{turn}.{axis}" in paths for axis in "xyzw"):
+            beside = f"{above.rpartition('.')[0]}.covariance".lstrip(".")
+            known = above.endswith("pose") and paths.get(beside, "").endswith("[36]")
+            yield _Pose(stem, turn, beside if known else "", is_vector=False)
+        elif word in {"point", "vector"} and not above:
+            yield _Pose(stem, "", "", is_vector=word == "vector")
+
+
+def _columns_of(poses: Sequence[_Pose]) -> Iterator[str]:
+    for pose in poses:
+        yield from (f"{pose.position}.{axis}" for axis in "xyz")
+        yield from (f"{pose.rotation}.{axis}" for axis in ("xyzw" if pose.rotation else ""))
+
+
+def _is_in(path: str, asked: Sequence[str]) -> bool:
+    return any(path == one or path.startswith(f"{one}.") for one in asked)
+
+
+def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:
+    """The points of an array, moved; other fields stay."""
+    names = array.dtype.names or ()
+    fields: list[Any] = [(axis, np.float64) for axis in _XYZ]
+    fields += [(name, array.dtype[name]) for name in names if name not in _XYZ]
+    made = np.empty(array.shape, fields)
+    with np.errstate(invalid="ignore"):  # ranges without an echo are infinite
+        there = pose.apply(positions(array))
+    for place, axis in enumerate(_XYZ):
+        made[axis] = there[..., place]
+    for name in names:
+        if name not in _XYZ:
+            made[name] = array[name]
+    return made
+
+
+def _stamp_of(message: Message) -> int:
+    value = _field(message, _STAMPS)
+    if isinstance(value, dict):  # JSON has seconds and nanoseconds
+        value = int(value.get("sec", 0)) * 10**9 + int(value.get("nsec", 0))
+    return value if isinstance(value, int) else message.log_time_ns
+
+
+def _field(message: Message, paths: Sequence[str]) -> Any:
+    """The value of the first of some fields that the message has."""
+    for path in paths:
+        value: Any = message.fields
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        if value is not None:
+            return value
+    return None
+
+
+def _transform(pose: Mapping[str, Any]) -> Transform:
+    position, turn = pose.get("position") or {}, pose.get("orientation") or {}
+    rotation = np.array([float(turn.get(axis, 0)) for axis in "xyzw"])
+    length = np.linalg.norm(rotation)
+    unit = rotation / length if length else np.array([0.0, 0.0, 0.0, 1.0])
+    return Transform(np.array([float(position.get(axis, 0)) for axis in "xyz"]), unit)

@@ -1,0 +1,101 @@
+"""`--split-by`: every part is the file that a question of its own writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.demo.topics import RobotConfig
+from hybridlog.demo.write import write_bag
+from hybridlog.formats import OUTPUTS
+
+from .running import run
+
+TOPICS = {
+    "tum": "odom",
+    "ply": "scan",
+    "png": "front/image_raw",
+    "jpg": "front/image_raw",
+}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings `one` and `two`, four seconds each; `two` has three marks."""
+    folder = tmp_path_factory.mktemp("split")
+    config = RobotConfig(image_size=(16, 12), scan_beams=18, cloud_columns=6)
+    write_bag(folder / "robot.bag", duration_s=4, config=config)
+    with hl.open(folder / "store", create=True, mongo="none") as opened:
+        opened.record(folder / "robot.bag", name="one")
+        opened.record(folder / "robot.bag", name="two", again=True)
+        opened.mark("two", "+1s", "carpet", until="+2s")
+        opened.mark("two", "+2.5s", "lap 1")
+        opened.mark("two", "+3s", "lap/2")
+    return folder / "store"
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    if path.is_file():
+        return {"": path.read_bytes()}
+    return {str(one.relative_to(path)): one.read_bytes() for one in path.rglob("*.*")}
+
+
+@pytest.mark.parametrize("form", [one for one in OUTPUTS if one != "geojson"])
+def test_by_recording_in_every_format(store: Path, tmp_path: Path, form: str) -> None:
+    suffix = (*OUTPUTS[form].suffixes, "")[0] if form not in {"png", "jpg"} else ""
+    fetch = ("fetch", "-t", TOPICS.get(form, "scan"), "-F", form, "-o")
+    out = tmp_path / f"all{suffix}"
+    said = run(*fetch, out, "--split-by", "recording", store=store).err
+    assert {one.name for one in tmp_path.iterdir()} == {f"all-one{suffix}", f"all-two{suffix}"}
+    for label in ("one", "two"):
+        part, alone = tmp_path / f"all-{label}{suffix}", tmp_path / f"alone{suffix}"
+        assert f"{part}: " in said
+        run(*fetch, alone, "-r", label, "-f", store=store)
+        assert contents(part) == contents(alone)
+
+
+def test_by_mark_and_by_predicate(store: Path, tmp_path: Path) -> None:
+    """A mark of a moment lasts until the next one of a moment."""
+    fetch = ("fetch", "-r", "two", "-t", "scan", "-F", "mcap", "-o")
+    run(*fetch, tmp_path / "m.mcap", "--split-by", "mark", store=store)
+    spans = {
+        "001-carpet": ("+1s", "+2s"),
+        "002-lap-1": ("+2.5s", "+3s"),
+        "003-lap-2": ("+3s", "end"),
+    }
+    assert {one.name for one in tmp_path.iterdir()} == {f"m-two-{name}.mcap" for name in spans}
+    for name, span in spans.items():
+        alone = tmp_path / "alone.mcap"
+        run(*fetch, alone, "--between", *span, "-f", store=store)
+        assert (tmp_path / f"m-two-{name}.mcap").read_bytes() == alone.read_bytes()
+    with hl.open(store, mongo="none") as opened:
+        found = (
+            opened.recordings("two").topic("odom").where("twist.twist.linear.x > 0.1").intervals()
+        )
+    how = ("--split-by", "odom: twist.twist.linear.x > 0.1")
+    run("export", tmp_path / "p.mcap", "-r", "two", *how, store=store)
+    parts = sorted(tmp_path.glob("p-two-*.mcap"))
+    assert len(parts) == len(found) > 0
+    run("export", tmp_path / "t", "-r", "two", "-F", "csv", "-t", "odom", *how, store=store)
+    assert [one.name for one in sorted((tmp_path / "t-two-001").iterdir())] == ["odom.csv"]
+
+
+def test_nothing_leaves_no_file(store: Path, tmp_path: Path) -> None:
+    fetch = ("fetch", "-t", "scan", "-o", tmp_path / "x.csv")
+    for how in ("mark", "odom: twist.twist.linear.x > 1e9"):
+        said = run(*fetch, "-r", "one", "--split-by", how, store=store).err
+        assert "No messages, so no file." in said
+    said = run(*fetch, "--where", "ranges.min < -1", "--split-by", "recording", store=store).err
+    assert "one: no messages, so no file." in said
+    assert not [*tmp_path.iterdir()]
+    (tmp_path / "x-two.csv").write_text("mine")
+    assert "exists" in run(*fetch, "--split-by", "recording", store=store, code=2).err
+    assert [one.name for one in tmp_path.iterdir()] == ["x-two.csv"]
+    for more, why in (
+        (("--split-by", "recording", "--count"), "leave out --count"),
+        (("-t", "odom", "--split-by", "ranges.min < 1"), "Name the topic of the predicate"),
+    ):
+        assert why in run(*fetch, *more, store=store, code=2).err
+    assert "name them with -o" in run(*fetch[:3], "--split-by", "mark", store=store, code=2).err
