@@ -288,7 +288,9 @@ _E = TypeVar("_E", RecordingEntry, ChannelEntry, ChannelStats)
 
 def _is_number(value: object) -> bool:
     """True for a whole number of 64 bits."""
-    return type(value) is int and -MAX_INT <= value <= MAX_INT
+    if not isinstance(value, int) or isinstance(value, bool):  # BSON has an int of its own
+        return False
+    return -MAX_INT <= value <= MAX_INT
 
 
 def _checked(item: _E) -> _E:
@@ -302,7 +304,7 @@ def _checked(item: _E) -> _E:
         wanted = _JSON.get(kind.partition("[")[0].partition(" ")[0])
         if (value is None and "None" in kind) or wanted is None:
             continue
-        if type(value) is not wanted or (wanted is int and not _is_number(value)):
+        if not isinstance(value, wanted) or (wanted is int and not _is_number(value)):
             raise TypeError(f"{name} is no {kind}")
     return item
 
