@@ -50,6 +50,9 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.attachments import StoredAttachment, StoredMetadata
+    from hybridlog.contract.contract import Contract
+    from hybridlog.contract.diff import Difference
+    from hybridlog.contract.judge import Result
     from hybridlog.formats.reading import Source
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
@@ -458,6 +461,50 @@ class Store:
             TopicError: No such recording.
         """
         return self.recordings(recording).check().all_topics().check()
+
+    @of_one_moment
+    def judge(self, contract: Contract | str | Path, recording: Texts = None) -> list[Result]:
+        """The results of the rules of a contract on recordings.
+
+        Args:
+            contract: A file in YAML, or what `Contract.parse` makes of one.
+            recording: Label, name, id or glob; None for all recordings.
+
+        Raises:
+            UsageError: The contract cannot be read, or breaks its schema.
+            TopicError: No such recording.
+        """
+        from hybridlog.contract.contract import Contract
+        from hybridlog.contract.judge import judge
+
+        rules = contract if isinstance(contract, Contract) else Contract.read(contract)
+        chosen = self.recordings(recording).check().summaries
+        return [result for one in chosen for result in judge(self.session, rules, one)]
+
+    @of_one_moment
+    def diff(
+        self,
+        a: Texts,
+        b: Texts,
+        *,
+        tolerance: float = 0.0,
+        contract: Contract | None = None,
+    ) -> list[Difference]:
+        """What differs between two recordings, or two choices of recordings, by topic.
+
+        Args:
+            a: Label, name, id or glob; several recordings are compared together.
+            b: The same.
+            tolerance: Numbers are equal that differ by at most this share of the greater one.
+            contract: Also compare which of its rules are broken; None for no contract.
+
+        Raises:
+            TopicError: No such recording.
+        """
+        from hybridlog.contract.diff import diff
+
+        sides = (self.recordings(one).check() for one in (a, b))
+        return diff(self.session, *sides, tolerance=tolerance, contract=contract)
 
     @of_one_moment
     def align(

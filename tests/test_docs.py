@@ -118,6 +118,9 @@ def steps(path: Path) -> list[Step]:
             found.append(Step("python", "\n".join(fence.lines) + "\n", fence.line + 1))
         elif fence.language == "text" and found and found[-1].kind == "python":
             found[-1].shown = fence.lines
+        elif fence.language.startswith("yaml "):  # a file, by its name
+            text = "\n".join([f"cat > {fence.language[5:]} <<'END'", *fence.lines, "END"])
+            found.append(Step("shell", text, fence.line + 1))
         elif fence.language == "console":
             is_open = False
             for number, text in enumerate(fence.lines, fence.line + 1):

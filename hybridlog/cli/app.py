@@ -12,6 +12,7 @@ from hybridlog import __version__
 from hybridlog.cli.completion import install_completion, show_completion
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
+DIFFERENT: Final = 12
 INTERNAL: Final = 70
 _ALL: Final = "hybridlog.all"  # whether `--all` was given
 
@@ -28,6 +29,7 @@ EXIT_CODES: Final = {
     9: "an optional package is missing",
     10: "no fields: the message definition does not give them",
     11: "--strict: messages of the asked range are lost, or not written yet",
+    DIFFERENT: "check --contract: a rule is broken; diff: something differs",
     INTERNAL: "an error in hybridlog itself",
     130: "interrupted (Ctrl-C): undone, or finished by a later command",
     143: "ended (SIGTERM): undone, or finished by a later command",
@@ -68,6 +70,7 @@ COMMANDS: Final = {
     "rate": "stats",
     "gaps": "intervals",
     "check": "check",
+    "diff": "diff",
     "stats": "stats",
     "tf": "tf",
     "plot": "plot",

@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answers import print_cost, print_remarks
+from hybridlog.cli.answers import check_room, print_cost, print_remarks
+from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import asked
+from hybridlog.cli.query_options import asked, recordings_of
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.contract.judge import Result
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.choice import Choice
 
@@ -27,6 +30,25 @@ if TYPE_CHECKING:
 @options.store
 @options.between
 @options.choice
+@click.option(
+    "--contract",
+    type=options.PATH,
+    metavar="FILE",
+    help="Judge recordings by the rules in this file; exit code 12 if one is broken.",
+)
+@click.option(
+    "--make",
+    type=options.PATH,
+    metavar="FILE",
+    help="Write a contract that this good recording keeps, to be edited.",
+)
+@click.option(
+    "--junit",
+    type=options.PATH,
+    metavar="FILE",
+    help="With --contract: also write the results in JUnit's XML, for CI.",
+)
+@options.force
 @options.strict
 @options.mongo
 @options.as_json
@@ -38,6 +60,10 @@ def check_command(
     store: Path | None,
     between: tuple[str, str] | None,
     choice: Choice,
+    contract: Path | None,
+    make: Path | None,
+    junit: Path | None,
+    force: bool,
     strict: bool,
     mongo: str | None,
     as_json: bool,
@@ -48,10 +74,29 @@ def check_command(
     Rate, jitter, longest gap and where it begins, late start, early stop and losses of each
     topic. No message is read.
     """
+    from hybridlog.contract.contract import Contract, contract_of
+
     started = time.monotonic()
+    if sum(map(bool, (contract, make))) > 1 or (junit and not contract):
+        raise UsageError("--contract and --make exclude each other; --junit is for --contract.")
+    if contract and (topic or between):
+        raise UsageError("A contract is about whole recordings: leave out -t and --between.")
+    rules = None if contract is None else Contract.read(contract)
+    for path in filter(None, (make, junit)):
+        check_room(path, force=force)
     with opened_store(store, mongo, quiet=quiet or as_json) as opened:
+        if rules is not None:
+            chosen = recordings_of(opened, choice)
+            results = [one for label in chosen.labels for one in opened.judge(rules, label)]
+            _show_verdict(results, len(chosen), junit, as_json=as_json, quiet=quiet)
+            return
         query = asked(opened, topic, choice, between=between, where=(), strict=strict)
         found = query.check()
+        if make is not None:
+            if len({one.recording for one in found}) != 1:
+                raise UsageError("A contract is made from one good recording: name it with -r.")
+            _write(make, contract_of(found))
+            return
         if as_json:
             output.print_json([asdict(one) for one in found])
         elif found:
@@ -62,6 +107,41 @@ def check_command(
                 output.note("No topic.")
             print_cost(query.counters, time.monotonic() - started, count=True)
             print_remarks(query, topic, is_empty=False)
+
+
+def _show_verdict(
+    results: Sequence[Result], recordings: int, junit: Path | None, *, as_json: bool, quiet: bool
+) -> None:
+    from hybridlog.contract.judge import broken
+    from hybridlog.contract.junit import junit_of
+
+    if junit is not None:
+        _write(junit, junit_of(results))
+    bad = broken(results)
+    if as_json:
+        output.print_json([asdict(one) for one in results])
+    elif bad:
+        columns: list[output.Column] = [
+            (name, "left") for name in ("recording", "topic", "rule", "wanted", "found")
+        ]
+        rows = [[one.recording, one.topic, one.rule, one.wanted, one.found] for one in bad]
+        output.print_table(columns, rows)
+    sys.stdout.flush()
+    if not quiet:
+        rules = (
+            f"{output.counted(len(results), 'rule')} in {output.counted(recordings, 'recording')}"
+        )
+        output.note(f"{rules}: {len(bad) or 'none'} broken.")
+    if bad:
+        raise click.exceptions.Exit(DIFFERENT)
+
+
+def _write(path: Path, text: str) -> None:
+    from hybridlog.formats.writing import Sink
+
+    sink = Sink(path)
+    sink.write(text.encode())
+    sink.commit()
 
 
 def _print(found: Sequence[TopicCheck]) -> None:

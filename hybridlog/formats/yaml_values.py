@@ -24,13 +24,19 @@ class YamlError(ValueError):
     """The text is not YAML, or too much of it; the message is the reason."""
 
 
-def parse_yaml(text: str | bytes, wanted: Collection[str] | None = None) -> object:
+def parse_yaml(
+    text: str | bytes,
+    wanted: Collection[str] | None = None,
+    *,
+    lines: dict[tuple[int, object], int] | None = None,
+) -> object:
     """Parse the first document of a text.
 
     Args:
         text: The text.
         wanted: Keys to keep in mappings, at any depth; None for all. Values of other keys
             are skipped.
+        lines: Gets the line of each key, by the `id` of its mapping and the key.
 
     Returns:
         Dictionaries, lists, strings, integers, booleans and None; fractions are strings.
@@ -41,7 +47,7 @@ def parse_yaml(text: str | bytes, wanted: Collection[str] | None = None) -> obje
     """
     import yaml
 
-    values = _Values(wanted)
+    values = _Values(wanted, {} if lines is None else lines)
     starts = {yaml.MappingStartEvent: dict, yaml.SequenceStartEvent: list}
     ends = {yaml.MappingEndEvent, yaml.SequenceEndEvent}
     skipped = 0  # depth within an unwanted value
@@ -50,6 +56,7 @@ def parse_yaml(text: str | bytes, wanted: Collection[str] | None = None) -> obje
             kind = type(event)
             if number > MAX_EVENTS:
                 raise YamlError(f"it has more than {MAX_EVENTS} keys and values")
+            values.line = event.start_mark.line + 1
             if skipped:
                 skipped += (kind in starts) - (kind in ends)
             elif kind in starts:
@@ -70,8 +77,12 @@ def parse_yaml(text: str | bytes, wanted: Collection[str] | None = None) -> obje
 class _Values:
     """Makes values of events."""
 
-    def __init__(self, wanted: Collection[str] | None) -> None:
+    def __init__(
+        self, wanted: Collection[str] | None, lines: dict[tuple[int, object], int]
+    ) -> None:
         self.root: list[object] = []
+        self.line = 0
+        self._lines = lines
         self._wanted = wanted
         self._open: list[Any] = [self.root]
         self._keys: list[object] = [_NO_KEY]  # of the open mappings, each waiting for a value
@@ -110,6 +121,7 @@ class _Values:
             if isinstance(value, dict | list):
                 raise YamlError("a key is a list or a mapping")
             self._keys[-1] = value
+            self._lines[id(holder), value] = self.line
             return True
         self._keys[-1] = _NO_KEY
         if self._wanted is not None and key not in self._wanted:

@@ -344,6 +344,9 @@ COMMANDS: dict[str, list[Asked]] = {
             _there,
         ),
     ],
+    "diff": [
+        asked(f"diff {LABEL} {LABEL} --json", lambda a, _: a.json, lambda _: []),
+    ],
     "plot": [
         asked("plot -t said --fields x -o OUT.png", _page, lambda _: True),
         asked("plot -t said --fields x -o OUT.html", _page, lambda _: True),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -131,7 +131,7 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         one = replace(question, topics=(topic,))
         known = session.field_types((topic,), question.recordings)
         if question.fields is None and known is not None:
-            numeric = tuple(path for path, kind in known.items() if kind in NUMBERS)
+            numeric = tuple(_single_numbers(known))
             if not numeric:
                 continue
             one = replace(one, fields=numeric)
@@ -149,6 +149,11 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
     return found
 
 
+def _single_numbers(types: Mapping[str, str]) -> list[str]:
+    """The fields of which each message has one number: none in lists of messages."""
+    return [path for path, kind in types.items() if kind in NUMBERS and "[" not in path]
+
+
 def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
     """Statistics of the topics whose fields stand in tables, planned together."""
     import pyarrow as pa
@@ -160,7 +165,7 @@ def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
     found: dict[str, dict[str, _Running]] = {}
     for topic, parts in by_topic.items():
         types = parts[0].field_types or {}
-        fields = [path for path, kind in types.items() if kind in NUMBERS]
+        fields = _single_numbers(types)
         if not fields or not all(
             part.field_types == types
             and not any(channel.is_reduced for channel in part.channels)

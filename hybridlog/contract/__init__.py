@@ -1,0 +1,1 @@
+"""Contracts: rules that a good recording keeps, and the verdict on a recording."""

@@ -1,0 +1,212 @@
+"""The verdict on a recording by a contract."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.answers.regularity import check
+from hybridlog.query.counters import Counters
+from hybridlog.query.query import Query
+from hybridlog.query.question import Question
+from hybridlog.query.times import format_duration
+from hybridlog.record.losses import topics_of
+from hybridlog_storage.errors import WhereError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.contract.contract import Contract, TopicRules
+    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.session import Session
+    from hybridlog_storage.summary import RecordingSummary
+
+CAUSE: Final = "contract"
+"""Tag `cause` of marks that a recorder sets while a contract is broken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One rule of a contract on one recording.
+
+    Attributes:
+        recording: Label of the recording.
+        topic: Full name of the topic; empty for the whole recording.
+        rule: Name of the rule, as in the contract; `messages` for a topic that must be there.
+        wanted: What the rule asks for.
+        found: What the recording has.
+        holds: False if the rule is broken.
+    """
+
+    recording: str
+    topic: str
+    rule: str
+    wanted: str
+    found: str
+    holds: bool
+
+
+def judge(session: Session, contract: Contract, summary: RecordingSummary) -> list[Result]:
+    """The results of all rules on a recording, in the order of the contract.
+
+    Args:
+        session: The open store.
+        contract: The rules.
+        summary: The recording.
+    """
+    return [*_Judge(session, contract, summary).results()]
+
+
+class _Judge:
+    def __init__(self, session: Session, contract: Contract, summary: RecordingSummary) -> None:
+        self._session = session
+        self._contract = contract
+        self._summary = summary
+        self._known = topics_of(session.entry_of(summary))
+
+    def results(self) -> Iterator[Result]:
+        if self._contract.lost is not None:
+            complete = completeness_of(self._session, self._question(*sorted(self._known)))
+            lost = complete.messages if complete.is_exact else None
+            yield self._lost("", self._contract.lost, lost)
+        topics = [name for name in self._contract.topics if name in self._known]
+        checked = check(self._session, self._question(*topics), Counters()) if topics else []
+        by_topic = {one.topic: one for one in checked}
+        beyond = self._beyond()
+        for name, rules in self._contract.topics.items():
+            one = by_topic.get(name)
+            if one is not None and one.messages:
+                yield self._result(name, "messages", "some", str(one.messages), holds=True)
+                yield from self._of_times(rules, one, beyond)
+                yield from self._of_stamps(rules, name)
+                yield from self._of_others(rules, one)
+            elif not rules.optional:
+                yield self._result(name, "messages", "some", "none", holds=False)
+
+    def _beyond(self) -> int:
+        """How long a recorder saw a silence that lasted beyond the last message, ns."""
+        end = self._summary.extent[1]
+        ends = [
+            one.end or 0
+            for one in marks_in(self._session, [self._summary.id], Counters())
+            if one.tags.get("cause") == CAUSE
+        ]
+        return max([end, *ends]) - end
+
+    def _of_times(self, rules: TopicRules, one: TopicCheck, beyond: int) -> Iterator[Result]:
+        if rules.type is not None:
+            types = {plain_type(name) for name in one.type.split(", ")}
+            holds = types == {plain_type(rules.type)}
+            yield self._result(one.topic, "type", rules.type, one.type, holds=holds)
+        if rules.rate is not None:
+            rate, room = one.rate_hz, rules.tolerance * rules.rate
+            holds = rate is not None and abs(rate - rules.rate) <= room
+            found = "none" if rate is None else f"{rate:.6g} Hz"
+            wanted = f"{rules.rate:g} Hz ± {100 * rules.tolerance:g} %"
+            yield self._result(one.topic, "rate", wanted, found, holds=holds)
+        late, early = one.late_ns or 0, (one.early_ns or 0) + beyond
+        ends = (0, 0) if one.is_latched else (late, early)
+        yield from self._most(
+            one.topic, "longest_gap", rules.longest_gap, max(one.gap_ns or 0, *ends)
+        )
+        yield from self._most(one.topic, "jitter", rules.jitter, one.jitter_ns or 0)
+        yield from self._most(one.topic, "late_start", rules.late_start, late)
+        yield from self._most(one.topic, "early_stop", rules.early_stop, early)
+        if rules.lost is not None:
+            yield self._lost(one.topic, rules.lost, one.lost)
+
+    def _of_stamps(self, rules: TopicRules, topic: str) -> Iterator[Result]:
+        limits = {"least_age": rules.least_age, "greatest_age": rules.greatest_age}
+        asked = [name for name, limit in limits.items() if limit is not None]
+        if not asked and not rules.stamps_in_order:
+            return
+        least, greatest, backwards = None, None, 0
+        last: NDArray[np.int64] = np.empty(0, np.int64)
+        for table in Query(self._session, self._question(topic)).fields("stamp").to_tables():
+            rows = table.select(["log_time", "stamp"]).drop_null()
+            if rows.num_rows:
+                stamp = _ns(rows["stamp"])
+                age = _ns(rows["log_time"]) - stamp
+                low, high = int(age.min()), int(age.max())
+                least = low if least is None else min(least, low)
+                greatest = high if greatest is None else max(greatest, high)
+                backwards += int((np.diff(np.concatenate([last, stamp])) < 0).sum())
+                last = stamp[-1:]
+        for name in asked:
+            limit, age_ns = limits[name], least if name == "least_age" else greatest
+            assert limit is not None
+            holds = age_ns is not None and (
+                age_ns >= limit if name == "least_age" else age_ns <= limit
+            )
+            found = "no header stamps" if age_ns is None else format_duration(age_ns)
+            yield self._result(topic, name, format_duration(limit), found, holds=holds)
+        if rules.stamps_in_order:
+            found = "no header stamps" if least is None else f"{backwards} before the last one"
+            holds = least is not None and not backwards
+            yield self._result(topic, "stamps_in_order", "in order", found, holds=holds)
+
+    def _of_others(self, rules: TopicRules, one: TopicCheck) -> Iterator[Result]:
+        times = self._times(one.topic) if rules.offset else np.empty(0, np.int64)
+        for other, limit in rules.offset.items():
+            others = self._times(other) if other in self._known else times[:0]
+            far = int((nearest(times, others) > limit).sum()) if len(others) else len(times)
+            found = f"{far} of {len(times)} messages are farther"
+            wanted = f"{other} within {format_duration(limit)}"
+            yield self._result(one.topic, "offset", wanted, found, holds=not far)
+        for predicate, share in rules.share.items():
+            try:
+                query = Query(self._session, self._question(one.topic)).where(predicate)
+                held, why = query.count(), ""
+            except WhereError as error:
+                held, why = 0, f": {error}"
+            found = f"{held} of {one.messages}{why}"
+            wanted = f"{predicate} for {100 * share:g} %"
+            holds = held >= share * one.messages and not why
+            yield self._result(one.topic, "share", wanted, found, holds=holds)
+
+    def _times(self, topic: str) -> NDArray[np.int64]:
+        found = match_times(self._session, self._question(topic), Counters())
+        return np.concatenate([np.empty(0, np.int64), *(one.log_time for one in found)])
+
+    def _most(self, topic: str, rule: str, limit: int | None, ns: float) -> Iterator[Result]:
+        if limit is not None:
+            found = format_duration(round(ns))
+            yield self._result(topic, rule, format_duration(limit), found, holds=ns <= limit)
+
+    def _lost(self, topic: str, limit: int, lost: int | None) -> Result:
+        found = "an unknown number" if lost is None else str(lost)
+        return self._result(
+            topic, "lost", str(limit), found, holds=lost is not None and lost <= limit
+        )
+
+    def _result(self, topic: str, rule: str, wanted: str, found: str, *, holds: bool) -> Result:
+        return Result(self._summary.label, topic, rule, wanted, found, holds)
+
+    def _question(self, *topics: str) -> Question:
+        return Question(*self._session.having(topics, [self._summary.id]))
+
+
+def nearest(times: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Distance from each of some times to the nearest of others, ascending and not empty, ns."""
+    after = np.searchsorted(others, times)
+    low, high = others[np.maximum(after - 1, 0)], others[np.minimum(after, len(others) - 1)]
+    found: NDArray[np.int64] = np.minimum(abs(times - low), abs(high - times))
+    return found
+
+
+def _ns(column: pa.ChunkedArray[pa.Scalar]) -> NDArray[np.int64]:
+    found: NDArray[np.int64] = column.combine_chunks().view("int64").to_numpy()
+    return found
+
+
+def broken(results: Sequence[Result]) -> list[Result]:
+    """The results of broken rules."""
+    return [one for one in results if not one.holds]

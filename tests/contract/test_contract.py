@@ -1,0 +1,309 @@
+"""Verdicts by contracts: planted breaches, each found by its rule alone."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.contract.contract import MAX_BYTES, MAX_RULES, Contract, contract_of
+from hybridlog.contract.judge import broken
+from hybridlog.query.topics import matcher
+from hybridlog.record.losses import Cause
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.messages import Channel, Schema
+from tests.cli.running import run as process
+from tests.cli.within import answer as run
+from tests.data import DATA, needs_data
+
+MS = 10**6
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+HEADER = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+DEFINITION = ("std_msgs/Header header\nfloat64 x\n" + HEADER).encode()
+GOOD = """\
+lost: 0
+topics:
+  /scan:
+    type: test_msgs/Scan
+    rate: 20
+    tolerance: 5%
+    longest_gap: 200ms
+    jitter: 10ms
+    late_start: 100ms
+    early_stop: 100ms
+    lost: 0
+    least_age: -1ms
+    greatest_age: 20ms
+    stamps_in_order: true
+    offset: {/odom: 30ms}
+    share: {"x > 0": 90%, "x < 100": 1}
+  /odom:
+    type: test_msgs/Odom
+    rate: 50
+    longest_gap: 0.5s
+  /rare:
+    optional: true
+    type: test_msgs/Rare
+"""
+
+
+@dataclass(frozen=True)
+class Sent:
+    topic: str
+    time: int
+    stamp: int
+    type: str
+    x: float = 1.0
+
+
+def good() -> list[Sent]:
+    scans = [START + n * 50 * MS for n in range(100)]
+    odoms = [START + n * 20 * MS for n in range(250)]
+    return [
+        *(Sent("/scan", t, t - 5 * MS, "test_msgs/Scan") for t in scans),
+        *(Sent("/odom", t, t, "test_msgs/Odom") for t in odoms),
+    ]
+
+
+Change = Callable[[list[Sent]], list[Sent]]
+
+
+def without(topic: str, begin: float = 0, end: float = 100) -> Change:
+    """No messages of a topic between seconds from the start."""
+
+    def is_out(one: Sent) -> bool:
+        return one.topic == topic and begin <= (one.time - START) / SECOND < end
+
+    return lambda sent: [one for one in sent if not is_out(one)]
+
+
+def changed(topic: str, every: int = 1, **values: Callable[[Sent], object]) -> Change:
+    """Every n-th message of a topic with other values."""
+
+    def change(sent: list[Sent]) -> list[Sent]:
+        places = [n for n, one in enumerate(sent) if one.topic == topic][::every]
+        found = list(sent)
+        for n in places:
+            found[n] = replace(sent[n], **{k: make(sent[n]) for k, make in values.items()})
+        return found
+
+    return change
+
+
+def shaken(ms: int) -> Change:
+    """Every second scan is late, with its stamp."""
+    return changed("/scan", 2, time=lambda m: m.time + ms * MS, stamp=lambda m: m.stamp + ms * MS)
+
+
+PLANTED: dict[str, tuple[Change, set[tuple[str, str]]]] = {
+    "nothing": (lambda sent: sent, set()),
+    "no scan": (without("/scan"), {("/scan", "messages")}),
+    "no odom": (without("/odom"), {("/odom", "messages"), ("/scan", "offset")}),
+    "rare of its type": (lambda s: [*s, Sent("/rare", START, START, "test_msgs/Rare")], set()),
+    "rare of another": (
+        lambda s: [*s, Sent("/rare", START, START, "test_msgs/Other")],
+        {("/rare", "type")},
+    ),
+    "type": (changed("/scan", type=lambda _: "test_msgs/Other"), {("/scan", "type")}),
+    "two types": (changed("/odom", 3, type=lambda _: "test_msgs/Other"), {("/odom", "type")}),
+    "half the rate": (
+        lambda s: [m for m in s if m.topic == "/odom" or (m.time - START) % (100 * MS) == 0],
+        {("/scan", "rate")},
+    ),
+    "rate of odom": (
+        lambda s: [m for m in s if m.topic == "/scan" or (m.time - START) % (60 * MS)],
+        {("/odom", "rate")},
+    ),
+    "gap": (
+        without("/scan", 2, 2.24),
+        {("/scan", "longest_gap"), ("/scan", "jitter"), ("/scan", "rate")},
+    ),
+    "gap of odom": (without("/odom", 2, 2.6), {("/odom", "longest_gap"), ("/odom", "rate"),
+                                              ("/scan", "offset")}),
+    "jitter": (shaken(21), {("/scan", "jitter")}),
+    "late": (without("/scan", 0, 0.14), {("/scan", "late_start")}),
+    "early": (without("/scan", 4.85), {("/scan", "early_stop")}),
+    "late beyond the gap": (
+        without("/scan", 0, 0.3),
+        {("/scan", "late_start"), ("/scan", "longest_gap")},
+    ),
+    "early beyond the gap": (
+        without("/scan", 4.7),
+        {("/scan", "early_stop"), ("/scan", "longest_gap")},
+    ),
+    "one stamp from the future": (
+        changed("/scan", 100, stamp=lambda m: m.time + 2 * MS),
+        {("/scan", "least_age")},
+    ),
+    "old stamps": (
+        changed("/scan", stamp=lambda m: m.time - 25 * MS),
+        {("/scan", "greatest_age")},
+    ),
+    "stamps backwards": (
+        changed("/scan", 2, stamp=lambda m: m.time - (65 if m.time == START + SECOND else 5) * MS),
+        {("/scan", "stamps_in_order"), ("/scan", "greatest_age")},
+    ),
+    "too few positive": (changed("/scan", 5, x=lambda _: -1.0), {("/scan", "share")}),
+    "few negative": (changed("/scan", 20, x=lambda _: -1.0), set()),
+    "one too great": (changed("/scan", 100, x=lambda _: 1000.0), {("/scan", "share")}),
+}  # fmt: skip
+
+
+def channel(topic: str, name: str) -> Channel:
+    return Channel(topic, "ros1", Schema(name, "ros1msg", DEFINITION), {})
+
+
+def play(store: hl.Store, sent: list[Sent], name: str, lost: int | None = 0) -> str:
+    """Record messages; losses are of /scan."""
+    channels = {(m.topic, m.type): channel(m.topic, m.type) for m in sent}
+    with store.start(name) as live:
+        for one in sorted(sent, key=lambda m: m.time):
+            sec, nsec = divmod(one.stamp, SECOND)
+            payload = struct.pack("<3II d".replace(" ", ""), 0, sec, nsec, 0, one.x)
+            live.write(channels[one.topic, one.type], payload, log_time=one.time)
+        if lost != 0:
+            live.ledger.note("/scan", Cause.QUEUE, lost, first=START, last=START)
+            live.ledger.note("/scan", Cause.THROTTLE, 9, first=START, last=START)
+    return live.label
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with hl.open(tmp_path_factory.mktemp("contract") / "s", create=True, mongo="none") as store:
+        for name, (change, _) in PLANTED.items():
+            play(store, change(good()), name.replace(" ", "-"))
+        play(store, good(), "lost", 2)
+        play(store, good(), "lost-unknown", None)
+        yield store
+
+
+def found(store: hl.Store, label: str) -> set[tuple[str, str]]:
+    results = store.judge(Contract.parse(GOOD), label)
+    return {(one.topic, one.rule) for one in broken(results)}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_each_planted_breach_is_found_by_its_rules_alone(store: hl.Store, name: str) -> None:
+    assert found(store, name.replace(" ", "-")) == PLANTED[name][1]
+
+
+@pytest.mark.parametrize("label", ["lost", "lost-unknown"])
+def test_losses_of_a_topic_and_of_the_recording(store: hl.Store, label: str) -> None:
+    assert found(store, label) == {("", "lost"), ("/scan", "lost")}
+
+
+def test_predicates_that_do_not_fit_and_stamps_that_are_not_there(store: hl.Store) -> None:
+    text = "topics: {/scan: {share: {'y > 0': 0.1}, offset: {/none: 1s}}}"
+    results = store.judge(Contract.parse(text), "nothing")
+    assert [(one.rule, one.holds) for one in results] == [
+        ("messages", True),
+        ("offset", False),
+        ("share", False),
+    ]
+    assert "y" in results[-1].found
+    with store.start("plain") as live:
+        live.write(Channel("/scan", "json", None, {}), b"{}", log_time=START)
+    text = "topics: {/scan: {stamps_in_order: true, least_age: 0, greatest_age: 1s, rate: 1}}"
+    results = store.judge(Contract.parse(text), "plain")
+    assert [one.rule for one in broken(results)] == [
+        "rate",
+        "least_age",
+        "greatest_age",
+        "stamps_in_order",
+    ]
+
+
+def test_the_command(store: hl.Store, tmp_path: Path) -> None:
+    path = store.directory.path
+    rules, report = tmp_path / "robot.yaml", tmp_path / "report.xml"
+    rules.write_text(GOOD)
+    good = run("check", "-r", "nothing", "--contract", rules, store=path)
+    assert (good.code, good.out, "none broken" in good.err) == (0, "", True)
+    asked = ("check", "-r", "late", "-r", "nothing", "--contract", rules)
+    bad = process(*asked, "--junit", report, store=path, code=12)
+    assert [line.split()[:3] for line in bad.lines[1:]] == [["late", "/scan", "late_start"]]
+    suites = {one.get("name"): one for one in ET.parse(report).getroot()}
+    assert {n: s.get("failures") for n, s in suites.items()} == {"late": "1", "nothing": "0"}
+    assert [c.get("name") for c in suites["late"] if len(c)] == ["late_start: 100ms"]
+    as_json = process(*asked, "--json", store=path, code=12)
+    assert [r["rule"] for r in as_json.json if not r["holds"]] == ["late_start"]
+    assert len(as_json.json) == sum(len(suite) for suite in suites.values())
+    run(*asked, "-t", "scan", store=path, code=2)
+    run(*asked, "--make", tmp_path / "other", store=path, code=2)
+    run(*asked, "--junit", report, store=path, code=2)  # it exists
+    run("check", "-r", "no-such", "--contract", rules, store=path, code=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "cure"),
+    [
+        ("topics:\n  /a:\n    rat: 5\n", 3, "did you mean `rate`"),
+        ("topics:\n  /a:\n    rate: fast\n", 3, "no number"),
+        ("topics:\n  /a:\n    rate: nan\n", 3, "no number"),
+        ("topics:\n  /a: {}\nlost: -1\n", 3, "0 or more"),
+        ("topics:\n  /a:\n    longest_gap: 5 parsecs\n", 3, "500ms"),
+        ("topics:\n  /a:\n    tolerance: 110%\n", 3, "95%"),
+        ("topics:\n  /a:\n    stamps_in_order: perhaps\n", 3, "true"),
+        ("topics:\n  /a:\n    share:\n      'x >': 1\n", 4, "x >"),
+        ("topics:\n  /a:\n    share:\n      '/b: x > 1': 1\n", 4, "leave the other topic out"),
+        ("topics:\n  /a:\n    share:\n      '_meta.t > 1': 1\n", 4, "fields of the message"),
+        ("topics:\n  /a:\n    offset: 5\n", 3, "a line of its own"),
+        ("topics:\n  /a: 5\n", 2, "a line of its own"),
+        ("topics: [1]\n", 1, "a line of its own"),
+        ("rules: 1\n", 1, "topics"),
+        ("- 1\n", None, "begins with `topics:`"),
+        ("{", None, "no YAML"),
+        ("topics:\n  /a: {rate: 1}\n  /a: {rate: 2}\n", None, "repeated"),
+    ],
+)
+def test_what_is_no_contract_names_line_and_cure(text: str, line: int | None, cure: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        Contract.parse(text, "robot.yaml")
+    said = str(caught.value)
+    assert cure in said
+    assert line is None or f"robot.yaml, line {line}:" in said
+
+
+def test_a_contract_is_bounded(tmp_path: Path) -> None:
+    many = ", ".join(f"'x > {n}': 1" for n in range(MAX_RULES + 1))
+    with pytest.raises(UsageError, match="more than"):
+        Contract.parse(f"topics: {{/a: {{share: {{{many}}}}}}}")
+    large = tmp_path / "large.yaml"
+    large.write_bytes(b"#" * (MAX_BYTES + 1))
+    with pytest.raises(UsageError, match="larger than"):
+        Contract.read(large)
+    with pytest.raises(UsageError, match="cannot be read"):
+        Contract.read(tmp_path)
+    bomb = "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(50))
+    with pytest.raises(UsageError, match="there is no rule"):
+        Contract.parse(bomb)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["auv_ros2.mcap", "sick_laser_radar.bag", "tilt_laser.bag"])
+def test_a_good_real_log_keeps_its_own_contract(name: str, tmp_path: Path) -> None:
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        store.record(DATA / "real" / name)
+        checked = store.check()
+        contract = Contract.parse(contract_of(checked))
+        assert contract.topics.keys() == {one.topic for one in checked if one.messages}
+        assert not broken(store.judge(contract))
+        if name != "tilt_laser.bag":  # its topics come now and then
+            assert any(rules.rate for rules in contract.topics.values())
+        (label,) = store.recordings().labels
+        path = tmp_path / "made.yaml"
+        assert run("check", "-r", label, "--make", path, store=tmp_path / "s").code == 0
+        assert Contract.read(path) == contract
+        gone = next(one.topic for one in checked if one.messages)
+        kept = matcher(["**"], [gone])
+        store.record(DATA / "real" / name, name="other", matcher=kept, again=True)
+        bad = broken(store.judge(contract, "other"))
+        assert ("messages", gone) in {(one.rule, one.topic) for one in bad}
+        assert json.dumps([one.found for one in bad])

@@ -1,0 +1,138 @@
+"""Differences: planted changes, each in its own lines, and none of a log and itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.contract.contract import Contract
+from tests.cli.running import run
+from tests.data import DATA, needs_data
+from tests.some import EXHAUSTIVE
+
+from .test_contract import GOOD, MS, SECOND, START, Change, Sent, changed, good, play, without
+
+COUNTS = {"messages", "rate", "jitter"}
+LATE = START + 2 * SECOND
+X, STAMPED = {"x"}, {"header.seq", "x"}
+
+
+def moved(ms: int) -> Change:
+    """One scan is late."""
+    return changed("/scan", 100, time=lambda m: m.time + ms * MS)
+
+
+def at(topic: str, **values: object) -> Change:
+    """The message of a topic two seconds after the start has other values."""
+
+    def change(sent: list[Sent]) -> list[Sent]:
+        return [replace(m, **values) if (m.topic, m.time) == (topic, LATE) else m for m in sent]
+
+    return change
+
+
+EXTRA = Sent("/new", START, START, "test_msgs/New")
+PLANTED: dict[str, tuple[Change, set[tuple[str, str]]]] = {
+    "nothing": (lambda sent: sent, set()),
+    "a new topic": (lambda s: [*s, EXTRA], {("/new", "topic")}),
+    "no odom": (without("/odom"), {("/odom", "topic"), ("/scan", "early_stop")}),
+    "no scan": (without("/scan"), {("/scan", "topic")}),
+    "type": (changed("/scan", type=lambda _: "test_msgs/Other"), {("/scan", "type")}),
+    "two types": (at("/odom", type="test_msgs/Other"), {("/odom", "type")}),
+    "a value": (at("/scan", x=2.0), {("/scan", "x")}),
+    "a least value": (at("/scan", x=-2.0), {("/scan", "x")}),
+    "a greatest value": (at("/odom", x=1e300), {("/odom", "x")}),
+    "nan": (at("/odom", x=float("nan")), {("/odom", "x")}),
+    "infinite": (at("/odom", x=float("inf")), {("/odom", "x")}),
+    "all values": (changed("/odom", x=lambda m: m.x + 1), {("/odom", "x")}),
+    "the last digit": (at("/odom", x=1.0000000000000002), {("/odom", "x")}),
+    "one late message": (at("/scan", time=LATE + MS), {("/scan", "jitter"),
+                                                       ("/scan", "longest_gap")}),
+    "late start": (changed("/scan", 100, time=lambda m: m.time + MS), {
+        ("/scan", what) for what in ("late_start", "rate", "jitter")
+    }),
+    "a message less": (without("/odom", 2, 2.001), {
+        *(("/odom", what) for what in COUNTS | STAMPED | {"longest_gap"})
+    }),
+    "a message twice": (lambda s: [*s, *(m for m in s if (m.topic, m.time) == ("/odom", LATE))], {
+        *(("/odom", what) for what in COUNTS | STAMPED)
+    }),
+    "a gap": (without("/scan", 2, 2.2), {
+        *(("/scan", what) for what in COUNTS | STAMPED | {"longest_gap"})
+    }),
+    "early stop": (without("/scan", 4.9), {
+        *(("/scan", what) for what in {"messages", "early_stop"} | STAMPED)
+    }),
+    "both": (lambda s: at("/scan", x=3.0)(at("/odom", x=4.0)(s)), {("/scan", "x"), ("/odom", "x")}),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with hl.open(tmp_path_factory.mktemp("diff") / "s", create=True, mongo="none") as store:
+        play(store, good(), "base")
+        for name, (change, _) in PLANTED.items():
+            play(store, change(good()), f"n-{name.replace(' ', '-')}")
+        play(store, good(), "lost", 2)
+        yield store
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_each_planted_change_is_found_alone(store: hl.Store, name: str) -> None:
+    label = f"n-{name.replace(' ', '-')}"
+    found = store.diff("base", label)
+    assert {(one.topic, one.what) for one in found} == PLANTED[name][1]
+    assert len(found) == len(PLANTED[name][1])
+    back = store.diff(label, "base")
+    assert [(one.topic, one.what, one.b, one.a) for one in back] == [
+        (one.topic, one.what, one.a, one.b) for one in found
+    ]
+
+
+def test_losses_choices_tolerance_and_verdicts(store: hl.Store) -> None:
+    assert [(d.topic, d.what, d.a, d.b) for d in store.diff("base", "lost")] == [
+        ("/scan", "lost", "0", "2")
+    ]
+    assert not store.diff("n-a-*", "n-a-*")
+    assert {d.what for d in store.diff("base", "n-nothing", tolerance=0.0)} == set()
+    assert not store.diff("base", "n-a-value", tolerance=1.0)
+    assert store.diff("base", "n-no-scan", tolerance=1.0)
+    rules = Contract.parse(GOOD)
+    judged = store.diff("base", "n-early-stop", tolerance=1.0, contract=rules)
+    assert [d.what for d in judged if d.what.startswith("early_stop ")] == ["early_stop 100ms"]
+
+
+def test_the_command(store: hl.Store, tmp_path: Path) -> None:
+    path = store.directory.path
+    assert run("diff", "base", "n-nothing", store=path).out == ""
+    shown = run("diff", "base", "n-a-value", store=path, code=12)
+    assert [line.split()[:2] for line in shown.lines] == [["topic", "what"], ["/scan", "x"]]
+    as_json = run("diff", "base", "n-a-new-topic", "--json", store=path, code=12).json
+    assert as_json == [{"topic": "/new", "what": "topic", "a": "", "b": "1 message"}]
+    assert run("diff", "base", "n-a-value", "--tolerance", "100%", store=path).out == ""
+    run("diff", "base", "n-a-value", "--tolerance", "much", store=path, code=2)
+    run("diff", "base", "no-such", store=path, code=2)
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "name",
+    [
+        "auv_ros2.mcap",
+        "sick_laser_radar.bag",
+        *(
+            pytest.param(path.name, marks=EXHAUSTIVE)
+            for path in sorted((DATA / "real").iterdir() if DATA.is_dir() else [])
+        ),
+    ],
+)
+def test_a_real_log_does_not_differ_from_itself(name: str, tmp_path: Path) -> None:
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        store.record(DATA / "real" / name, name="a")
+        store.record(DATA / "real" / name, name="b", again=True)
+        assert not store.diff("a", "a")
+        assert not store.diff("a", "b")
