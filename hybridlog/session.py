@@ -1159,8 +1159,14 @@ class Session:
         key = recording.id, topic
         if key in self._tables_tried:
             return self.tables.of(recording, topic)
-        self._tables_tried.add(key)
-        return made_for(self.directory, recording, topic, self.tables, self.repairs)
+        return made_for(
+            self.directory,
+            recording,
+            topic,
+            self.tables,
+            self.repairs,
+            tried=self._tables_tried,
+        )
 
     def reject_table(self, recording: RecordingEntry, topic: str) -> None:
         """Drop a table that turned out to be damaged; the next question makes it again."""

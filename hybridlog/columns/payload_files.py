@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections import defaultdict
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -20,12 +21,14 @@ from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from hybridlog.columns.payload_reader import PayloadReader
     from hybridlog_storage.journal import PayloadFile
     from hybridlog_storage.messages import Buffer
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
 THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 """Name of a segment that is about to replace the whole one."""
@@ -249,3 +252,63 @@ def open_segment(
         SegmentError: It cannot be opened.
     """
     return SegmentReader(path, number, contents=contents or RecordingPayloads(path.parent))
+
+
+@dataclass(frozen=True, slots=True)
+class WalkedSegment:
+    """A segment in a walk over a recording.
+
+    Attributes:
+        number: Its number.
+        reader: Reads it.
+        summary: Its footer.
+        begin: Bytes of the segments before it.
+        report: Told the bytes of the walk behind each chunk that was read.
+    """
+
+    number: int
+    reader: SegmentReader
+    summary: SegmentSummary
+    begin: int
+    report: Callable[[int], None]
+
+    def chunks(
+        self, is_wanted: Callable[[ChunkPlace], bool] = lambda _: True
+    ) -> Iterator[tuple[ChunkPlace, StoredChunk | SegmentError]]:
+        """The wanted chunks in order; what is wrong with those that cannot be read."""
+        for place in self.summary.chunks:
+            if not is_wanted(place):
+                continue
+            found: StoredChunk | SegmentError
+            try:
+                found = self.reader.read_chunk(place)
+            except SegmentError as error:
+                found = error
+            yield place, found
+            self.report(self.begin + place.offset + place.length)
+
+
+def walk(
+    recording: Path,
+    numbers: Iterable[int],
+    contents: RecordingPayloads | None = None,
+    report: Callable[[int], None] = lambda _: None,
+) -> Iterator[WalkedSegment]:
+    """Open sealed segments of a recording, one after the other.
+
+    Args:
+        recording: The recording's directory.
+        numbers: Numbers of the segments.
+        contents: As for `open_segment`.
+        report: As for `WalkedSegment`; told at the end of each segment, too.
+
+    Raises:
+        SegmentError: One cannot be opened.
+    """
+    contents = contents or RecordingPayloads(recording)
+    begin = 0
+    for number in numbers:
+        with open_segment(recording / sealed_name(number), number, contents) as reader:
+            yield WalkedSegment(number, reader, reader.summary(), begin, report)
+            begin += reader.size
+            report(begin)

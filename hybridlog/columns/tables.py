@@ -294,16 +294,17 @@ class Tables:
             FileNotFoundError: no table of these segments exists.
             StoreError: the table is damaged, or has another number of rows.
         """
-        channels = self._channels_of(recording, topic)
         if recording.status == "open" or not self.can_have(recording, topic):
             raise FileNotFoundError
-        rows, damaged = self._rows_of(recording, topic, channels)
+        with self._lock:
+            self._look(recording, [topic])
+            rows, damaged = self._known_rows(recording, topic), self._damaged(recording, topic)
         table = self._table(recording, topic, rows)
         if table is None:
             if damaged:
                 raise StoreError(f"The table {damaged[0]} is damaged.")
             raise FileNotFoundError
-        messages = sum(channel.stats.messages for channel in channels)
+        messages = self._messages_of(recording, topic)
         if table.rows != messages:
             raise StoreError(
                 f"The tables of {topic} have {table.rows} messages, the segments {messages}."
@@ -319,45 +320,61 @@ class Tables:
         }
         return len(found) == 1
 
-    def has_all(self, recording: RecordingEntry, topic: str) -> bool:
-        """True if files have all messages of a topic, whatever their definitions are."""
-        channels = self._channels_of(recording, topic)
+    def lacking(self, recording: RecordingEntry, topics: Collection[str]) -> set[str]:
+        """Topics of which files lack messages, whatever their definitions are."""
         try:
-            rows, _ = self._rows_of(recording, topic, channels)
+            with self._lock:
+                self._look(recording, topics)
+                return {topic for topic in topics if not self._has_all(recording, topic)}
         except StoreError:
-            return False
-        own = [one.section for one in rows if topic in one.section.topics]
-        messages = sum(channel.stats.messages for channel in channels)
-        return (
-            all(one.segments.items() <= recording.digests.items() for one in own)
-            and sum(one.topics[topic].rows for one in own) == messages
+            return set(topics)
+
+    def _has_all(self, recording: RecordingEntry, topic: str) -> bool:
+        own = [one.section for one in self._known_rows(recording, topic)]
+        return self._has_rows(recording, topic) and all(
+            one.segments.items() <= recording.digests.items() for one in own if topic in one.topics
         )
 
-    def _rows_of(
-        self, recording: RecordingEntry, topic: str, channels: Sequence[ChannelEntry]
-    ) -> tuple[list[_Rows], list[str]]:
-        """The rows of a recording in the folders of a topic, and damaged files there.
+    def _look(self, recording: RecordingEntry, topics: Collection[str]) -> None:
+        """Look at the folders of some topics, once for all, if rows of them are missing.
 
         Shared files that are not listed for it are opened only if rows are missing otherwise.
         """
-        types = {channel.type for channel in channels}
-        messages = sum(channel.stats.messages for channel in channels)
-        rows: list[_Rows] = []
-        with self._lock:
-            if types <= self._looked_at:
-                rows = self._known_rows(recording, types)
-            for everywhere in (False, True):
-                if sum(_rows_in(one.section, topic) for one in rows) == messages:
-                    break
-                self._folders.look()
-                for folder in self._folders.of(types):
-                    folder.look(recording.id, everywhere=everywhere)
-                self._looked_at |= types
-                rows = self._known_rows(recording, types)
-            return rows, [path for folder in self._folders.of(types) for path in folder.damaged]
+        left = [
+            topic
+            for topic in topics
+            if not self._types_of(recording, topic) <= self._looked_at
+            or not self._has_rows(recording, topic)
+        ]
+        for everywhere in (False, True):
+            if not left:
+                return
+            types = set().union(*(self._types_of(recording, topic) for topic in left))
+            self._folders.look()
+            for folder in self._folders.of(types):
+                folder.look(recording.id, everywhere=everywhere)
+            self._looked_at |= types
+            left = [topic for topic in left if not self._has_rows(recording, topic)]
 
-    def _known_rows(self, recording: RecordingEntry, types: Collection[str]) -> list[_Rows]:
-        return [rows for one in self._folders.of(types) for rows in one.rows(recording.id)]
+    def _has_rows(self, recording: RecordingEntry, topic: str) -> bool:
+        """True if the files that were looked at have as many rows as the catalog messages."""
+        rows = self._known_rows(recording, topic)
+        found = sum(one.section.topics.get(topic, TopicCounts(0)).rows for one in rows)
+        return found == self._messages_of(recording, topic)
+
+    def _known_rows(self, recording: RecordingEntry, topic: str) -> list[_Rows]:
+        folders = self._folders.of(self._types_of(recording, topic))
+        return [rows for folder in folders for rows in folder.rows(recording.id)]
+
+    def _damaged(self, recording: RecordingEntry, topic: str) -> list[str]:
+        folders = self._folders.of(self._types_of(recording, topic))
+        return [path for folder in folders for path in folder.damaged]
+
+    def _messages_of(self, recording: RecordingEntry, topic: str) -> int:
+        return sum(one.stats.messages for one in self._channels_of(recording, topic))
+
+    def _types_of(self, recording: RecordingEntry, topic: str) -> set[str]:
+        return {channel.type for channel in self._channels_of(recording, topic)}
 
     def _table(
         self, recording: RecordingEntry, topic: str, found: Sequence[_Rows]
@@ -398,7 +415,6 @@ class Tables:
         Returns:
             The table, and the segments of which it has all rows; None without a valid one.
         """
-        channels = self._channels_of(recording, topic)
         if not self.can_have(recording, topic):
             return None
         with self._lock:
@@ -407,7 +423,7 @@ class Tables:
                 recording.id, _Folders(place, IN_PARTS - 2, self.opened)
             )
             known.look()
-            folders = known.of({channel.type for channel in channels})
+            folders = known.of(self._types_of(recording, topic))
             for folder in folders:
                 folder.look_at_all()
             rows = [rows for folder in folders for rows in folder.rows(recording.id)]
@@ -432,8 +448,3 @@ class Tables:
                 by_topic[channel.topic].append(channel)
             found = self._channels = recording, dict(by_topic)
         return found[1].get(topic, [])
-
-
-def _rows_in(section: Section, topic: str) -> int:
-    counts = section.topics.get(topic)
-    return 0 if counts is None else counts.rows

@@ -19,11 +19,11 @@ import numpy as np
 
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of, topic_folder
-from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, walk
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance import thinning
 from hybridlog.maintenance.opening import put_entry
-from hybridlog.maintenance.report import CompactedTopic
+from hybridlog.maintenance.report import CompactedTopic, reporter
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -32,7 +32,7 @@ from hybridlog_storage.journal import Journal
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.chunk_table import ChunkTable
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
 _MIN_SHARE = 0.5  # of the sequences in the bytes of a topic's messages
 _MIN_BYTES = 128 << 10  # of a topic's messages: the footer of a file takes some kilobytes
@@ -136,7 +137,6 @@ class _Compaction:
         self.path: Path = directory.recording(label)
         self.refused: list[CompactedTopic] = []
         self._label = label
-        self._progress = progress
         self._inventory: Inventory = take_inventory(directory, label)
         state = self._inventory.state
         if state is None or state.end is None:
@@ -144,8 +144,8 @@ class _Compaction:
                 f"The journal of recording {label!r} has no end: run `hybridlog repair` first."
             )
         self._state = state
-        self._total = 2 * sum(len(s.chunks) for s in self._inventory.summaries.values())
-        self._done = 0
+        self._size = sum(summary.size for summary in self._inventory.summaries.values())
+        self._report = reporter(progress, label, 2 * self._size)  # what is written is proved
 
     def choose(self, topics: Collection[str] | None) -> list[_Topic]:
         """The topics whose payloads can be moved.
@@ -196,9 +196,10 @@ class _Compaction:
         size = sum(int(r["payload_bytes"]) for r in totals if int(r["channel"]) in topic.channels)
         if size < _MIN_BYTES:
             return False
-        for chunk, _ in self._chunks([topic]):
-            batch = chunk.batch.take(topic.rows_of(chunk))
-            return topic.columns.share_of_sequences(batch) >= _MIN_SHARE
+        for _, _, chunk in self._chunks([topic]):
+            if not isinstance(chunk, SegmentError):
+                batch = chunk.batch.take(topic.rows_of(chunk))
+                return topic.columns.share_of_sequences(batch) >= _MIN_SHARE
         return False
 
     def write(self, chosen: Sequence[_Topic]) -> None:
@@ -216,11 +217,14 @@ class _Compaction:
                 topic.columns,
                 partial(next, numbers[topic_folder(topic.name)]),
             )
-        for chunk, digest in self._chunks(chosen, report=True, tell=True):
+        for summary, place, chunk in self._chunks(chosen, self._report):
+            if isinstance(chunk, SegmentError):
+                _keep_damaged(chosen, summary.table, place.number)
+                continue
             for topic in chosen:
                 rows = topic.rows_of(chunk)
                 if len(rows):
-                    self._add(topic, chunk, rows, digest)
+                    self._add(topic, chunk, rows, summary.digest)
         for topic in chosen:
             assert topic.writer is not None
             topic.writer.close()
@@ -252,7 +256,10 @@ class _Compaction:
             for number, topic in enumerate(chosen)
             if topic.files
         }
-        for chunk, _ in self._chunks([topic for topic, _, _ in left.values()], report=True):
+        read = [topic for topic, _, _ in left.values()]
+        for _, _, chunk in self._chunks(read, lambda done: self._report(self._size + done)):
+            if isinstance(chunk, SegmentError):
+                continue
             for number, (topic, payloads, seen) in list(left.items()):
                 problem = _difference(payloads, chunk, topic.rows_of(chunk), seen)
                 if problem:
@@ -292,33 +299,14 @@ class _Compaction:
                 files.remove_tree(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
 
     def _chunks(
-        self, topics: Sequence[_Topic], *, report: bool = False, tell: bool = False
-    ) -> Iterator[tuple[StoredChunk, str]]:
-        """Chunks with messages of some topics, with the digest of their segment, in order.
-
-        Args:
-            topics: The topics.
-            report: True to report progress.
-            tell: True to count the messages of damaged chunks as kept.
-        """
+        self, topics: Sequence[_Topic], report: Callable[[int], None] = lambda _: None
+    ) -> Iterator[tuple[SegmentSummary, ChunkPlace, StoredChunk | SegmentError]]:
+        """Chunks with messages of some topics in order, with the footer of their segment."""
         wanted = {number for topic in topics for number in topic.channels}
-        for number, summary in self._inventory.summaries.items():
-            name = self._inventory.listing.sealed[number]
-            with open_segment(self.path / name, number) as reader:
-                for place in summary.chunks:
-                    if report:
-                        self._done += 1
-                    if wanted.isdisjoint(place.channels):
-                        continue
-                    try:
-                        chunk = reader.read_chunk(place)
-                    except SegmentError:
-                        if tell:
-                            _keep_damaged(topics, summary.table, place.number)
-                    else:
-                        yield chunk, summary.digest
-                    if report and self._progress is not None:
-                        self._progress(self._label, min(self._done, self._total), self._total)
+        summaries = self._inventory.summaries
+        for segment in walk(self.path, summaries, report=report):
+            for place, chunk in segment.chunks(lambda p: not wanted.isdisjoint(p.channels)):
+                yield summaries[segment.number], place, chunk
 
 
 def _keep_damaged(topics: Sequence[_Topic], table: ChunkTable, number: int) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.payload_files import open_segment
+from hybridlog.columns.payload_files import walk
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.opening import put_entry
+from hybridlog.maintenance.report import reporter
 from hybridlog_storage.catalog import stamps_of
 from hybridlog_storage.errors import SegmentError
 
@@ -58,20 +58,17 @@ def _decoded(
     progress: Progress | None,
 ) -> Iterator[tuple[int, str, NDArray[Any]]]:
     indexer = ChunkIndexer(entry.id)
-    total = sum(summary.size for summary in inventory.summaries.values())
-    before = 0
-    for number, summary in inventory.summaries.items():
-        if catalog.stamps(entry, number, summary.table) is None:
-            stats: dict[int, Mapping[int, ChannelStats]] = {}
-            path = directory.recording(entry.label) / inventory.listing.sealed[number]
-            with open_segment(path, number) as reader:
-                for place in summary.chunks:
-                    # An unreadable chunk has no results; reading it raises an error.
-                    with suppress(SegmentError):
-                        chunk = reader.read_chunk(place)
-                        _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)
-                        stats[place.number] = of_chunk.stats
-                    if progress is not None:
-                        progress(entry.label, before + place.offset + place.length, total)
-            yield number, summary.digest, stamps_of(summary.table, stats)
-        before += summary.size
+    missing = {
+        number: summary
+        for number, summary in inventory.summaries.items()
+        if catalog.stamps(entry, number, summary.table) is None
+    }
+    report = reporter(progress, entry.label, sum(summary.size for summary in missing.values()))
+    for segment in walk(directory.recording(entry.label), missing, report=report):
+        summary = missing[segment.number]
+        stats: dict[int, Mapping[int, ChannelStats]] = {}
+        for place, chunk in segment.chunks():
+            if not isinstance(chunk, SegmentError):  # an unreadable chunk has no results
+                _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)
+                stats[place.number] = of_chunk.stats
+        yield segment.number, summary.digest, stamps_of(summary.table, stats)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from itertools import groupby
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import walk
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import put_entry
-from hybridlog.maintenance.report import Progress, RepairReport
+from hybridlog.maintenance.report import Progress, RepairReport, reporter
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
@@ -32,10 +31,8 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
-    from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.summary import RecordingSummary
 
 Place = tuple[int, int]
@@ -370,19 +367,23 @@ def _index(
     indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, database, through)
     sent = time.monotonic()
     # A chunk that is indexed already may be missing in the tables all the same.
-    found = _chunks(
-        directory,
-        catalog,
-        entry,
-        missing=missing,
-        topics=topics,
-        damage=damage,
-        progress=progress,
-    )
+    in_tables = tables.channels_of(entry, topics)
+    numbers = [number for number, _, _ in entry.spans]
+    report = reporter(progress, entry.label, entry.stored_bytes)
     try:
-        for number, chunks in groupby(found, key=lambda one: one[0].segment):
+        for segment in walk(directory.recording(entry.label), numbers, report=report):
+            number, channels = segment.number, segment.summary.channels
             stats: dict[int, Mapping[int, ChannelStats]] = {}
-            for chunk, channels in chunks:
+            wanted = {
+                place
+                for place in segment.summary.chunks
+                if (number, place.number) in missing or not in_tables.isdisjoint(place.channels)
+            }
+            for place, chunk in segment.chunks(wanted.__contains__):
+                if isinstance(chunk, SegmentError):
+                    damage[number, place.number] = str(chunk)
+                    continue
+                damage.pop((number, place.number), None)
                 writer.add(chunk, channels)
                 documents, entries = indexer.documents_of([chunk], channels)
                 stats[chunk.number] = entries[0].stats
@@ -392,7 +393,7 @@ def _index(
                     sender.send()
                     sent = time.monotonic()
             writer.cut(number, entry.digests[str(number)])
-            if len(stats) == len(catalog.table(entry, number).chunks):
+            if stats and len(stats) == len(catalog.table(entry, number).chunks):
                 rows = decoded_rows(stats.values())
                 catalog.put_stamps(entry.id, [(number, entry.digests[str(number)], rows)])
         sender.end()
@@ -400,41 +401,6 @@ def _index(
     finally:
         sender.close()
         writer.discard()
-
-
-def _chunks(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    entry: RecordingEntry,
-    *,
-    missing: Collection[Place],
-    topics: Collection[str],
-    damage: dict[Place, str],
-    progress: Progress | None,
-) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
-    """Chunks of a recording that are missing in the index or in tables, in order."""
-    total = entry.stored_bytes
-    before = 0
-    path = directory.recording(entry.label)
-    contents = RecordingPayloads(path)
-    in_tables = tables.channels_of(entry, topics)
-    for number, _, _ in entry.spans:
-        with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
-            summary = reader.summary()
-            for place in summary.chunks:
-                is_in_tables = not in_tables.isdisjoint(place.channels)
-                if (number, place.number) not in missing and not is_in_tables:
-                    continue
-                try:
-                    chunk = reader.read_chunk(place)
-                except SegmentError as error:
-                    damage[number, place.number] = str(error)
-                    continue
-                damage.pop((number, place.number), None)
-                yield chunk, summary.channels
-                if progress is not None:
-                    progress(entry.label, before + place.offset + place.length, total)
-            before += reader.size
 
 
 def finish(

@@ -15,6 +15,11 @@ Progress = Callable[[str, int, int], None]
 """Called with the recording's label, bytes done and bytes in all."""
 
 
+def reporter(progress: Progress | None, label: str, total: int) -> Callable[[int], None]:
+    """Reports the bytes done of a recording."""
+    return lambda done: None if progress is None else progress(label, done, total)
+
+
 @dataclass(slots=True)
 class RepairReport:
     """Repairs at the opening of a store; recordings by label.

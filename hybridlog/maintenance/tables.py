@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
-from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import walk
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from hybridlog.columns.parquet_file import ParquetFileReader
-    from hybridlog.columns.table_writer import TableWriter
     from hybridlog.columns.tables import Tables
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.messages import Channel
-    from hybridlog_storage.segments.chunk import StoredChunk
 
 
 def missing(
-    directory: StoreDirectory, entry: RecordingEntry, tables: Tables | None = None
+    directory: StoreDirectory,
+    entry: RecordingEntry,
+    tables: Tables | None = None,
+    among: Collection[str] | None = None,
 ) -> set[str]:
     """Topics whose tables are missing, or differ from the catalog.
 
@@ -37,15 +35,17 @@ def missing(
         directory: The store.
         entry: The recording's entry in the catalog.
         tables: Finds the tables.
+        among: The topics to look at; None for all.
     """
     from hybridlog.columns.tables import Tables
 
     tables = tables or Tables(directory.path)
-    return {
+    topics = topics_of(entry) if among is None else topics_of(entry).intersection(among)
+    lacking = tables.lacking(entry, topics)
+    return lacking | {
         topic
-        for topic in topics_of(entry)
-        if not tables.has_all(entry, topic)
-        or (tables.can_have(entry, topic) and tables.of(entry, topic) is None)
+        for topic in topics - lacking
+        if tables.can_have(entry, topic) and tables.of(entry, topic) is None
     }
 
 
@@ -75,8 +75,13 @@ def make(
             entry = replace(entry, label=label)
             writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=False)
             try:
-                for chunk, channels in _chunks(directory, entry, wanted, writer):
-                    writer.add(chunk, channels)
+                channels = channels_of(entry, wanted)
+                numbers = [number for number, _, _ in entry.spans]
+                for segment in walk(directory.recording(label), numbers):
+                    for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
+                        if not isinstance(chunk, SegmentError):
+                            writer.add(chunk, segment.summary.channels)
+                    writer.cut(segment.number, entry.digests[str(segment.number)])
                 writer.close(entry)
             finally:
                 writer.discard()
@@ -91,8 +96,13 @@ def made_for(
     topic: str,
     tables: Tables,
     report: RepairReport,
+    *,
+    tried: set[tuple[str, str]],
 ) -> TopicTable | None:
     """The table of a topic for a question, created again if it is missing or damaged.
+
+    Missing tables of topics that share chunks with it are created with it, so that no chunk is
+    read for each of them.
 
     Args:
         directory: The store.
@@ -100,39 +110,42 @@ def made_for(
         topic: Full name.
         tables: Finds the tables.
         report: Collects the tables that were created.
+        tried: Recordings and topics for which this was tried; it grows.
     """
+    tried.add((entry.id, topic))
     found = tables.of(entry, topic)
     if found is not None or entry.status == "open" or not directory.is_writable:
         return found
-    if not tables.can_have(entry, topic) and tables.has_all(entry, topic):
+    if not tables.can_have(entry, topic) and not tables.lacking(entry, [topic]):
         return None
-    if not make(directory, entry, {topic}):
+    try:
+        others = {one for one in _sharing(directory, entry, topic) if (entry.id, one) not in tried}
+    except StoreError:
         return None
-    tables.forget(entry, [topic])
-    found = tables.of(entry, topic)
-    if found is not None:
-        report.tables.append((entry.label, topic))
+    wanted = {topic, *missing(directory, entry, tables, others)}
+    tried.update((entry.id, one) for one in wanted)
+    if not make(directory, entry, wanted):
+        return None
+    tables.forget(entry, wanted)
+    made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
+    report.tables += [(entry.label, one) for one in made]
+    return tables.of(entry, topic)
+
+
+def _sharing(directory: StoreDirectory, entry: RecordingEntry, topic: str) -> set[str]:
+    """Topics that share chunks with a topic, or with another one of them."""
+    topics = {channel.id: channel.topic for channel in entry.channels}
+    numbers = [number for number, _, _ in entry.spans]
+    together = {
+        frozenset(topics[channel] for channel in place.channels if channel in topics)
+        for segment in walk(directory.recording(entry.label), numbers)
+        for place in segment.summary.chunks
+    }
+    found, before = {topic}, 0
+    while len(found) > before:
+        before = len(found)
+        found.update(*(some for some in together if not found.isdisjoint(some)))
     return found
-
-
-def _chunks(
-    directory: StoreDirectory,
-    entry: RecordingEntry,
-    topics: Collection[str],
-    writer: TableWriter,
-) -> Iterator[tuple[StoredChunk, Mapping[int, Channel]]]:
-    """Chunks with messages of some topics, in order; damaged ones are left out."""
-    path = directory.recording(entry.label)
-    contents = RecordingPayloads(path)
-    wanted = channels_of(entry, topics)
-    for number, _, _ in entry.spans:
-        with open_segment(path / f"{number:06d}.mcap", number, contents) as reader:
-            summary = reader.summary()
-            for place in summary.chunks:
-                if not wanted.isdisjoint(place.channels):
-                    with suppress(SegmentError):
-                        yield reader.read_chunk(place), summary.channels
-        writer.cut(number, entry.digests[str(number)])
 
 
 def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:

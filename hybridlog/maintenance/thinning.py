@@ -18,9 +18,9 @@ import numpy as np
 
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import thinned_name
-from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment, walk
 from hybridlog.entries import take_inventory
-from hybridlog.maintenance.report import CompactedTopic
+from hybridlog.maintenance.report import CompactedTopic, reporter
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.journal import Journal
@@ -32,11 +32,16 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
+    from hybridlog.columns.payload_files import WalkedSegment
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
+    from hybridlog_storage.segments.segment_reader import (
+        ChunkPlace,
+        SegmentReader,
+        SegmentSummary,
+    )
 
 
 def drop(
@@ -65,18 +70,15 @@ def drop(
     path = directory.recording(label)
     inventory = take_inventory(directory, label)
     dropped: Counter[str] = Counter()
-    total = sum(len(summary.chunks) for summary in inventory.summaries.values())
-    done = 0
-    for number, summary in inventory.summaries.items():
-        contents = RecordingPayloads(path)
-        with open_segment(path / inventory.listing.sealed[number], number, contents) as reader:
-            movable = _movable(inventory, reader, summary, contents, topics)
-            if movable:
-                _replace(inventory, path, reader, summary, movable)
-                dropped.update(_messages(summary, movable))
-        done += len(summary.chunks)
-        if progress is not None:
-            progress(label, done, total)
+    contents = RecordingPayloads(path)
+    sizes = [summary.size for summary in inventory.summaries.values()]
+    done = reporter(progress, label, sum(sizes))
+    for segment in walk(path, inventory.summaries, contents, done):
+        summary = inventory.summaries[segment.number]
+        movable = _movable(inventory, segment, contents, topics)
+        if movable:
+            _replace(inventory, path, segment.reader, summary, movable)
+            dropped.update(_messages(summary, movable))
     found = {report.topic: report for report in reports}
     for topic, count in dropped.items():
         report = found.setdefault(topic, CompactedTopic(label, topic))
@@ -111,8 +113,7 @@ def _messages(summary: SegmentSummary, chunks: Collection[int]) -> Counter[str]:
 
 def _movable(
     inventory: Inventory,
-    reader: SegmentReader,
-    summary: SegmentSummary,
+    segment: WalkedSegment,
     contents: RecordingPayloads,
     topics: Collection[str] | None,
 ) -> set[int]:
@@ -120,16 +121,21 @@ def _movable(
     in_columns = {file.topic for file in inventory.payloads.values()}
     if topics is not None:
         in_columns &= set(topics)
+    channels = inventory.summaries[segment.number].channels
+
+    def is_wanted(place: ChunkPlace) -> bool:
+        names = {channels[number].topic for number in place.channels if number in channels}
+        return place.length != MOVED_SIZE and names <= in_columns
+
     found: set[int] = set()
-    for place in summary.chunks:
-        names = {summary.channels[c].topic for c in place.channels if c in summary.channels}
-        if place.length == MOVED_SIZE or not names <= in_columns:
+    for place, chunk in segment.chunks(is_wanted):
+        if isinstance(chunk, SegmentError):
             continue
+        content = memoryview(chunk.batch.buffer).cast("B")
         try:
-            content = memoryview(reader.read_chunk(place).batch.buffer).cast("B")
-            rebuilt = contents(reader.number, place.number, len(content))
+            rebuilt = contents(segment.number, place.number, len(content))
         except SegmentError:
-            continue  # not all of its messages are in columns, or it is damaged
+            continue  # not all of its messages are in columns
         if memoryview(rebuilt).cast("B") == content:
             found.add(place.number)
     return found

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.columns.payload_files import RecordingPayloads, walk
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
@@ -19,7 +19,6 @@ from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_check import SegmentCheck
-from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
@@ -311,22 +310,24 @@ class _Check:
                     self.found(f"{name} byte {offset}", problem, cure)
             if summary is None:
                 return
-            with open_segment(self._path / name, number, self._contents) as reader:
-                for place in summary.chunks:
-                    self._chunk(reader, place, summary.channels, name)
-                self._result.bytes_read += reader.bytes_read
+            for segment in walk(self._path, [number], self._contents):
+                for place, chunk in segment.chunks():
+                    self._chunk(place, chunk, summary.channels, name)
+                self._result.bytes_read += segment.reader.bytes_read
         except SegmentError as error:
             self._is_damaged = True
             self.found(name, str(error), _RESTORE)
 
     def _chunk(
-        self, reader: SegmentReader, place: ChunkPlace, channels: Mapping[int, Channel], name: str
+        self,
+        place: ChunkPlace,
+        chunk: StoredChunk | SegmentError,
+        channels: Mapping[int, Channel],
+        name: str,
     ) -> None:
-        try:
-            chunk = reader.read_chunk(place)
-        except SegmentError as error:
+        if isinstance(chunk, SegmentError):
             if not self._is_damaged:
-                self.found(f"{name} byte {place.offset}", str(error), _RESTORE)
+                self.found(f"{name} byte {place.offset}", str(chunk), _RESTORE)
             return
         self._result.chunks += 1
         self._result.messages += len(chunk.batch)

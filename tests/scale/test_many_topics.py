@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +75,28 @@ def test_statistics_of_many_topics_are_planned_together(
         planned.append(0)
         with hl.open(path) as store:
             found = store.all_topics().stats()
+            store.refresh()
+            for work in (store.all_topics().stats, store.sql("show tables").rows):
+                opened = Counter(cost_of(store, work).opened)
+                assert not [n for file, n in opened.items() if ".parquet" in file and n > 1]
         assert [(one.topic, one.field) for one in found] == [
             (topic, "data") for topic in sorted(f"/s{n}" for n in range(count))
         ]
         assert {(one.count, one.min, one.max) for one in found} == {(MESSAGES, 0, MESSAGES - 1)}
     assert planned[0] == planned[1]
+
+
+def test_missing_tables_are_made_together(stores: dict[int, Path], tmp_path: Path) -> None:
+    costs = {}
+    for count, path in stores.items():
+        copy = shutil.copytree(path, tmp_path / str(count), symlinks=True)
+        shutil.rmtree(copy / "tables")
+        with hl.open(copy) as store:
+            query = store.all_topics().where("data > 3")
+            costs[count] = cost_of(store, query.count)
+            assert query.count() == count * (MESSAGES - 4)
+            assert len(store.repairs.tables) == count
+        with hl.open(copy) as store:
+            assert store.all_topics().where("data > 3").count() == count * (MESSAGES - 4)
+            assert not store.repairs.tables
+    assert costs[MANY].counts == costs[FEW].counts
