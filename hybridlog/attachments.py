@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.formats.writing import Sink
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.schema.states import State, state_of
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
     import os
@@ -166,7 +166,7 @@ def extras_of(session: Session, question: Question) -> Extras:
         found.channels.extend(
             channel
             for _, channel in sorted(session.definitions(entry).items())
-            if channel.topic in topics and channel.message_encoding != REDUCED
+            if channel.topic in topics and state_of(channel.message_encoding) is State.WHOLE
         )
         for read in _metadata_records(session, entry):
             try:

@@ -313,7 +313,8 @@ def _channel_row(
     channel: ChannelEntry, *, is_decoded: bool, narrow: bool, short: bool
 ) -> list[str]:
     from hybridlog.query.latching import depth_of
-    from hybridlog_storage.messages import REDUCED, SUPPLIED, Channel
+    from hybridlog.schema.states import State, state_of
+    from hybridlog_storage.messages import SUPPLIED, Channel
 
     stats = channel.stats
     rate = _rate(channel)
@@ -326,7 +327,7 @@ def _channel_row(
         notes.append(f"{stats.unreadable} unreadable")
     if stats.surplus:
         notes.append(f"{stats.surplus} with bytes left over")
-    if channel.message_encoding == REDUCED:
+    if state_of(channel.message_encoding) is State.REDUCED:
         notes.append("fields only")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")

@@ -23,9 +23,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from hybridlog.schema.states import encoding_of
 from hybridlog_storage.catalog import schema_hash
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
@@ -59,8 +59,6 @@ OWN_COLUMNS: Final = (
     "ref",
 )
 """Columns that every table has in addition to the fields of the messages."""
-STATES: Final = ("whole", "reduced", "unreadable", "expired")
-"""Values of the column `state`."""
 ORIGINAL: Final = b"hybridlog.name"
 """Metadata of a column: the name of its field, if it differs."""
 SUMMARY: Final = b"hybridlog.summary"
@@ -141,9 +139,8 @@ def table_schema(message_encoding: str, schema: str | None, metadata: Mapping[st
         schema: Hash of its schema, if any.
         metadata: Metadata of the channel; a reduced one names its original encoding there.
     """
-    if message_encoding == REDUCED:
-        message_encoding = metadata.get(ORIGINAL_ENCODING, "")
-    return hashlib.sha256(f"{message_encoding}:{schema or ''}".encode()).hexdigest()
+    encoding = encoding_of(message_encoding, metadata)
+    return hashlib.sha256(f"{encoding}:{schema or ''}".encode()).hexdigest()
 
 
 def table_schema_of(channel: Channel) -> str:

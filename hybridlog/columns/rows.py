@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.columns.layout import STATES
+from hybridlog.schema.states import State
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.segments.chunk import StoredChunk
 
-WHOLE, REDUCED, UNREADABLE = 0, 1, 2
-"""Indexes in `STATES`."""
+_STATES: Final = list(State)
 _ROW: Final = 64  # bytes of a row in addition to its fields
 
 
@@ -80,14 +79,14 @@ class Piece:
         messages: The messages.
         fields: Their columns, a struct each; None without columns.
         errors: Unreadable rows, each with the reason.
-        state: Index in `STATES` of the state of all other rows.
+        state: State of all other rows.
     """
 
     segment: int
     messages: Messages
     fields: Any
     errors: list[tuple[NDArray[np.intp], str]] = field(default_factory=list)
-    state: int = WHOLE
+    state: State = State.WHOLE
 
     @property
     def rows(self) -> int:
@@ -118,7 +117,9 @@ def own_columns(
     """
     import pyarrow as pa
 
-    states = np.concatenate([np.full(piece.rows, piece.state, np.int8) for piece in pieces])
+    states = np.concatenate(
+        [np.full(piece.rows, _STATES.index(piece.state), np.int8) for piece in pieces]
+    )
     errors = _errors(pieces, states)
     ids = np.flatnonzero(np.bincount(messages.channel)).tolist()
     silent = [number for number in ids if not has_publish_time[number]]
@@ -131,7 +132,7 @@ def own_columns(
         "pub": pa.array(messages.publish_time, mask=no_publish),
         "stamp": _stamps(fields, len(segment)),
         "channel": pa.array(messages.channel),
-        "state": pa.array(STATES).take(pa.array(states)),
+        "state": pa.array(_STATES, pa.string()).take(pa.array(states)),
         "error": errors,
         "ref": pa.StructArray.from_arrays(
             [
@@ -157,7 +158,7 @@ def _errors(pieces: Sequence[Piece], states: NDArray[np.int8]) -> Any:
         for rows, reason in piece.errors:
             for row in rows.tolist():
                 found[before + row] = reason
-                states[before + row] = UNREADABLE
+                states[before + row] = _STATES.index(State.UNREADABLE)
         before += piece.rows
     return pa.array(found, pa.string())
 

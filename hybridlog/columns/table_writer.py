@@ -34,14 +34,13 @@ from hybridlog.columns.layout import (
     topics_of,
     type_prefix,
 )
-from hybridlog.columns.rows import REDUCED, WHOLE, Messages, Piece, own_columns
+from hybridlog.columns.rows import Messages, Piece, own_columns
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
-from hybridlog_storage.messages import ORIGINAL_ENCODING
-from hybridlog_storage.messages import REDUCED as REDUCED_ENCODING
 from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
@@ -165,9 +164,7 @@ class _Topic:
 
 def _defined_fields(channel: Channel, shape: FieldShape) -> Any:
     """Type of the columns of the fields that a definition fixes; None without any."""
-    encoding = channel.message_encoding
-    if encoding == REDUCED_ENCODING:
-        encoding = channel.metadata.get(ORIGINAL_ENCODING, "")
+    encoding = encoding_of(channel.message_encoding, channel.metadata)
     codec = codec_for(replace(channel, message_encoding=encoding))
     if not codec.indexed:
         return None
@@ -180,7 +177,7 @@ def _counts(pieces: Sequence[Piece]) -> TopicCounts:
     return TopicCounts(
         sum(piece.rows for piece in pieces),
         sum(len(rows) for piece in pieces for rows, _ in piece.errors),
-        sum(piece.rows for piece in pieces if piece.state == REDUCED),
+        sum(piece.rows for piece in pieces if piece.state is State.REDUCED),
     )
 
 
@@ -285,7 +282,7 @@ class TableWriter:
         self._met_count = 0
         self._has_grown = False  # rows were decoded since the last look at their size
         self._topics: dict[tuple[str, str], _Topic] = {}
-        self._of_channel: dict[int, tuple[_Topic, Codec, bool]] = {}
+        self._of_channel: dict[int, tuple[_Topic, Codec, State]] = {}
         self._has_publish_time: dict[int, bool] = {}
         self._seen: Counter[int] = Counter()  # messages of each segment
         self._sealed: dict[int, tuple[str, int]] = {}  # digest and messages
@@ -403,16 +400,16 @@ class TableWriter:
         messages = Messages.joined(self._held)
         self._held.clear()
         self._filled = self._held_rows = 0
-        for topic, codec, is_reduced, part in self._by_topic(messages):
+        for topic, codec, state, part in self._by_topic(messages):
             if topic.is_wanted:
                 with self._only(topic):
-                    topic.add(self._piece(topic, codec, part, data, is_reduced=is_reduced))
+                    topic.add(self._piece(topic, codec, state, part, data))
 
-    def _by_topic(self, messages: Messages) -> Iterator[tuple[_Topic, Codec, bool, Messages]]:
+    def _by_topic(self, messages: Messages) -> Iterator[tuple[_Topic, Codec, State, Messages]]:
         """The messages, grouped by topic and encoding."""
         numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
         found = {number: self._topic_of(number) for number in numbers}
-        place: dict[tuple[_Topic, Codec, bool], int] = {}
+        place: dict[tuple[_Topic, Codec, State], int] = {}
         for kind in found.values():
             place.setdefault(kind, len(place))
         kinds = list(place)
@@ -425,7 +422,7 @@ class TableWriter:
             if kinds[number][0].is_wanted:
                 yield *kinds[number], messages.take(rows)
 
-    def _topic_of(self, number: int) -> tuple[_Topic, Codec, bool]:
+    def _topic_of(self, number: int) -> tuple[_Topic, Codec, State]:
         found = self._of_channel.get(number)
         if found is None:
             channel = self._channels[number]
@@ -435,8 +432,8 @@ class TableWriter:
                 topic = _Topic(self._recording, channel)
                 self._topics[channel.topic, schema] = topic
                 topic.is_wanted = self._wanted is None or channel.topic in self._wanted
-            is_reduced = channel.message_encoding == REDUCED_ENCODING
-            found = self._of_channel[number] = topic, codec_for(channel), is_reduced
+            state = state_of(channel.message_encoding)
+            found = self._of_channel[number] = topic, codec_for(channel), state
             self._has_publish_time[number] = channel.has_publish_time
         return found
 
@@ -444,14 +441,12 @@ class TableWriter:
         self,
         topic: _Topic,
         codec: Codec,
+        state: State,
         messages: Messages,
         data: NDArray[np.uint8],
-        *,
-        is_reduced: bool,
     ) -> Piece:
-        state = REDUCED if is_reduced else WHOLE
         piece = Piece(self._held_segment, messages, None, state=state)
-        if codec.indexed and not is_reduced:
+        if codec.indexed and state is State.WHOLE:
             self._add_fields(piece, topic, codec, data)
         return piece
 

@@ -16,6 +16,7 @@ from hybridlog.columns.zones import may_hold
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import is_list
 from hybridlog.schema.column import ranges
+from hybridlog.schema.states import State
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.stopping import check_wanted
@@ -73,7 +74,7 @@ class TableRows:
         state = self.own.get("state")
         if state is None:
             return np.zeros(len(self), np.bool_)
-        return np.asarray(pc.equal(state, "unreadable").to_numpy(zero_copy_only=False))
+        return np.asarray(pc.equal(state, State.UNREADABLE.value).to_numpy(zero_copy_only=False))
 
     def behind(self, key: Key) -> int:
         """Index of the first row after a log time and arrival number."""

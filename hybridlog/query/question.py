@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hybridlog.query.times import TimeLike
+from hybridlog.schema.states import State, state_of
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.messages import REDUCED
 from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
@@ -114,7 +114,12 @@ class RecordedChannel:
     @property
     def is_reduced(self) -> bool:
         """True if its messages have their fields but not their payloads."""
-        return self.channel.message_encoding == REDUCED
+        return self.state is not State.WHOLE
+
+    @property
+    def state(self) -> State:
+        """The state of its messages; some may be unreadable."""
+        return state_of(self.channel.message_encoding)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +200,7 @@ class Part:
         cut = np.clip(self.windows, low, high)
         return cut[cut[:, 1] > cut[:, 0]]
 
-    @property
+    @lazy
     def share(self) -> float:
         """Fraction of the topic's time in the part, 0 to 1."""
         whole = self.span
@@ -229,7 +234,7 @@ class Part:
         cut = cut[cut[:, 1] > cut[:, 0]]
         return (int(cut[0, 0]), int(cut[-1, 1])) if len(cut) else None
 
-    @property
+    @lazy
     def span(self) -> Span | None:
         """Log time of the topic's messages in the recording, ns; None without any."""
         firsts = [s.first for s in self.stats if s.first is not None]

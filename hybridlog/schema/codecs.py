@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from hybridlog.schema.codec import Codec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.definition_text import canonical
+from hybridlog.schema.states import State, state_of
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import REDUCED
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel, Schema
@@ -46,7 +46,7 @@ def _made(encoding: str, schema: Schema | None) -> Codec:
         from hybridlog.schema.json_codec import JsonCodec
 
         return JsonCodec()
-    if encoding == REDUCED:
+    if state_of(encoding) is State.REDUCED:
         from hybridlog.schema.reduced_codec import ReducedCodec
 
         return ReducedCodec()

@@ -22,6 +22,7 @@ from bson.errors import BSONError
 from hybridlog.schema.codec import decode_each
 from hybridlog.schema.index_bodies import document_of, index_bodies
 from hybridlog.schema.objects import Objects
+from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED, Channel
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 _HEAD = struct.Struct("<Q32s")
-_GIVEN_UP = "its payload was dropped under pressure; only its fields are stored"
+_GIVEN_UP = f"its payload was {CAUSES[State.REDUCED]}; only its fields are stored"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.query.question import Question
+from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent, current_content
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
@@ -19,7 +20,6 @@ from hybridlog.sql.source import source_of
 from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
-from hybridlog.wording import counted, unfit
 from hybridlog_storage.errors import (
     HybridlogError,
     TopicError,
@@ -297,7 +297,7 @@ class SqlAnswer:
         for topic, reason in found.undefined.items():
             lines.append(f"{topic} has no columns of fields: {reason}.")
         for (topic, state), count in found.absent.items():
-            lines.append(f"{topic}: {_absent(state, count)}.")
+            lines.append(f"{topic}: {without_fields(count, state)}.")
         question = Question(tuple(found.topics), tuple(found.recordings))
         return [*lines, *completeness_of(self._connection.engine.session, question).sentences]
 
@@ -463,15 +463,6 @@ class SqlAnswer:
                 shortage = shortage_of(error, self._connection.memory)
                 raise shortage or UsageError(str(error)) from error
             raise
-
-
-def _absent(state: str, messages: int) -> str:
-    """A number of messages without fields, and the cause."""
-    if state == "unreadable":
-        return f"{unfit(messages)}; the fields are null, and error says why"
-    have = "has" if messages == 1 else "have"
-    cause = {"reduced": "reduced under pressure"}.get(state, state)
-    return f"{counted(messages, 'message')} {have} no fields: {cause}"
 
 
 def _kind(statement: Any) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.columns.fields import without
-from hybridlog.columns.rows import REDUCED, WHOLE, Messages, Piece, own_columns
+from hybridlog.columns.rows import Messages, Piece, own_columns
 from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
@@ -306,11 +306,9 @@ class _ChunkRows:
         counts: ScanCounts,
     ) -> Rows:
         count = len(messages.seq)
-        piece = Piece(self._segment, messages, None, state=WHOLE)
+        piece = Piece(self._segment, messages, None, state=channel.state)
         records = pa.nulls(count, pa.struct([]))
-        if channel.is_reduced:
-            piece.state = REDUCED
-        elif channel.codec.indexed:
+        if channel.codec.indexed and not channel.is_reduced:
             wanted = None if paths is None else {*paths, "header.stamp"}
             data = chunk.batch.buffer
             decoded = channel.codec.columns(data, messages.at, messages.length, wanted)

@@ -16,8 +16,7 @@ import pyarrow.dataset as ds
 from pyarrow import acero, fs
 
 from hybridlog.columns.fields import without
-from hybridlog.columns.layout import STATES
-from hybridlog.columns.rows import WHOLE
+from hybridlog.schema.states import State
 from hybridlog.sql.columns import (
     OWN,
     ViewColumn,
@@ -47,13 +46,13 @@ class Remarks:
     """Remarks about an answer: messages and topics that it may lack.
 
     Attributes:
-        absent: Messages without fields, by topic and `state`, which is the cause.
+        absent: Messages without fields, by topic and state.
         undefined: Topics without fields, with the reason.
         recordings: Recordings that were read, by id.
         topics: Topics that were read.
     """
 
-    absent: Counter[tuple[str, str]] = field(default_factory=Counter)
+    absent: Counter[tuple[str, State]] = field(default_factory=Counter)
     undefined: dict[str, str] = field(default_factory=dict)
     recordings: dict[str, RecordingEntry] = field(default_factory=dict)
     topics: set[str] = field(default_factory=set)
@@ -354,8 +353,9 @@ class _Plan:
         if states is None:
             return  # all are whole
         for found in pc.value_counts(states).to_pylist():
-            if found["values"] != STATES[WHOLE]:
-                self._reading.remarks.absent[topic, found["values"]] += found["counts"]
+            if found["values"] != State.WHOLE:
+                state = State(found["values"])
+                self._reading.remarks.absent[topic, state] += found["counts"]
 
 
 def _mask(batch: pa.RecordBatch, where: Any) -> Any:
@@ -448,7 +448,7 @@ def _from_payloads(
     channel = rows.own["channel"].to_numpy(zero_copy_only=False)
     wanted = np.arange(rows.size)
     if "state" in rows.own:
-        is_whole = pc.equal(rows.own["state"], STATES[WHOLE]).to_numpy(zero_copy_only=False)
+        is_whole = pc.equal(rows.own["state"], State.WHOLE.value).to_numpy(zero_copy_only=False)
         wanted = np.flatnonzero(is_whole)
     order = wanted[np.lexsort((ref["off"][wanted], ref["chunk"][wanted], ref["seg"][wanted]))]
     keys = np.stack([ref["seg"][order], ref["chunk"][order], channel[order]])

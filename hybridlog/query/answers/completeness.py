@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.record.losses import Cause
+from hybridlog.schema.states import without_payload
 from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import IncompleteError
 
@@ -136,10 +137,9 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     if counters.unreadable:
         yield _unreadable(counters.unreadable, question)
     if counters.reduced:
-        has = "has" if counters.reduced == 1 else "have"
         yield (
-            f"{counted(counters.reduced, 'message')} {has} no payload, which was dropped under "
-            "pressure: not in this answer; --where and --fields find the fields."
+            f"{without_payload(counters.reduced)}: not in this answer; --where and --fields find "
+            "the fields."
         )
     reasons: Counter[str] = Counter()
     for why, number in counters.no_transform:

@@ -59,6 +59,7 @@ class _Running:
         self.least: int | float | None = None
         self.most: int | float | None = None
         self._total = Totals(1)
+        self._mean = 0.0
         self._squares, self._exponent = 0.0, -1074  # squares of numbers divided by 2**exponent
 
     def add(self, column: pa.ChunkedArray[Any]) -> None:
@@ -89,15 +90,12 @@ class _Running:
         step = math.ldexp(mean, -exponent) - math.ldexp(before, -exponent)
         self._squares += step * step * self.count * count / (self.count + count)
         self.count += count
+        self._mean = float(self._total.means(np.array([self.count]))[0])
 
     @property
     def _std(self) -> float:
         with np.errstate(over="ignore"):  # it may be greater than the greatest double
             return float(np.ldexp(math.sqrt(self._squares / (self.count - 1)), self._exponent))
-
-    @property
-    def _mean(self) -> float:
-        return float(self._total.means(np.array([self.count]))[0])
 
     def result(self, topic: str, field: str) -> FieldStatistics:
         few = self.count < 2

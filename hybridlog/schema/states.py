@@ -1,0 +1,66 @@
+"""The state of a message: whole, or without its payload or fields for a cause.
+
+It follows from the encoding of the channel, or from decoding. Tables have it in `state`;
+answers count messages that are not whole, and name the cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Final
+
+from hybridlog.wording import counted, unfit
+from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED
+
+
+class State(StrEnum):
+    """The states, as tables have them."""
+
+    WHOLE = "whole"
+    """With its payload, which fits its definition."""
+
+    REDUCED = "reduced"
+    """Without its payload, which was dropped under pressure; its fields are stored."""
+
+    UNREADABLE = "unreadable"
+    """With a payload that does not fit its definition."""
+
+    EXPIRED = "expired"
+    """Without its payload, which was deleted to make room; reserved."""
+
+
+CAUSES: Final = {
+    State.REDUCED: "dropped under pressure",
+    State.EXPIRED: "deleted to make room",
+}
+"""Reasons why messages have no payload."""
+
+
+def state_of(encoding: str) -> State:
+    """The state of the messages of a channel, by its encoding; some may still be unreadable."""
+    return State.REDUCED if encoding == REDUCED else State.WHOLE
+
+
+def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:
+    """The encoding of the payloads of a channel, which may be gone.
+
+    Args:
+        encoding: The channel's encoding.
+        metadata: The channel's metadata.
+    """
+    return encoding if state_of(encoding) is State.WHOLE else metadata.get(ORIGINAL_ENCODING, "")
+
+
+def without_payload(messages: int, state: State = State.REDUCED) -> str:
+    """A number of messages without payload: `1 message has no payload, which was dropped ...`."""
+    has = "has" if messages == 1 else "have"
+    return f"{counted(messages, 'message')} {has} no payload, which was {CAUSES[state]}"
+
+
+def without_fields(messages: int, state: State) -> str:
+    """A number of rows of a table without fields, in words."""
+    if state is State.UNREADABLE:
+        return f"{unfit(messages)}; the fields are null, and error says why"
+    have, its = ("has", "its payload was") if messages == 1 else ("have", "their payloads were")
+    return f"{counted(messages, 'message')} {have} no fields: {its} {CAUSES[state]}"
