@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.record.losses import Cause
-from hybridlog.schema.states import without_payload
 from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import IncompleteError
 
@@ -137,6 +136,8 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     if counters.unreadable:
         yield _unreadable(counters.unreadable, question)
     if counters.reduced:
+        from hybridlog.schema.states import without_payload
+
         yield (
             f"{without_payload(counters.reduced)}: not in this answer; --where and --fields find "
             "the fields."
