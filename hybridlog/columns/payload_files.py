@@ -293,6 +293,8 @@ def walk(
     numbers: Iterable[int],
     contents: RecordingPayloads | None = None,
     report: Callable[[int], None] = lambda _: None,
+    *,
+    known: Mapping[int, SegmentSummary] | None = None,
 ) -> Iterator[WalkedSegment]:
     """Open sealed segments of a recording, one after the other.
 
@@ -301,6 +303,7 @@ def walk(
         numbers: Numbers of the segments.
         contents: As for `open_segment`.
         report: As for `WalkedSegment`; told at the end of each segment, too.
+        known: Footers that were read before.
 
     Raises:
         SegmentError: One cannot be opened.
@@ -309,6 +312,7 @@ def walk(
     begin = 0
     for number in numbers:
         with open_segment(recording / sealed_name(number), number, contents) as reader:
-            yield WalkedSegment(number, reader, reader.summary(), begin, report)
+            summary = (known or {}).get(number) or reader.summary()
+            yield WalkedSegment(number, reader, summary, begin, report)
             begin += reader.size
             report(begin)

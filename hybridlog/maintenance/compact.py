@@ -303,10 +303,10 @@ class _Compaction:
     ) -> Iterator[tuple[SegmentSummary, ChunkPlace, StoredChunk | SegmentError]]:
         """Chunks with messages of some topics in order, with the footer of their segment."""
         wanted = {number for topic in topics for number in topic.channels}
-        summaries = self._inventory.summaries
-        for segment in walk(self.path, summaries, report=report):
+        known = self._inventory.summaries
+        for segment in walk(self.path, known, report=report, known=known):
             for place, chunk in segment.chunks(lambda p: not wanted.isdisjoint(p.channels)):
-                yield summaries[segment.number], place, chunk
+                yield segment.summary, place, chunk
 
 
 def _keep_damaged(topics: Sequence[_Topic], table: ChunkTable, number: int) -> None:

@@ -64,8 +64,8 @@ def _decoded(
         if catalog.stamps(entry, number, summary.table) is None
     }
     report = reporter(progress, entry.label, sum(summary.size for summary in missing.values()))
-    for segment in walk(directory.recording(entry.label), missing, report=report):
-        summary = missing[segment.number]
+    for segment in walk(directory.recording(entry.label), missing, report=report, known=missing):
+        summary = segment.summary
         stats: dict[int, Mapping[int, ChannelStats]] = {}
         for place, chunk in segment.chunks():
             if not isinstance(chunk, SegmentError):  # an unreadable chunk has no results

@@ -73,8 +73,9 @@ def drop(
     contents = RecordingPayloads(path)
     sizes = [summary.size for summary in inventory.summaries.values()]
     done = reporter(progress, label, sum(sizes))
-    for segment in walk(path, inventory.summaries, contents, done):
-        summary = inventory.summaries[segment.number]
+    footers = inventory.summaries
+    for segment in walk(path, footers, contents, done, known=footers):
+        summary = segment.summary
         movable = _movable(inventory, segment, contents, topics)
         if movable:
             _replace(inventory, path, segment.reader, summary, movable)
@@ -121,7 +122,7 @@ def _movable(
     in_columns = {file.topic for file in inventory.payloads.values()}
     if topics is not None:
         in_columns &= set(topics)
-    channels = inventory.summaries[segment.number].channels
+    channels = segment.summary.channels
 
     def is_wanted(place: ChunkPlace) -> bool:
         names = {channels[number].topic for number in place.channels if number in channels}

@@ -310,7 +310,7 @@ class _Check:
                     self.found(f"{name} byte {offset}", problem, cure)
             if summary is None:
                 return
-            for segment in walk(self._path, [number], self._contents):
+            for segment in walk(self._path, [number], self._contents, known={number: summary}):
                 for place, chunk in segment.chunks():
                     self._chunk(place, chunk, summary.channels, name)
                 self._result.bytes_read += segment.reader.bytes_read
