@@ -83,7 +83,12 @@ ALLOWED = {
     "re2": ("hybridlog.query.predicate.regex",),
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
-    "rosbags": ("hybridlog.demo", "hybridlog.formats.rosbag1.writer", "hybridlog.schema"),
+    "rosbags": (
+        "hybridlog.demo",
+        "hybridlog.formats.rosbag1.writer",
+        "hybridlog.formats.rosbag2.writer",
+        "hybridlog.schema",
+    ),
     "sqlite3": ("hybridlog.formats.rosbag2.sqlite",),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
@@ -92,7 +97,7 @@ ALLOWED = {
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.handshake",
     ),
-    "yaml": ("hybridlog.formats.yaml_values",),
+    "yaml": ("hybridlog.formats.rosbag2.writer", "hybridlog.formats.yaml_values"),
     "zstandard": (
         "hybridlog.formats.joined",
         "hybridlog.formats.spool",

@@ -649,9 +649,10 @@ def not_written(path: Path) -> str:
 
 def _holds_messages(path: Path) -> bool:
     from hybridlog.formats.raw import holds_messages
+    from hybridlog.formats.rosbag2.directory import holds_bag
 
     try:
-        return holds_messages(path)
+        return holds_messages(path) or holds_bag(path)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
 

@@ -23,7 +23,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.split import pieces, split_by
-from hybridlog.formats import OUTPUTS, formats_of, suffixes_of
+from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
@@ -43,7 +43,7 @@ _TABLES = formats_of("table", "lines")
     "target",
     type=options.PATH,
     metavar="OUTPUT",
-    help=f"File ({', '.join(_LOGS)}) or directory (tables).",
+    help="File (mcap, bag) or directory (rosbag2, tables).",
 )
 @click.option(
     "--format",
@@ -89,7 +89,7 @@ def export_command(
     front = Front(latched=not no_latched, original_times=original_times)
     options.check_tags(tags, form)
     if form in _LOGS and split is None:
-        check_room(target, force=force)
+        check_room(target, force=force, is_directory=is_directory(form, target))
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = query_of(opened, topic, choice)
         if not query.topics:
@@ -100,7 +100,7 @@ def export_command(
             query = query.tags(*parse_fields(tags, "--tags"))
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
-            folder = False if form in _LOGS else None
+            folder = is_directory(form, target) if form in _LOGS else None
             parts = pieces(opened, query, split, target, force=force, is_directory=folder)
         for path, one in parts:
             if form in _LOGS:
@@ -136,7 +136,7 @@ def _write_file(
 ) -> None:
     with (
         if_stopped(partial(not_written, target)),
-        replacing(target, force=force),
+        replacing(target, force=force, is_directory=is_directory(form, target)),
     ):
         write_answer(query, form, target, front=front, extras=extras, quiet=quiet)
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
@@ -208,8 +208,9 @@ def _print_written(
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
     if missing or not quiet:
         written = query.counters.messages - query.counters.reduced - missing
+        files = path.iterdir() if path.is_dir() else [path]
         output.note(
             f"{path}: {output.counted(written, 'message')}{left_out}"
             f"{latched(query.counters)}{beside}, "
-            f"{output.size(path.stat().st_size)}"
+            f"{output.size(sum(one.stat().st_size for one in files))}"
         )

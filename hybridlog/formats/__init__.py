@@ -129,6 +129,7 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
         "log", "hybridlog.formats.mcap.writer:McapWriter", (".mcap",), has_profile=True
     ),
     "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:BagWriter", (".bag",)),
+    "rosbag2": OutputFormat("log", "hybridlog.formats.rosbag2.writer:Rosbag2Writer", ()),
     "tum": OutputFormat("table", "hybridlog.formats.places:TumWriter", (".tum",), is_text=True),
     "geojson": OutputFormat(
         "table", "hybridlog.formats.places:GeoJsonWriter", (".geojson",), is_text=True

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -55,7 +56,10 @@ def fill(name: str, target: object, times: int = 1, messages: int = 300) -> obje
         elif name == "ply":
             writer.write(*clouds(messages))
         else:
-            writer.write(many(messages), ros1_channels())
+            channels = ros1_channels()
+            if name == "rosbag2":
+                channels = [replace(one, message_encoding="cdr") for one in channels]
+            writer.write(many(messages), channels)
     return writer  # type: ignore[no-any-return]
 
 
@@ -301,9 +305,9 @@ def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
-    (tmp_path / "whole").mkdir()
     for time in range(2):  # what is done once only, such as imports, is not counted
-        target = tmp_path / "whole" / f"out{time}"
+        target = tmp_path / f"whole{time}" / "out"
+        target.parent.mkdir()
         steps = interrupted(0, write, name, target)
     whole = contents(target)
     outcomes = set()

@@ -1,0 +1,77 @@
+"""Bags of ROS 2 that are written, read by rosbags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.rosbag2 import Reader
+from ruamel.yaml import YAML
+
+import hybridlog as hl
+from hybridlog.formats.rosbag2.writer import Rosbag2Writer
+from hybridlog_storage.errors import UsageError
+from tests.cli.running import run
+from tests.data import DATA, needs_data
+
+LOG = DATA / "real/auv_ros2.mcap"
+Row = tuple[str, str, int, bytes]
+
+
+def rows_of(bag: Path) -> list[Row]:
+    with Reader(bag) as reader:
+        return [(c.topic, c.msgtype, time, bytes(raw)) for c, time, raw in reader.messages()]
+
+
+@needs_data
+def test_every_byte_and_profile_in_split_files(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        store.record(LOG, name="auv")
+        query = store.all_topics()
+        with Rosbag2Writer(tmp_path / "bag", max_file=300_000) as writer:
+            writer.declare([one.channel for one in query.channels()])
+            for batch, channels in query.batches():
+                writer.write(batch, [one.channel for one in channels])
+        sent = [(m.topic, m.type, m.log_time_ns, m.raw) for m in query]
+        store.record(tmp_path / "bag", name="again")
+        again = store.entry("again")
+        assert (again.messages, again.status) == (len(sent), "complete")
+    assert sorted(rows_of(tmp_path / "bag")) == sorted(sent)
+    described = YAML(typ="safe").load((tmp_path / "bag/metadata.yaml").read_text())
+    bag = described["rosbag2_bagfile_information"]
+    names = [f"bag_{number}.mcap" for number in range(len(bag["files"]))]
+    assert len(names) > 1
+    assert [one["path"] for one in bag["files"]] == bag["relative_file_paths"] == names
+    assert {one.name for one in (tmp_path / "bag").iterdir()} == {*names, "metadata.yaml"}
+    assert sum(one["message_count"] for one in bag["files"]) == bag["message_count"] == len(sent)
+    times = [time for _, _, time, _ in sent]
+    assert bag["starting_time"]["nanoseconds_since_epoch"] == min(times)
+    assert bag["duration"]["nanoseconds"] == max(times) - min(times)
+    with Reader(tmp_path / "bag") as reader:
+        topics = {one.topic: one for one in reader.connections}
+        assert reader.message_count == len(sent)
+        assert "/coug2/modem_send" in topics  # it has no messages
+        ext = topics["/tf_static"].ext
+        assert isinstance(ext, ConnectionExtRosbag2)
+        assert ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
+
+
+@needs_data
+def test_the_command_and_what_fits_into_no_bag(tmp_path: Path) -> None:
+    store, bag = tmp_path / "store", tmp_path / "bag"
+    run("record", LOG, "--name", "auv", "--mongo", "none", "-q", store=store)
+    run("export", bag, "-F", "rosbag2", store=store)
+    assert len(rows_of(bag)) == 18558
+    run("export", bag, "-F", "rosbag2", store=store, code=2)
+    some = ("fetch", "-t", "/tf", "-F", "rosbag2", "-o", bag)
+    run(*some, "-f", store=store)
+    assert {topic for topic, *_ in rows_of(bag)} == {"/tf"}
+    (bag / "mine.txt").touch()
+    assert "holds other things" in run(*some, "-f", store=store, code=2).err
+    run("mark", "here", "-r", "auv", "--at", "+1s", store=store)
+    said = run("export", tmp_path / "marked", "-F", "rosbag2", store=store, code=2).err
+    assert "/hybridlog/marks has json messages" in said
+    assert not (tmp_path / "marked").exists()
+    with pytest.raises(UsageError, match="makes a directory"), (tmp_path / "x").open("wb") as file:
+        Rosbag2Writer(file)
