@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -27,6 +28,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         UsageError: A value is out of range.
         TopicError: A pattern that is malformed.
     """
+    from hybridlog.contract.contract import Contract
     from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
@@ -60,6 +62,8 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         snapshots=_snapshots(choices),
         no_index=matcher(choices.no_index) if choices.no_index else None,
         use_sim_time=choices.use_sim_time,
+        contract=None if choices.contract is None else Contract.read(choices.contract),
+        on_breach=_words(choices.on_breach),
     )
 
 
@@ -79,6 +83,17 @@ def _snapshots(choices: RecordChoices) -> SnapshotOptions | None:
         0.0 if choices.after is None else _seconds(choices.after),
         tuple(Trigger.of(text) for text in choices.trigger),
     )
+
+
+def _words(command: str | None) -> list[str]:
+    """The words of a command, as a shell splits them."""
+    try:
+        words = [] if command is None else shlex.split(command)
+    except ValueError as error:
+        raise UsageError(f"--on-breach: {error}.") from error
+    if command is not None and not words:
+        raise UsageError("--on-breach needs a command.")
+    return words
 
 
 def _pair(option: str, value_name: str, text: str) -> tuple[str, str]:

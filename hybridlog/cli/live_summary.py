@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridlog.cli import output
+from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.live_table import closing_rows
+from hybridlog.contract.judge import broken
 from hybridlog.query.answers.completeness import line_of
 from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import (
@@ -20,6 +23,7 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
+    from hybridlog.contract.judge import Result
     from hybridlog.live.policy import Rule
     from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
     from hybridlog.live.sources.base import LiveSource
@@ -50,13 +54,19 @@ class LiveSummary:
         self._options = options
         self._state = recorder.look()
         self._unreached = [source.address for source in sources if not source.was_reached]
+        self._broken: Sequence[Result] = ()
         self._is_all_unreached = len(self._unreached) == len(sources)
+
+    def add_verdict(self, results: Sequence[Result]) -> None:
+        """Add the results of the contract on the recording."""
+        self._broken = broken(results)
 
     def print_and_exit(self, *, as_json: bool, quiet: bool) -> None:
         """Print it; exits with the code of the worst problem, if there is one."""
         recorder, state = self._recorder, self._state
         if as_json:
             summary = _summary(self._reports, state, recorder.reason)
+            summary["broken"] = [asdict(one) for one in self._broken]
             print(json.dumps({"report": summary}), flush=True)  # noqa: T201
         elif not quiet:
             self._print()
@@ -106,6 +116,8 @@ class LiveSummary:
         """Lines that --quiet does not leave out."""
         if self._recorder.stopped_for_disk and not is_reason_shown:
             yield self._recorder.reason
+        for one in self._broken:
+            yield f"{one.topic or 'the recording'} breaks {one.rule} {one.wanted}: {one.found}"
         for address in self._unreached:
             yield f"{address} was never reached, so nothing of it is recorded."
         rows = [
@@ -134,7 +146,9 @@ class LiveSummary:
             return DatabaseError.exit_code
         if self._is_all_unreached and not state.messages:
             return SourceError.exit_code
-        return SourceDamagedError.exit_code if Cause.UNREADABLE in state.lost else 0
+        if Cause.UNREADABLE in state.lost:
+            return SourceDamagedError.exit_code
+        return DIFFERENT if self._broken else 0
 
 
 def _idle(option: str, rules: Sequence[Rule], topics: set[str]) -> Iterator[str]:

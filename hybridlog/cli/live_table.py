@@ -85,6 +85,7 @@ def drawn(
     # Broken between its parts only.
     whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
     ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]
+    below = [*(f"{topic} is silent" for topic in state.silent), *below]
     below = [line for each in below for line in textwrap.wrap(output.printable(each), width)]
     topics = state.topics
     rows = len(topics) if height is None else max(height - 1 - len(ends) - len(below), 4)

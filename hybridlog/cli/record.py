@@ -239,6 +239,20 @@ def _is_file(word: str) -> bool:
     "--after", cls=_LiveOption, metavar="TIME", help="With --ring: time after the trigger."
 )
 @click.option(
+    "--contract",
+    cls=_LiveOption,
+    type=options.PATH,
+    metavar="FILE",
+    help="Tell and mark topics that are silent for longer than the rules in this file allow, and "
+    "judge the recording at its end.",
+)
+@click.option(
+    "--on-breach",
+    cls=_LiveOption,
+    metavar="COMMAND",
+    help="With --contract: run this when a topic is silent; topic, rule and seconds follow.",
+)
+@click.option(
     "--shared",
     is_flag=True,
     help="If this makes the store: let the group of its directory write it.",

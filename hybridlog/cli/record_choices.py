@@ -65,6 +65,8 @@ class RecordChoices:
     trigger: tuple[str, ...]
     before: str | None
     after: str | None
+    contract: Path | None
+    on_breach: str | None
     shared: bool
     mongo: str | None
     cache_size: int | None
@@ -106,6 +108,8 @@ def check_choices(choices: RecordChoices) -> None:
         raise UsageError("--no-latched and --original-times are for --between, and logs.")
     if choices.master is not None and not choices.master.strip():
         raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
+    if choices.on_breach is not None and choices.contract is None:
+        raise UsageError("--on-breach is for --contract.")
     if choices.qos is not None and not choices.ros2:
         raise UsageError("--qos is for --ros2.")
     if "--speed" in choices.live_options and choices.replay is None:

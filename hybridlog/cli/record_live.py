@@ -60,6 +60,10 @@ def record_live(choices: RecordChoices) -> None:
                 with _explain_wait(last):
                     reports = recorder.stop()
         summary = LiveSummary(reports, recorder, sources, options)
+        if options.contract is not None:
+            labels = [report.entry.label for report in reports]
+            results = [one for label in labels for one in store.judge(options.contract, label)]
+            summary.add_verdict(results)
         summary.print_and_exit(as_json=choices.as_json, quiet=quiet)
 
 

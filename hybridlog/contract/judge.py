@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration
 from hybridlog.record.losses import topics_of
+from hybridlog.record.marks import CONTRACT
 from hybridlog_storage.errors import WhereError
 
 if TYPE_CHECKING:
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
-
-CAUSE: Final = "contract"
-"""Tag `cause` of marks that a recorder sets while a contract is broken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +95,7 @@ class _Judge:
         ends = [
             one.end or 0
             for one in marks_in(self._session, [self._summary.id], Counters())
-            if one.tags.get("cause") == CAUSE
+            if one.tags.get("cause") == CONTRACT
         ]
         return max([end, *ends]) - end
 
@@ -113,9 +111,8 @@ class _Judge:
             wanted = f"{rules.rate:g} Hz ± {100 * rules.tolerance:g} %"
             yield self._result(one.topic, "rate", wanted, found, holds=holds)
         late, early = one.late_ns or 0, (one.early_ns or 0) + beyond
-        ends = (0, 0) if one.is_latched else (late, early)
         yield from self._most(
-            one.topic, "longest_gap", rules.longest_gap, max(one.gap_ns or 0, *ends)
+            one.topic, "longest_gap", rules.longest_gap, max(one.gap_ns or 0, late, early)
         )
         yield from self._most(one.topic, "jitter", rules.jitter, one.jitter_ns or 0)
         yield from self._most(one.topic, "late_start", rules.late_start, late)

@@ -33,11 +33,12 @@ from hybridlog.live.recording import (
     LiveRecording,
     indexed_within_s,
 )
+from hybridlog.live.silence import RULE, Commands, SilenceWatch
 from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.record.losses import Cause
-from hybridlog.record.marks import mark_channel, mark_payload
+from hybridlog.record.marks import CONTRACT, mark_channel, mark_payload
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
@@ -45,6 +46,7 @@ from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel
 
 if TYPE_CHECKING:
+    from hybridlog.contract.contract import Contract
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
@@ -81,6 +83,8 @@ class RecorderOptions:
         snapshots: Store only messages around triggers; None to store everything.
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
         use_sim_time: Log times are those of `/clock`.
+        contract: Topics that are silent for longer than it allows are told and marked.
+        on_breach: Command that runs when a topic becomes silent.
     """
 
     name: str = "live"
@@ -98,11 +102,15 @@ class RecorderOptions:
     snapshots: SnapshotOptions | None = None
     no_index: TopicMatcher | None = None
     use_sim_time: bool = False
+    contract: Contract | None = None
+    on_breach: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         """Refuse limits that would stop the recorder at once, and a ring of two times."""
         if self.use_sim_time and self.snapshots is not None:
             raise UsageError("--ring goes by the time of this machine: leave out --use-sim-time.")
+        if self.contract is not None and self.snapshots is not None:
+            raise UsageError("--contract is for a recording that stores everything: leave --ring.")
         for name in ("duration_s", "max_messages", "max_bytes"):
             bound = getattr(self, name)
             if bound is not None and not bound > 0:
@@ -128,6 +136,7 @@ class RecorderState:
         stored_bytes: Payload bytes stored so far.
         snapshots: Snapshots so far; None when everything is stored.
         taken: Messages that are stored or will be, by topic, when the state is requested.
+        silent: Topics that are silent for longer than the contract allows.
     """
 
     name: str
@@ -144,6 +153,7 @@ class RecorderState:
     stored_bytes: int
     snapshots: int | None = None
     taken: Mapping[str, int] = field(default_factory=dict)
+    silent: Sequence[str] = ()
 
 
 @dataclass(slots=True)
@@ -203,6 +213,10 @@ class Recorder:
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
         self._state: RecorderState | None = None
+        self._silence = None if options.contract is None else SilenceWatch(options.contract)
+        self._commands = Commands(options.on_breach)
+        self._watching = threading.Thread(target=self._watch, daemon=True)
+        self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
             self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
@@ -274,6 +288,8 @@ class Recorder:
             self._control.close()
             self._target.abort()
             raise
+        if self._silence is not None:
+            self._watching.start()
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
@@ -296,9 +312,14 @@ class Recorder:
         Raises:
             DiskFullError: The disk is full; flushed messages stay.
         """
+        ended_at = self._now() if self._ended_at is None else self._ended_at
         for source in self._sources:
             source.stop()
         self._over.set()
+        if self._silence is not None:
+            if self._watching.is_alive():
+                self._watching.join()
+            self._tell_silences(self._silence, ended_at, is_end=True)
         if self._simulated is not None:
             self._simulated.close()
         self._control.close()
@@ -340,9 +361,7 @@ class Recorder:
             lost[cause.value] = lost.get(cause.value, 0) + count
         with self._lock:
             rates = sorted(self._topics.items())
-        log_time = time.time_ns()
-        if self._simulated is not None:
-            log_time = self._simulated.at(log_time)
+        log_time = self._now()
         topics = [
             rate.look(
                 elapsed,
@@ -369,6 +388,7 @@ class Recorder:
             shutil.disk_usage(self._store_path).free,
             stored_bytes,
             self._target.count if isinstance(self._target, Snapshots) else None,
+            silent=() if self._silence is None else self._silence.silent,
         )
         self._check_limits(state)
         self._state = state
@@ -392,6 +412,37 @@ class Recorder:
         """
         received = time.time_ns() if begin is None else begin
         self._sink.take(self._marks, mark_payload(text, tags, end), received=received)
+
+    def _now(self) -> int:
+        """The current log time, ns."""
+        now = time.time_ns()
+        return now if self._simulated is None else self._simulated.at(now)
+
+    def _watch(self) -> None:
+        """The thread that tells silences."""
+        assert self._silence is not None
+        while not self._over.wait(self._silence.interval_s):
+            self._tell_silences(self._silence, self._now())
+
+    def _tell_silences(self, watch: SilenceWatch, now: int, *, is_end: bool = False) -> None:
+        begun, ended = watch.look(now, is_end=is_end)
+        for one in begun:
+            self._tell(f"{one.text} ({RULE} of the contract)")
+            if problem := self._commands.run(one):
+                self.say(problem)
+        for one in ended:
+            recorded = self._recorded.get(self._marks) or self._meet(self._marks, b"{}")
+            tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
+            payload = mark_payload(one.text, tags, one.end)
+            recorded.tally.add(len(payload), one.begin)
+            try:
+                stored = self._target.write(
+                    recorded.channel, payload, log_time=one.begin, wait=False
+                )
+                if not stored:
+                    self._lose_for_room(recorded, one.begin)
+            except HybridlogError as error:
+                self._lose(recorded, Cause.QUEUE, str(error), one.begin)
 
     def fire(self, reason: str) -> None:
         """Start a snapshot.
@@ -467,6 +518,8 @@ class Recorder:
                 sequence=number,
                 wait=False,
             ):
+                if self._silence is not None:
+                    self._silence.take(recorded.channel.topic, received)
                 return
             if size > SMALL_BYTES:
                 # Its fields may fit where its payload does not.
@@ -668,6 +721,8 @@ class Recorder:
             sequence=number,
             wait=False,
         ):
+            if self._silence is not None:
+                self._silence.take(recorded.channel.topic, received)
             self._lose(recorded, Cause.DEGRADE, "payload dropped, fields stored", received)
         else:
             self._lose_for_room(recorded, received)
@@ -698,7 +753,9 @@ class Recorder:
         self._end(reason)
 
     def _end(self, reason: str) -> None:
+        now = self._now()
         with self._lock:
+            self._ended_at = now if self._ended_at is None else self._ended_at
             self._reason = self._reason or reason
             self._closed = self._closed or self._refused is None
         self._over.set()

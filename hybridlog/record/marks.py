@@ -10,6 +10,8 @@ from hybridlog_storage.messages import Channel, Schema
 
 MARKS: Final = "/hybridlog/marks"
 """Topic of marks."""
+CONTRACT: Final = "contract"
+"""Tag `cause` of marks that a recorder sets while a contract is broken."""
 MARK: Final = "hybridlog.Mark"
 """Type of marks."""
 _SCHEMA: Final = (

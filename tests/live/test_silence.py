@@ -1,0 +1,193 @@
+"""Silences of topics while they are recorded: the same ones as in the stored recording."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.contract.contract import Contract, TopicRules
+from hybridlog.contract.judge import broken
+from hybridlog.live.recorder import Recorder, RecorderOptions, state_of, summary_of
+from hybridlog.live.silence import SilenceWatch
+from hybridlog.live.sources.replay import ReplaySource
+from hybridlog.record.marks import MARKS
+from tests.across.test_check import write_mcap
+from tests.cli.running import run
+from tests.data import DATA, needs_data
+from tests.some import EXHAUSTIVE
+
+MS = 10**6
+SECOND = 10**9
+STEADY = [n * 20 * MS for n in range(150)]
+
+
+def out(begin: float, end: float) -> list[int]:
+    """Times without those between two seconds."""
+    return [t for t in STEADY if not begin <= t / SECOND < end]
+
+
+PLANTED: dict[str, tuple[list[int], bool]] = {
+    **{f"/gap{n}": (out(n / 10, n / 10 + 0.7), True) for n in range(1, 15)},
+    "/late": (out(0, 0.8), True),
+    "/early": (out(2, 9), True),
+    "/late_and_early": (out(0, 0.8)[:50], True),
+    "/twice": ([t for t in out(0.5, 1.1) if not 2 <= t / SECOND < 2.6], True),
+    "/once": (STEADY[:1], True),
+    "/bursts": ([t for t in STEADY if t // MS % 1000 < 100], True),
+    "/steady": (STEADY, False),
+    "/slow": (STEADY[::10], False),
+}
+"""Times of topics, and whether they are silent for more than half a second."""
+
+
+def played(
+    store: hl.Store, log: Path, contract: Contract, speed: float = 1.0
+) -> tuple[str, list[str], dict[str, list[tuple[int, int]]]]:
+    """Label of the recording, what the recorder said, and the silences that it marked."""
+    said: list[str] = []
+    options = RecorderOptions(reserve_bytes=0, contract=contract)
+    recorder = Recorder(store, [ReplaySource(log, speed=speed)], options, said.append)
+    recorder.start()
+    while not recorder.wait(0.2):
+        state = recorder.look()
+        assert state_of(json.loads(json.dumps(summary_of(state)))).silent == [*state.silent]
+    (report,) = recorder.stop()
+    marked: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    if report.entry.messages_by_topic()[MARKS]:
+        for mark in store.query([MARKS], [report.entry.id]):
+            tags = mark.fields["tags"]
+            assert (tags["cause"], tags["rule"]) == ("contract", "longest_gap")
+            marked[tags["topic"]].append((mark.log_time_ns, mark.fields["end"]))
+    assert not report.entry.end["losses"]
+    return report.entry.label, said, marked
+
+
+def stored(store: hl.Store, label: str, limit: str) -> dict[str, list[tuple[int, int]]]:
+    """The gaps of each topic of a recording."""
+    found = {}
+    for topic in store.recordings(label).topics():
+        gaps = store.query([topic], [label]).gaps(limit)
+        if len(gaps) and topic != MARKS:
+            found[topic] = [(gap.begin_ns, gap.end_ns) for gap in gaps]
+    return found
+
+
+def check_same(store: hl.Store, label: str, marked: dict[str, list[tuple[int, int]]]) -> set[str]:
+    """Marks are gaps of the stored recording, and its verdict is the same."""
+    found = stored(store, label, "500ms")
+    end = store.entry(label).span[1]  # type: ignore[index]
+    last = {topic: [span for span in spans if span[1] <= end] for topic, spans in marked.items()}
+    closed = {topic: [span for span in spans if span[1] <= end] for topic, spans in found.items()}
+    assert {t: s for t, s in last.items() if s} == {t: s for t, s in closed.items() if s}
+    assert found.keys() <= marked.keys()  # the recorder may have gone on after the last message
+    return {*marked}
+
+
+def rules(*topics: str) -> Contract:
+    return Contract({topic: TopicRules(longest_gap=SECOND // 2) for topic in topics})
+
+
+def test_played_and_stored_verdicts_are_equal_and_right(tmp_path: Path) -> None:
+    log = write_mcap(tmp_path / "log.mcap", {name: times for name, (times, _) in PLANTED.items()})
+    contract = rules(*PLANTED)
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        label, said, marked = played(store, log, contract)
+        silent = check_same(store, label, marked)
+        assert {name for name, (_, is_silent) in PLANTED.items() if is_silent} <= silent
+        bad = {one.topic for one in broken(store.judge(contract, label))}
+        assert bad == silent
+        lines = [line for line in said if "no message for more than 500ms" in line]
+        assert len(lines) == sum(map(len, marked.values()))
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "name",
+    [
+        "auv_ros2.mcap",
+        *(
+            pytest.param(n, marks=EXHAUSTIVE)
+            for n in ("sick_laser_radar.bag", "tilt_laser.bag", "robot_localization_test1.bag")
+        ),
+    ],
+)
+def test_real_logs_have_one_verdict(name: str, tmp_path: Path) -> None:
+    log = DATA / "real" / name
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        store.record(log, name="whole")
+        contract = rules(*(one.topic for one in store.check() if one.messages))
+        label, _, marked = played(store, log, contract, speed=20.0)
+        silent = check_same(store, label, marked)
+        assert {one.topic for one in broken(store.judge(contract, label))} == silent
+
+
+def test_a_silence_is_told_within_twice_its_limit() -> None:
+    rng = random.Random(1)
+    for _ in range(50):
+        limit = rng.randrange(10 * MS, 2 * SECOND)
+        watch = SilenceWatch(Contract({"/a": TopicRules(longest_gap=limit)}))
+        begin = rng.randrange(10**18)
+        watch.take("/a", begin)
+        now, step = begin + rng.randrange(limit), int(watch.interval_s * 1e9)
+        told: list[int] = []
+        while not told and now < begin + 3 * limit:
+            told = [now for _ in watch.look(now)[0]]
+            now += step
+        assert told
+        assert begin + limit < told[0] <= begin + 2 * limit
+
+
+def test_each_silence_is_told_once_and_ends_once() -> None:
+    watch = SilenceWatch(
+        Contract({n: TopicRules(longest_gap=10, optional=n == "/o") for n in ("/a", "/b", "/o")})
+    )
+    take: Callable[[str, int], None] = watch.take
+    take("/other", 100)
+    assert watch.look(110) == ([], [])
+    begun, over = watch.look(111)
+    assert ([one.topic for one in sorted(begun)], over) == (["/a", "/b"], [])
+    assert watch.look(150) == ([], [])
+    assert watch.silent == ["/a", "/b"]
+    take("/a", 160)
+    begun, over = watch.look(161)
+    assert (begun, [(one.begin, one.end) for one in over]) == ([], [(100, 160)])
+    take("/a", 175)  # between two looks
+    take("/a", 170)  # late, and not before
+    begun, over = watch.look(176)
+    assert [(one.begin, one.end) for one in begun] == [(160, 175)]
+    assert begun == over
+    take("/o", 176)  # optional, and late
+    begun, over = watch.look(176)
+    assert [(one.topic, one.begin, one.end) for one in begun] == [("/o", 100, 176)]
+    begun, over = watch.look(177, is_end=True)
+    assert (begun, [(one.topic, one.begin, one.end) for one in over]) == ([], [("/b", 100, 177)])
+
+
+def test_the_command_tells_marks_runs_a_command_and_judges(tmp_path: Path) -> None:
+    logs = {"/a": out(0.4, 2.2), "/b": STEADY}
+    log = write_mcap(tmp_path / "log.mcap", logs)
+    rules = tmp_path / "robot.yaml"
+    rules.write_text("topics: {/a: {longest_gap: 500ms}, /b: {type: Any}}")
+    script = tmp_path / "breach"
+    script.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/breaches\n')
+    script.chmod(0o755)
+    asked = ("record", "--replay", log, "--contract", rules, "--mongo", "none", "--reserve", "0")
+    done = run(*asked, "--on-breach", f"{script} now", store=tmp_path / "s", code=12)
+    assert "/a: no message for more than 500ms (longest_gap of the contract)" in done.err
+    assert "/a breaks longest_gap 500ms: 1." in done.err
+    assert (tmp_path / "breaches").read_text() == "now /a longest_gap 0.5\n"
+    again = run("check", "--contract", rules, "--json", store=tmp_path / "s", code=12).json
+    assert [(row["topic"], row["rule"]) for row in again if not row["holds"]] == [
+        ("/a", "longest_gap")
+    ]
+    run("record", log, "--contract", rules, store=tmp_path / "s", code=2)
+    run(*asked, "--ring", "5s", store=tmp_path / "s", code=2)
+    run("record", "--replay", log, "--on-breach", "true", store=tmp_path / "s", code=2)
+    wrong = run(*asked, "--on-breach", "no-such-program", store=tmp_path / "s", code=12)
+    assert "no-such-program cannot be started" in wrong.err
