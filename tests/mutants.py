@@ -233,6 +233,15 @@ STEPS = "tests/faults/test_some.py"
 
 FORMAT_2 = [
     *_of(
+        "hybridlog/query/engines/tables.py",
+        (
+            "bounds-hide-unreadable-messages",
+            "if bounds is not None and not self._counts[part].unreadable:",
+            "if bounds is not None:",
+            "tests/test_narrowing.py::test_recordings_whose_documents_may_not_tell_are_asked",
+        ),
+    ),
+    *_of(
         "storage/hybridlog_storage/journal.py",
         (
             "a-journal-is-not-synced",
@@ -513,6 +522,18 @@ FORMAT_2 = [
     ),
     *_of(
         "storage/hybridlog_storage/catalog.py",
+        (
+            "bounds-of-other-content-are-kept",
+            "            if kinds and _content_of(row) != content_of(entry.digests):",
+            "            if False:",
+            f"{CATALOG}::test_bounds_are_of_one_content",
+        ),
+        (
+            "bounds-are-written-to-other-content",
+            "if recording in found and found[recording][0] == known",
+            "if recording in found",
+            f"{CATALOG}::test_bounds_are_of_one_content",
+        ),
         (
             "entries-of-damaged-parts-are-believed",
             "        for number in self._damaged & self._parts.keys():\n",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.query.predicate.numbers import is_nan, is_number
-from hybridlog.query.predicate.tree import And, Compare, Or, Slice
+from hybridlog.query.predicate.tree import And, Compare, Member, Or, Slice
 from hybridlog.schema.column import ranges
 
 if TYPE_CHECKING:
@@ -127,6 +127,8 @@ def may_hold(node: Node, zones: Mapping[str, Zone]) -> bool:
     if isinstance(node, And | Or):
         together = all if isinstance(node, And) else any
         return together(may_hold(item, zones) for item in node.items)
+    if isinstance(node, Member) and not node.negated:
+        return any(_may_compare(Compare(node.field, "==", value), zones) for value in node.values)
     return not isinstance(node, Compare) or _may_compare(node, zones)
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.query.bounds import MIN_RECORDINGS
 from hybridlog.query.predicate.numbers import is_nan, is_number
 from hybridlog.query.predicate.tree import And, Compare, Member, Node, Value
 from hybridlog_storage.errors import DatabaseError, WhereError
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 _PURPOSE = "An index on a field"
-_MIN_RECORDINGS = 16
-"""Fewer recordings are asked by their columns: a command costs as much."""
 _MIN_MATCHES = 100
 _MATCHES_SHARE = 4
 """MongoDB reads at most one match for so many recordings: a search in vain stays cheap."""
@@ -52,7 +51,7 @@ def narrowed(
         found: The recordings.
         channels: Channels of them, of one recording for each set of topics and types.
     """
-    if not session.connection.index or len(found) < _MIN_RECORDINGS or len(question.topics) != 1:
+    if not session.connection.index or len(found) < MIN_RECORDINGS or len(question.topics) != 1:
         return found
     condition = _condition(session.field_indexes, question, channels)
     if condition is None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from hybridlog.query.bounds import MIN_RECORDINGS, BoundsFinder, within_bounds
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
 from hybridlog.query.engines.base import Checking, Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex
@@ -73,6 +74,7 @@ class Planner:
         self._decidable: dict[Part, Part] = {}  # without what only MongoDB answers
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
+        self._is_of_many = False  # recordings
         self._scan = PayloadScan(session, counters)
         self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
 
@@ -87,7 +89,10 @@ class Planner:
     def _tables(self) -> TablesEngine:
         from hybridlog.query.engines.tables import TablesEngine
 
-        return TablesEngine(self.session, self.counters)
+        predicate, bounds = self.question.predicate, None
+        if predicate is not None and self._is_of_many:
+            bounds = BoundsFinder(self.session.catalog, predicate)
+        return TablesEngine(self.session, self.counters, bounds=bounds)
 
     @lazy
     def _columns(self) -> ArraysEngine:
@@ -125,12 +130,17 @@ class Planner:
         return self.batch_hint([part for one in found for part in self.parts_in(*one)])
 
     def _matching_ranges(self) -> Ranges:
-        """The recordings to ask, without those of which an index says that nothing matches."""
+        """The recordings to ask, without those of which it is known that nothing matches.
+
+        Bounds of their fields tell, or an index on a field.
+        """
         found = self._ranges.resolve()
         predicate = self.question.predicate
-        if predicate is None or predicate.needs_index or self.session.connected is None:
+        if predicate is None or predicate.needs_index or len(found) < MIN_RECORDINGS:
             return found
-        if not self.session.field_indexes:
+        self._is_of_many = True
+        found = within_bounds(self.session, self.question, found)
+        if self.session.connected is None or not self.session.field_indexes:
             return found
         from hybridlog.query.narrowing import narrowed
 

@@ -29,6 +29,7 @@ from zlib import error as ZlibError  # noqa: N812
 import numpy as np
 
 from hybridlog_storage.catalog_parts import (
+    BOUNDS,
     DAMAGE,
     ENTRY,
     MAX_PART_BYTES,
@@ -39,9 +40,11 @@ from hybridlog_storage.catalog_parts import (
     MemoryFolder,
     PartContent,
     Version,
+    bounds_in,
     is_of_another,
     number_of,
     part_name,
+    texts_in,
 )
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
@@ -79,6 +82,12 @@ _RECORDINGS: Final = "recordings"
 _TOPICS = RecordingSummary._fields.index("topics")
 _BUSY_S: Final = 1.0
 _CACHED_BYTES: Final = 64 << 20  # of chunk tables
+_MAX_BOUNDED_BYTES: Final = 56 << 10  # of a part from which recordings keep bounds of one kind
+_BOUND_BYTES: Final = 128  # of a line with bounds, about
+_MAX_BOUNDED_PARTS: Final = 256  # parts that are replaced at the end for the sake of bounds
+_MAX_NOTED: Final = 1 << 17  # bounds that wait for the end
+Ends = tuple[float | None, float | None]
+"""The least and the greatest of some numbers; None twice without any."""
 _STAMPS = np.dtype(
     [
         ("unreadable", "<u4"),
@@ -486,19 +495,23 @@ class _Part:
         summaries: By id; None for recordings without one.
         shared: Sets of topics as text, by kind and hash.
         damage: Lists of unreadable chunks as text, by id.
+        lines: Lines with bounds.
+        bounds: Those that were asked about, by kind and id.
     """
 
     version: Version = ()
     size: int = 0
+    lines: bytes = b""
     summaries: dict[str, RecordingSummary | None] = field(default_factory=dict)
     shared: dict[tuple[str, str], str] = field(default_factory=dict)
     damage: dict[str, str] = field(default_factory=dict)
+    bounds: dict[str, dict[str, Ends]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, content: PartContent, version: Version, size: int) -> _Part:
+    def of(cls, content: PartContent, version: Version, data: bytes) -> _Part:
         """The list of a part."""
         sets = {key: text for key, text in content.shared.items() if _are_topics(*key, text)}
-        found = cls(version, size, shared=sets)
+        found = cls(version, len(data), bounds_in(data), shared=sets)
         for recording, row in content.rows.items():
             found.summaries[recording] = None
             if SUMMARY in row:
@@ -512,6 +525,18 @@ class _Part:
             if DAMAGE in row:
                 found.damage[recording] = row[DAMAGE]
         return found
+
+    def bounds_of(self, kind: str) -> dict[str, Ends]:
+        """Bounds of one kind by recording."""
+        if kind not in self.bounds:
+            texts = texts_in(self.lines, kind)
+            self.bounds[kind] = {}
+            with suppress(TypeError, ValueError):
+                for recording, text in texts.items():
+                    low, high = json.loads(text)
+                    if {type(low), type(high)} <= {int, float} or low is high is None:
+                        self.bounds[kind][recording] = low, high
+        return self.bounds[kind]
 
 
 class Catalog:
@@ -539,6 +564,8 @@ class Catalog:
         self._by_fingerprint: dict[str, list[str]] | None = None
         self._odd: set[str] = set()  # names of files that are not ours, or left over
         self._damaged: set[int] = set()  # numbers of parts
+        # Bounds and the content that they are of, by kind and recording.
+        self._noted: dict[str, dict[str, tuple[str, Ends]]] = defaultdict(dict)
         self._tables: OrderedDict[tuple[str, int, str], tuple[ChunkTable, NDArray[np.void] | None]]
         self._tables = OrderedDict()
         self._cached = 0
@@ -559,6 +586,7 @@ class Catalog:
     def close(self) -> None:
         """Drop what was read, and remove what was found to be damaged."""
         with self._lock:
+            self._keep_noted()
             self._forget()
             self.drop_damaged()
 
@@ -605,6 +633,10 @@ class Catalog:
             found = known if is_known else self._read_list(name, version)
             if found is not None:
                 parts[number] = found
+                if not is_known:  # another process may have read recordings again
+                    before = {} if known is None else known.summaries
+                    after = found.summaries.items()
+                    self._drop_noted([one for one, now in after if before.get(one) != now])
         self._parts = parts
         self._place()
 
@@ -625,7 +657,7 @@ class Catalog:
             return None
         found = PartContent.from_bytes(self._store_id, data, is_list=True)
         self._check(number_of(name) or 0, found)
-        return _Part.of(found, version, len(data))
+        return _Part.of(found, version, data)
 
     def _read(self, number: int) -> PartContent:
         """Everything in a part but what is damaged; nothing if it does not exist."""
@@ -711,7 +743,7 @@ class Catalog:
         whole = PartContent(rows, shared)
         data = whole.to_bytes(self._store_id)
         self._folder.write(name, data)
-        self._parts[number] = _Part.of(whole, (), len(data))
+        self._parts[number] = _Part.of(whole, (), data)
 
     def _change(self, recording: str, change: Callable[[dict[str, str]], None], *sets: str) -> None:
         """Change the row of a recording; an empty one is removed.
@@ -750,6 +782,10 @@ class Catalog:
         text = json.dumps([described.files, entry.to_document()], separators=(",", ":"))
 
         def change(row: dict[str, str]) -> None:
+            kinds = [kind for kind in row if kind.startswith(BOUNDS)]
+            if kinds and _content_of(row) != content_of(entry.digests):
+                for kind in kinds:
+                    del row[kind]
             row[ENTRY] = text
             row[SUMMARY] = f"- {described.summary.to_json()}"
 
@@ -761,7 +797,11 @@ class Catalog:
     def put_looks(self, summaries: Iterable[RecordingSummary]) -> None:
         """Note that recordings are unchanged although their directories look different."""
         texts = {one.id: one.to_json() for one in summaries}
-        self._note(texts, lambda recording, row: f"{row.partition(' ')[0]} {texts[recording]}")
+
+        def change(recording: str, row: dict[str, str]) -> None:
+            row[SUMMARY] = f"{row[SUMMARY].partition(' ')[0]} {texts[recording]}"
+
+        self._note(texts, change)
 
     def put_indexed(self, recordings: Iterable[str], index: str) -> None:
         """Note which index is complete for recordings.
@@ -770,10 +810,16 @@ class Catalog:
             recordings: Their ids.
             index: The id of the index; empty if none is.
         """
-        self._note(recordings, lambda _, row: f"{index or '-'} {row.partition(' ')[2]}")
 
-    def _note(self, recordings: Iterable[str], change: Callable[[str, str], str]) -> None:
-        """Change summaries; this saves work later, and is left out if it fails."""
+        def change(_: str, row: dict[str, str]) -> None:
+            row[SUMMARY] = f"{index or '-'} {row[SUMMARY].partition(' ')[2]}"
+
+        self._note(recordings, change)
+
+    def _note(
+        self, recordings: Iterable[str], change: Callable[[str, dict[str, str]], None]
+    ) -> None:
+        """Change listed recordings; this saves work later, and is left out if it fails."""
         wanted = [*recordings]
         if not wanted:
             return
@@ -785,9 +831,8 @@ class Catalog:
             for number, own in by_part.items():
                 content = self._read(number)
                 for recording in own:
-                    row = content.rows.get(recording, {})
-                    if SUMMARY in row:
-                        row[SUMMARY] = change(recording, row[SUMMARY])
+                    if SUMMARY in content.rows.get(recording, {}):
+                        change(recording, content.rows[recording])
                 self._write(number, content)
 
     def remove(self, recording: str) -> None:
@@ -959,6 +1004,61 @@ class Catalog:
                 return rows
         return None
 
+    # Bounds.
+
+    def bounds(self, kind: str) -> dict[str, Ends]:
+        """Known bounds of one kind, by recording; see `note_bounds`."""
+        with self._lock:
+            found = {
+                recording: ends
+                for number, part in self._parts.items()
+                for recording, ends in part.bounds_of(f"{BOUNDS}{kind}").items()
+                if self._places.get(recording) == number
+            }
+            noted = self._noted.get(kind, {})
+            return found | {recording: ends for recording, (_, ends) in noted.items()}
+
+    def note_bounds(self, kind: str, entry: RecordingEntry, ends: Ends) -> None:
+        """Note the bounds of numbers of a recording; they are written when this is closed.
+
+        Args:
+            kind: What they are bounds of, in a word.
+            entry: The recording; bounds hold for the content of its segments.
+            ends: The bounds, without NaN.
+        """
+        with self._lock:
+            if sum(map(len, self._noted.values())) >= _MAX_NOTED:
+                self._noted.clear()
+            self._noted[kind][entry.id] = content_of(entry.digests), ends
+
+    def _drop_noted(self, recordings: Iterable[str]) -> None:
+        for noted in self._noted.values():
+            for recording in recordings:
+                noted.pop(recording, None)
+
+    def _keep_noted(self) -> None:
+        """Write bounds that were noted, of as many recordings as takes a second."""
+        noted, self._noted = self._noted, defaultdict(dict)
+        recordings = {recording for own in noted.values() for recording in own}
+        places = sorted({self._places[one] for one in recordings & self._places.keys()})
+        chosen = {*places[:_MAX_BOUNDED_PARTS]}
+
+        def change(recording: str, row: dict[str, str]) -> None:
+            known = _content_of(row)
+            own = {
+                f"{BOUNDS}{kind}": json.dumps(found[recording][1], separators=(",", ":"))
+                for kind, found in noted.items()
+                if recording in found and found[recording][0] == known
+            }
+            part = self._parts[self._places[recording]]
+            room = (_MAX_BOUNDED_BYTES - part.size) // (_BOUND_BYTES * len(part.summaries))
+            if room <= 0:
+                for kind in [kind for kind in row if kind.startswith(BOUNDS)]:
+                    del row[kind]
+            row.update([*own.items()][-max(room, 1) :])
+
+        self._note([one for one in recordings if self._places.get(one) in chosen], change)
+
     # Schemas.
 
     def _put_schemas(self, schemas: Collection[Schema]) -> None:
@@ -1048,6 +1148,10 @@ class Catalog:
         return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
 
     def _forget(self, recording: str | None = None) -> None:
+        if recording is None:
+            self._noted.clear()
+        else:
+            self._drop_noted([recording])
         for key in [k for k in self._tables if recording in {None, k[0]}]:
             table, _ = self._tables.pop(key)
             self._cached -= _size(table)
@@ -1060,6 +1164,18 @@ def _are_topics(kind: str, key: str, text: str) -> bool:
     with suppress(TypeError, ValueError):
         return all(isinstance(word, str) for one in topics_from_json(text) for word in one)
     return False
+
+
+def content_of(digests: Mapping[str, str]) -> str:
+    """A hash of the content of a recording's segments, by their digests."""
+    return hash_of(json.dumps(sorted(digests.items())))
+
+
+def _content_of(row: Mapping[str, str]) -> str:
+    """The same of a row; empty without an entry."""
+    with suppress(KeyError, TypeError, ValueError, AttributeError):
+        return content_of(json.loads(row[ENTRY])[1]["digests"])
+    return ""
 
 
 def schema_hash(schema: Schema) -> str:

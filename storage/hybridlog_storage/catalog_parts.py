@@ -33,9 +33,9 @@ STAMPS: Final = "2-stamps-"
 `STAMPS`."""
 TOPICS: Final = "0-topics"
 """Kind of the lines with sets of topics; the key is a hash."""
-BOUNDS: Final = "1-bounds"
-"""Kind of the lines with the bounds of a field, for the recordings of the part by their ids."""
-_OF_RECORDING: Final = (SUMMARY, DAMAGE, ENTRY, STAMPS)
+BOUNDS: Final = "1-bounds-"
+"""Beginning of the kinds of lines with bounds; what they are bounds of follows."""
+_OF_RECORDING: Final = (SUMMARY, DAMAGE, ENTRY, STAMPS, BOUNDS)
 _DETAILS: Final = (b"1-", b"2-")
 _PART = re.compile(r"part-(\d{6,12})")
 _HEAD = re.compile(rb"hybridlog catalog (\d+) (\S*) (\d{10})\n")
@@ -112,11 +112,12 @@ class PartContent:
             end = data.find(b"\n", begin) % (len(data) + 1)
             if is_list and data.startswith(_DETAILS, begin + 9):
                 break
-            found._add(data[begin : begin + 8], data[begin + 9 : end])
+            found.add_line(data[begin : begin + 8], data[begin + 9 : end])
             begin = end + 1
         return found
 
-    def _add(self, checksum: bytes, line: bytes) -> None:
+    def add_line(self, checksum: bytes, line: bytes) -> None:
+        """Add a line, without its checksum; a damaged one is left out."""
         if checksum != b"%08x" % crc32(line):
             self.is_whole = False
             return
@@ -127,13 +128,21 @@ class PartContent:
             self.shared[kind, key] = text
 
 
-def text_in(data: bytes, kind: str, key: str) -> str | None:
-    """The text of one line of a part; None if it is missing or damaged."""
-    begin = data.find(f" {kind} {key} ".encode("ascii"))
-    line = data[begin + 1 : data.find(b"\n", begin)]
-    if begin < 8 or data[begin - 8 : begin] != b"%08x" % crc32(line):
-        return None
-    return line.decode("ascii").split(" ", 2)[2]
+def bounds_in(data: bytes) -> bytes:
+    """The lines of a part with bounds, and perhaps some before them."""
+    begin = data.find(f" {BOUNDS}".encode("ascii"))
+    end = data.find(f" {ENTRY} ".encode("ascii"), begin)
+    return data[max(begin - 8, 0) : end] if begin >= 0 else b""
+
+
+def texts_in(lines: bytes, kind: str) -> dict[str, str]:
+    """The texts of one kind among some lines by key, without damaged ones."""
+    wanted = f"{kind} ".encode("ascii")
+    found = PartContent()
+    for line in lines.splitlines():
+        if line.startswith(wanted, 9):
+            found.add_line(line[:8], line[9:])
+    return {key: row[kind] for key, row in found.rows.items()}
 
 
 class MemoryFolder:

@@ -33,9 +33,8 @@ def write_day(path: Path, day: int) -> None:
         topics = [writer.register_channel(name, "ros1", schema) for name in ("/pose", "/imu")]
         for number in range(MESSAGES):
             time = START + day * DAY + number * 10**9
-            payload = struct.pack("<f", number)
-            for channel in topics:
-                writer.add_message(channel, time, payload, time)
+            for channel, value in zip(topics, (number, 100 * day + number), strict=True):
+                writer.add_message(channel, time, struct.pack("<f", value), time)
         writer.finish()
 
 
@@ -235,6 +234,37 @@ def test_many_at_once_are_counted_in_each_file_once(stores: dict[int, Path]) -> 
         tables = [path for path in cost.opened if path.endswith(".parquet")]
         assert len(tables) == len({*tables})
     assert not [path for path in again.opened if path.endswith((".parquet", ".mcap"))]
+
+
+def test_bounds_leave_out_recordings_that_cannot_match(stores: dict[int, Path]) -> None:
+    """After a first question, in the same process and in others."""
+    last = 100 * (MANY - 1)
+    wanted = {
+        f"data > {last + 4.5}": MESSAGES - 5,
+        "data in [1205, 1150, -1]": 1,
+        "data > 100 and data < 108.5": 8,
+        "not (data < 1e9)": 0,
+        "data != 5": MANY * MESSAGES - 1,
+        f"data < 0 or data > {last + 100}": 0,
+        "data == 1204.5": 0,
+        "data in [1204.5, -3]": 0,
+    }
+    for _ in range(2):
+        with hl.open(stores[MANY], mongo="none") as store:
+            imu = store.topic("imu")
+            assert imu.where("data == 1205").count() == 1
+            for text, count in wanted.items():
+                assert imu.where(text).count() == count
+                assert sum(1 for _ in imu.where(text)) == count
+    with hl.open(stores[MANY], mongo="none") as store:
+        imu = store.topic("imu")
+        costs = [cost_of(store, imu.where(text).count) for text in wanted]
+        asked = [{path for path in cost.opened if path.startswith("day")} for cost in costs]
+        assert asked[:3] == [{f"day{MANY - 1:05d}"}, {"day00012"}, {"day00001"}]
+        for cost in costs[-3:]:
+            assert {*cost.opened} <= {str(store.directory.path)}
+        store.tag("day00012", place="hall")
+        assert imu.where("data in [1205, 3]").count() == 2
 
 
 def test_a_small_recording_takes_little_room(stores: dict[int, Path]) -> None:

@@ -40,6 +40,7 @@ from hybridlog_storage.catalog import (
     stamps_of,
 )
 from hybridlog_storage.catalog_parts import (
+    BOUNDS,
     DAMAGE,
     ENTRY,
     MAX_PART_BYTES,
@@ -399,6 +400,55 @@ def test_damage_is_replaced(catalog: Catalog) -> None:
     assert (catalog.damage("r"), catalog.damage("other")) == ({}, {(9, 9): "c"})
 
 
+def test_bounds_are_of_one_content(tmp_path: Path) -> None:
+    models = [Model(number, f"run{number}") for number in range(3)]
+    first, second, third = models
+    ends = {first.id: (1, 2.5), second.id: (None, None), third.id: (-math.inf, 2**70)}
+    with closing(Catalog(tmp_path, STORE)) as one, closing(Catalog(tmp_path, STORE)) as other:
+        for model in models:
+            model.put(one)
+        assert len(other.summaries()) == 3
+        for model in models:
+            other.note_bounds("x", model.entry, ends[model.id])
+            other.note_bounds("y", model.entry, (5, 6))
+        assert other.bounds("x") == ends
+        first.entry.digests["0"] = "sha256:0"
+        first.put(one)
+    del ends[first.id]
+    with closing(Catalog(tmp_path, STORE)) as one:
+        one.summaries()
+        assert one.bounds("x") == ends
+        one.put_damage(third.id, {(0, 0): "x"})
+        second.put(one)  # the same again
+        assert one.bounds("x") == ends
+        second.entry.digests["1"] = "sha256:1"
+        second.put(one)
+        del ends[second.id]
+        assert (one.bounds("x"), one.bounds("y")) == (ends, {third.id: (5, 6)})
+        one.note_bounds("x", third.entry, (7, 8))
+        assert one.bounds("x") == {third.id: (7, 8)}
+        one.remove(third.id)
+        assert one.bounds("x") == {}
+        assert one.is_sound()
+
+
+def test_bounds_take_little_room(tmp_path: Path) -> None:
+    models = [Model(number, f"run{number}", segments=1, chunks=3) for number in range(20)]
+    for turn in range(3):
+        with closing(Catalog(tmp_path, STORE)) as catalog:
+            for model in models if not turn else ():
+                model.put(catalog)
+            catalog.summaries()
+            for kind in range(40):
+                for model in models:
+                    catalog.note_bounds(f"{turn}-{kind}", model.entry, (0.1, 0.2))
+    sizes = [path.stat().st_size for path in (tmp_path / CATALOG).glob("part-*")]
+    assert max(sizes) < 64 << 10
+    with closing(Catalog(tmp_path, STORE)) as catalog:
+        assert len(catalog.summaries()) == 20
+        assert {*map(len, (catalog.bounds(f"2-{kind}") for kind in range(40)))} - {0}
+
+
 def test_schemas(catalog: Catalog, model: Model) -> None:
     model.put(catalog)
     known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
@@ -562,6 +612,7 @@ class Truth:
         for model in self.models:
             model.put(catalog)
             catalog.put_damage(model.id, self.damage)
+            catalog.note_bounds("x", model.entry, (-1.5, 2))
 
     def check(self, catalog: Catalog) -> bool:
         """That nothing that it says is wrong; returns whether it says all."""
@@ -582,6 +633,7 @@ class Truth:
             complete &= row is not None and bool(damage) and None not in decoded
             if model.id in summaries:
                 assert {*catalog.topics(summaries[model.id].topics)} == model.described.topics
+        assert catalog.bounds("x").items() <= {m.id: (-1.5, 2) for m in self.models}.items()
         known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
         found = catalog.schemas(known)
         assert found.items() <= known.items()
@@ -665,7 +717,7 @@ def changed_anywhere(value: Any) -> Iterator[Any]:
             yield dict(found) if isinstance(value, dict) else [it for _, it in found]
 
 
-@pytest.mark.parametrize("kind", [SUMMARY, ENTRY, DAMAGE, TOPICS, f"{STAMPS}0"])
+@pytest.mark.parametrize("kind", [SUMMARY, ENTRY, DAMAGE, TOPICS, f"{STAMPS}0", f"{BOUNDS}x"])
 def test_a_forged_line_is_no_error(truth: Truth, tmp_path: Path, kind: str) -> None:
     """Its checksum is right. Of types that do not fit nothing is believed."""
     folder = tmp_path / CATALOG
@@ -710,6 +762,8 @@ def test_a_forged_line_is_no_error(truth: Truth, tmp_path: Path, kind: str) -> N
                     assert type(channel.stats.messages) is type(channel.id) is int
                     assert type(channel.topic) is type(channel.message_encoding) is str
             opened.damage(recording)
+            for ends in opened.bounds("x").values():
+                assert ends == (None, None) or {*map(type, ends)} <= {int, float}
             decoded = decoded_of(opened, truth.models[0])
             wanted = decoded_in(truth.models[0])
             assert all(one in (None, it) for one, it in zip(decoded, wanted, strict=True))

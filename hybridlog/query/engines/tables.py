@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.payload_reader import ArrayTable
     from hybridlog.columns.topic_table import TableRows, TopicTable
+    from hybridlog.query.bounds import BoundsFinder
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
     from hybridlog.query.predicate.tree import Node
@@ -56,6 +57,7 @@ class TablesEngine:
         session: The open store.
         counters: Count the bytes that are read.
         table_of: Returns the table of a part; None for the one of its whole recording.
+        bounds: Gets the bounds of the columns that are read; None to leave them.
     """
 
     def __init__(
@@ -63,8 +65,10 @@ class TablesEngine:
         session: Session,
         counters: Counters,
         table_of: Callable[[Part], TopicTable | None] | None = None,
+        bounds: BoundsFinder | None = None,
     ) -> None:
         self._session = session
+        self._bounds = bounds
         self._table_of = table_of or (lambda part: session.table(part.recording, part.topic))
         self._counters = counters
         self._counts: dict[Part, _Count] = {}
@@ -159,27 +163,41 @@ class TablesEngine:
         types = part.field_types
         whole = self._session.tables.whole(table.files[0])
         matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
+        alike = [(part, table) for part, table in together if part.field_types == types]
+        bounds = None if self._bounds is None else self._bounds.of([part for part, _ in alike])
+        own = [(part, one) for part, table in alike for one in table.parts]
         for rows, holds in self._rows(part, whole=whole):
+            if bounds is not None:
+                here = [pair for pair in own if pair[1].group == len(before) - 1]
+                spans = [(part, one.begin, one.begin + one.rows) for part, one in here]
+                bounds.add(rows.records, spans)
             before.append(before[-1] + len(rows))
             for found, mask in ((matched, holds), (unreadable, rows.is_unreadable())):
                 found.append(found[-1][-1] + np.cumsum(mask))
         sums, bad = np.concatenate(matched), np.concatenate(unreadable)
-        for part, table in together:
-            if part.field_types == types:
-                spans = [(before[one.group] + one.begin, one.rows) for one in table.parts]
-                self._counts[part] = _Count(
-                    sum(int(sums[begin + rows] - sums[begin]) for begin, rows in spans),
-                    sum(int(bad[begin + rows] - bad[begin]) for begin, rows in spans),
-                )
+        for part, table in alike:
+            places = [(before[one.group] + one.begin, one.rows) for one in table.parts]
+            self._counts[part] = _Count(
+                sum(int(sums[begin + rows] - sums[begin]) for begin, rows in places),
+                sum(int(bad[begin + rows] - bad[begin]) for begin, rows in places),
+            )
+            if bounds is not None and not self._counts[part].unreadable:
+                bounds.note(part)
 
     def check(self, part: Part) -> int:
         """The count of one part; confirms that the columns can decide."""
         if part not in self._counts:
             matched = unreadable = 0
+            finder = self._bounds if part.is_unbounded else None
+            bounds = None if finder is None else finder.of([part])
             for rows, holds in self._rows(part):
                 matched += int(holds.sum())
                 unreadable += int(rows.is_unreadable().sum())
+                if bounds is not None:
+                    bounds.add(rows.records, [(part, 0, len(rows))])
             self._counts[part] = _Count(matched, unreadable)
+            if bounds is not None and not unreadable:
+                bounds.note(part)
         return self._counts[part].matched
 
     def _tell_unreadable(self, parts: Sequence[Part]) -> None:

@@ -104,6 +104,37 @@ def to_mask(
     return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
 
 
+def numbers_at(
+    asked: Field, types: FieldTypes | Mapping[str, str] | None, records: pa.StructArray
+) -> list[tuple[NDArray[Any], Rows]] | None:
+    """The numbers that conditions on a field compare.
+
+    Args:
+        asked: The field.
+        types: As for `to_mask`.
+        records: As for `to_mask`.
+
+    Returns:
+        Numbers and the row of each, in order of rows; None if there may be anything else.
+    """
+    found = []
+    try:
+        for leaves in _Columns(FieldTypes.of(types), records).leaves(asked):
+            for each in _elements(leaves):
+                values = _as_integers(each.values)
+                is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+                if each.is_hidden or each.is_summary:
+                    return None
+                if is_number:
+                    some, rows = _some(values, each.rows, _valid(values))
+                    found.append((_numpy(some), rows))
+                elif not pa.types.is_null(values.type):
+                    return None
+    except (_UnfitError, pa.ArrowNotImplementedError):
+        return None
+    return found
+
+
 def _parts(records: Records) -> Iterator[pa.StructArray]:
     """The records in pieces."""
     if isinstance(records, pa.Table):
@@ -199,7 +230,7 @@ class _Columns:
 
     def _exists(self, asked: Field) -> _Pair:
         possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
-        for leaves in self._leaves(asked):
+        for leaves in self.leaves(asked):
             possible[leaves.rows] = True
             if leaves.is_hidden:
                 continue
@@ -212,7 +243,7 @@ class _Columns:
     def _holds(self, node: Compare | Member | Match) -> _Pair:
         """Masks of the rows with a value that satisfies a condition, without its negation."""
         possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
-        for leaves in self._leaves(node.field):
+        for leaves in self.leaves(node.field):
             for each in _elements(leaves):
                 found = _tested(node, each, self._types)
                 possible[each.rows[found.possible]] = True
@@ -221,7 +252,7 @@ class _Columns:
 
     # Paths.
 
-    def _leaves(self, asked: Field) -> list[_Leaves]:
+    def leaves(self, asked: Field) -> list[_Leaves]:
         """The values at a path.
 
         Raises:

@@ -1,0 +1,184 @@
+"""Leaves out recordings of which bounds say that no message matches.
+
+Bounds are the least and the greatest number of a field of a topic in a recording. Columns that
+answer a question about many recordings tell them, the catalog keeps them, and later questions
+open only files in which something may match. They are known only where columns alone can
+answer: not for messages without fields, for running recordings, or for lost segments.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterable, Sequence
+from itertools import takewhile
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.columns.zones import Zone, may_hold
+from hybridlog.query.predicate.numbers import is_nan
+from hybridlog.query.predicate.tree import Compare, Field, Member, is_meta, nodes
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.query.predicate.tree import Node, Predicate
+    from hybridlog.query.question import Part, Question
+    from hybridlog.query.ranges import Ranges
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import Catalog, Ends
+
+MIN_RECORDINGS: Final = 16
+"""Fewer recordings are asked by their columns: to leave some out saves little."""
+_WHOLE: Final = 1 << 62  # elements of a region: all
+_NONE: Final[Ends] = (None, None)
+
+
+def key_of(topic: str, path: str) -> str:
+    """A word for a field of a topic."""
+    return hashlib.sha256(f"{topic}\n{path}".encode()).hexdigest()[:16]
+
+
+def within_bounds(session: Session, question: Question, found: Ranges) -> Ranges:
+    """The recordings of a question that may have matching messages.
+
+    Args:
+        session: The open store.
+        question: The question, with a predicate.
+        found: The recordings.
+    """
+    assert question.predicate is not None
+    root = question.predicate.root
+    fields = _bounded(root)
+    if len(found) < MIN_RECORDINGS or not fields:
+        return found
+    snapshot = session.snapshot()
+    paths = {path for one in fields for path in _paths(one)}
+    may = snapshot.is_open[found.places].copy()
+    for topic in question.topics:
+        has = np.isin(found.places, snapshot.having([topic]))
+        known = {path: session.catalog.bounds(key_of(topic, path)) for path in paths}
+        if not any(known.values()):
+            may |= has
+        for row in np.flatnonzero(has & ~may).tolist():
+            recording = snapshot.summaries[found.places[row]].id
+            zones = {
+                path: Zone(_WHOLE, (ends[recording][0],), (ends[recording][1],))
+                for path, ends in known.items()
+                if recording in ends
+            }
+            may[row] = may_hold(root, zones)
+    return found if may.all() else found.take(np.flatnonzero(may))
+
+
+def _bounded(root: Node) -> list[Field]:
+    """The fields of conditions that bounds may exclude."""
+    return [
+        node.field
+        for node in nodes(root)
+        if isinstance(node, Compare | Member) and not is_meta(node.field.path)
+    ]
+
+
+def _paths(asked: Field) -> list[str]:
+    """The paths of which bounds tell about a field: its own, and those it goes through."""
+    names = [*takewhile(lambda part: isinstance(part, str), asked.parts)]
+    return [".".join(map(str, names[:end])) for end in range(1, len(names) + 1)]
+
+
+class BoundsFinder:
+    """Finds bounds in columns that are read for an answer.
+
+    Args:
+        catalog: Keeps them.
+        predicate: The question's.
+    """
+
+    def __init__(self, catalog: Catalog, predicate: Predicate) -> None:
+        self._catalog = catalog
+        # A mean is rounded, and other engines may round it otherwise.
+        fields = {one.path: one for one in _bounded(predicate.root) if _is_plain(one)}
+        self._fields = [*fields.values()]
+        self._known: dict[str, dict[str, Ends]] = {}
+
+    def of(self, parts: Collection[Part]) -> Found:
+        """What is to be found for some parts with the same topics and types."""
+        return Found(self, [one for one in self._fields if self._lacks(one, parts)])
+
+    def _lacks(self, asked: Field, parts: Collection[Part]) -> bool:
+        return any(part.recording.id not in self._known_of(part.topic, asked) for part in parts)
+
+    def _known_of(self, topic: str, asked: Field) -> dict[str, Ends]:
+        kind = key_of(topic, asked.path)
+        if kind not in self._known:
+            self._known[kind] = self._catalog.bounds(kind)
+        return self._known[kind]
+
+    def note(self, part: Part, asked: Field, ends: Ends) -> None:
+        """Note what is known of a part's recording."""
+        self._known_of(part.topic, asked)[part.recording.id] = ends
+        self._catalog.note_bounds(key_of(part.topic, asked.path), part.recording, ends)
+
+
+class Found:
+    """Bounds of some parts.
+
+    Args:
+        finder: Takes them.
+        fields: The fields.
+    """
+
+    def __init__(self, finder: BoundsFinder, fields: Sequence[Field]) -> None:
+        self._finder = finder
+        self._ends: dict[Field, dict[Part, Ends]] = {asked: {} for asked in fields}
+
+    def add(self, records: pa.StructArray, spans: Iterable[tuple[Part, int, int]]) -> None:
+        """Look at rows.
+
+        Args:
+            records: Fields of messages.
+            spans: The rows of each part, from one index to another.
+        """
+        if not self._ends:
+            return
+        from hybridlog.query.predicate.to_mask import numbers_at
+
+        spans = [*spans]
+        edges = np.array([span[1:] for span in spans], np.intp).reshape(-1, 2)
+        for asked in [*self._ends]:
+            found = numbers_at(asked, spans[0][0].field_types, records) if spans else []
+            if found is None:
+                del self._ends[asked]
+                continue
+            known = self._ends[asked]
+            for part, *_ in spans:
+                known.setdefault(part, _NONE)
+            for numbers, rows in found:
+                for (part, *_), (begin, end) in zip(
+                    spans, np.searchsorted(rows, edges).tolist(), strict=True
+                ):
+                    known[part] = _joined(known[part], numbers[begin:end])
+
+    def note(self, part: Part) -> None:
+        """Note the bounds of a part, of which all rows were looked at."""
+        for asked, known in self._ends.items():
+            if part in known:
+                self._finder.note(part, asked, known[part])
+
+
+def _is_plain(asked: Field) -> bool:
+    return all(isinstance(part, str) for part in asked.parts) and asked.parts[-1] != "mean"
+
+
+def _joined(ends: Ends, numbers: NDArray[Any]) -> Ends:
+    """The bounds of some numbers and of more."""
+    if not len(numbers):
+        return ends
+    found = np.fmin.reduce(numbers).item(), np.fmax.reduce(numbers).item()
+    if is_nan(found[0]):
+        return ends
+    low, high = ends
+    return (found[0] if low is None else min(low, found[0])), (
+        found[1] if high is None else max(high, found[1])
+    )
