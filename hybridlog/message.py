@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch
 
+
+PictureOf: TypeAlias = "Callable[[Message], NDArray[Any]]"
+"""Decodes a frame of video."""
 
 _MAX_SHOWN = 64 << 20  # bytes of a payload that a thumbnail is made of
 
@@ -41,6 +44,7 @@ class Message:
         "_codec",
         "_documents",
         "_is_reduced",
+        "_picture_of",
         "_row",
         "_view",
         "log_time_ns",
@@ -63,6 +67,7 @@ class Message:
         view: memoryview,
         documents: Documents,
         row: int,
+        picture_of: PictureOf | None,
     ) -> None:
         described = channel.channel
         self.topic = described.topic
@@ -77,6 +82,7 @@ class Message:
         self._is_reduced = channel.is_reduced
         self._documents = documents
         self._row = row
+        self._picture_of = picture_of
 
     def __repr__(self) -> str:
         return f"<Message {self.topic} {format_time(self.log_time_ns)} {len(self._view)} B>"
@@ -96,7 +102,7 @@ class Message:
 
     def _thumbnail(self) -> bytes:
         """A small PNG of an image; empty for other messages, and for what cannot be shown."""
-        from hybridlog.arrays.message_arrays import IMAGES, to_numpy
+        from hybridlog.arrays.message_arrays import IMAGES
         from hybridlog.drawing.pixels import thumbnail
 
         is_image = self.type.replace("/msg/", "/") in IMAGES
@@ -104,7 +110,7 @@ class Message:
             return b""
         try:
             message = self.decode()
-            return thumbnail(to_numpy(self.type, message), getattr(message, "encoding", "rgb8"))
+            return thumbnail(self.to_numpy(), getattr(message, "encoding", "rgb8"))
         except HybridlogError:
             return b""
 
@@ -166,13 +172,17 @@ class Message:
         return cast("pa.StructScalar | Mapping[str, Any]", values[0])
 
     def to_numpy(self) -> NDArray[Any]:
-        """An image, scan or point cloud as an array.
+        """An image, scan or point cloud as an array; a frame of video as its picture.
 
         Raises:
-            PayloadError: another type, or sizes that do not fit the data.
+            PayloadError: another type, or sizes that do not fit the data. Of a frame: one that
+                it refers to is missing.
+            MissingDependencyError: Pillow or PyAV is required and not installed.
         """
-        from hybridlog.arrays.message_arrays import to_numpy
+        from hybridlog.arrays.message_arrays import VIDEOS, to_numpy
 
+        if self._picture_of is not None and self.type.replace("/msg/", "/") in VIDEOS:
+            return self._picture_of(self)
         return to_numpy(self.type, self.decode())
 
 
@@ -212,8 +222,13 @@ class Documents:
                 self._bodies[row] = body.tobytes()
 
 
-def messages_in(run: MessageRun) -> Iterator[Message]:
-    """The messages of a run, in its order."""
+def messages_in(run: MessageRun, picture_of: PictureOf | None = None) -> Iterator[Message]:
+    """The messages of a run, in its order.
+
+    Args:
+        run: The run.
+        picture_of: Gives the pictures of frames of video; None where none are asked for.
+    """
     batch, channels = run.batch, run.channels
     documents = Documents(channels, batch)
     view = memoryview(batch.buffer)
@@ -238,4 +253,5 @@ def messages_in(run: MessageRun) -> Iterator[Message]:
             view=view[start : start + size],
             documents=documents,
             row=row,
+            picture_of=picture_of,
         )

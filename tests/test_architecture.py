@@ -31,6 +31,7 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 # Where each third-party package may be imported: a module, or a package and all below it.
 ALLOWED = {
     "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
+    "av": ("hybridlog.arrays.video",),
     "bson": (
         "hybridlog.query.answers.index_documents",  # as MongoDB has them
         "hybridlog.schema.index_bodies",

@@ -13,6 +13,7 @@ from hybridlog.across.approximate_time import approximate_sets
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import completeness_of
+from hybridlog.query.answers.video import picture_of
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
@@ -188,7 +189,8 @@ class Synced(Sequence[tuple["Message", ...]]):
         question = replace(topic.question, recordings=(recording,), during=span)
         counters = Counters()
         runs = Planner(session, question, counters).runs()
-        messages = [message for run in runs for message in messages_in(run)]
+        picture = picture_of(session)
+        messages = [message for run in runs for message in messages_in(run, picture)]
         self.counters.add(counters)
         if number >= len(messages):
             raise StoreError(

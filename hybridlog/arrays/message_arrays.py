@@ -226,7 +226,9 @@ COMPRESSED_IMAGES: Final = frozenset(
 )
 """Types of messages with a picture in a file format, without `/msg/`."""
 _RAW_IMAGES = ("sensor_msgs/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
-IMAGES: Final = COMPRESSED_IMAGES.union(_RAW_IMAGES)
+VIDEOS: Final = frozenset(("foxglove.CompressedVideo", "foxglove_msgs/CompressedVideo"))
+"""Types of messages with a frame of video, without `/msg/`."""
+IMAGES: Final = COMPRESSED_IMAGES.union(_RAW_IMAGES, VIDEOS)
 """Types of messages with a picture, without `/msg/`."""
 _MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
     **dict.fromkeys(_RAW_IMAGES, _image),

@@ -425,7 +425,7 @@ def _write_pictures(query: Query, form: str, target: Target, progress: Progress)
             if message.type.replace("/msg/", "/") not in IMAGES:
                 raise UsageError(
                     f"{message.topic} has {message.type or 'no type'}, which is no image: {form} "
-                    "is for Image and CompressedImage, those of ROS and of Foxglove."
+                    "is for images and compressed video, those of ROS and of Foxglove."
                 )
             if message.is_reduced:
                 query.counters.reduced += 1
@@ -531,7 +531,7 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
 
 
 def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
-    """Print what an answer cost, with `--verbose`; without, the latched messages in front.
+    """Print what an answer cost, with `--verbose`; without, the messages in front.
 
     Args:
         counters: Of the query.
@@ -539,8 +539,8 @@ def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
         count: The answer was a number, not messages.
     """
     if not click.get_current_context().meta.get(VERBOSE):
-        if counters.latched and not count:
-            output.note(f"{output.counted(counters.latched, 'latched message')} in front")
+        if (counters.latched or counters.frames) and not count:
+            output.note(latched(counters).removeprefix(" and "))
         return
     used = []
     if not count:
@@ -560,9 +560,13 @@ def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
 
 def latched(counters: Counters) -> str:
     """The end of a number of messages: ` and 2 latched messages in front`, if any."""
-    if not counters.latched:
-        return ""
-    return f" and {output.counted(counters.latched, 'latched message')} in front"
+    found = ""
+    if counters.latched:
+        found = f" and {output.counted(counters.latched, 'latched message')} in front"
+    if counters.frames:
+        frames = output.counted(counters.frames, "frame")
+        found += f" and {frames} of video in front, from the key frame on"
+    return found
 
 
 def print_lost(query: Query, count: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
     from hybridlog.drawing.density import Density
     from hybridlog.maintenance.sizes import Size, Sizes
+    from hybridlog.query.answers.video import VideoSummary
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
@@ -74,11 +75,12 @@ def info_command(
         index = opened.index_place
         found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
         extras = {entry.id: _extras(opened, entry) for entry in chosen}
+        videos = {entry.id: _videos(opened, entry) for entry in chosen[:_MAX_DRAWN]}
         drawn = {}
         if sys.stdout.isatty() and not as_json and len(chosen) <= _MAX_DRAWN:
             drawn = {entry.id: _densities(opened, entry) for entry in chosen}
     if as_json:
-        full = [_as_dict(entry, *extras[entry.id]) for entry in chosen]
+        full = [_as_dict(entry, *extras[entry.id], videos.get(entry.id, {})) for entry in chosen]
         for about, entry in zip(full, chosen, strict=True):
             if entry.label in found:
                 about["sizes"] = [size_dict(row) for row in found[entry.label].rows]
@@ -89,7 +91,13 @@ def info_command(
     for number, entry in enumerate(chosen):
         if number:
             output.say()
-        _print_recording(entry, index, *extras[entry.id], drawn.get(entry.id))
+        _print_recording(
+            entry,
+            index,
+            *extras[entry.id],
+            videos=videos.get(entry.id, {}),
+            drawn=drawn.get(entry.id),
+        )
         if entry.label in found:
             output.say()
             of_one = found[entry.label]
@@ -124,8 +132,26 @@ def _is_segment(what: str) -> bool:
     return looks and Path(what).exists()
 
 
+def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
+    """Codec and key frames of video topics, by topic; none of those that cannot be read."""
+    from hybridlog.query.answers.video import is_video, summary_of
+
+    found: dict[str, VideoSummary] = {}
+    for channel in store.session.channels(entry):
+        topic = channel.channel.topic
+        if topic not in found and is_video(channel.channel):
+            try:
+                found[topic] = summary_of(store.session, entry.id, topic)
+            except SegmentError as error:
+                output.note(f"{entry.label}: {error}")
+    return found
+
+
 def _as_dict(
-    entry: RecordingEntry, attachments: list[StoredAttachment], metadata: list[StoredMetadata]
+    entry: RecordingEntry,
+    attachments: list[StoredAttachment],
+    metadata: list[StoredMetadata],
+    videos: Mapping[str, VideoSummary],
 ) -> dict[str, Any]:
     from hybridlog.entries import summary_of
 
@@ -153,6 +179,7 @@ def _as_dict(
                 "surplus": c.stats.surplus if entry.is_decoded else None,
                 "not_indexed": c.unindexed,
                 "metadata": c.metadata,
+                "video": asdict(videos[c.topic]) if c.topic in videos else None,
             }
             for c in entry.channels
         ],
@@ -184,6 +211,8 @@ def _print_recording(
     index: str | None,
     attachments: list[StoredAttachment],
     metadata: list[StoredMetadata],
+    *,
+    videos: Mapping[str, VideoSummary],
     drawn: Density | None,
 ) -> None:
     from hybridlog.entries import summary_of
@@ -237,7 +266,10 @@ def _print_recording(
 
     def rows_with(*, short: bool) -> list[list[str]]:
         known = entry.is_decoded
-        return [_channel_row(c, is_decoded=known, narrow=narrow, short=short) for c in channels]
+        return [
+            _channel_row(c, is_decoded=known, narrow=narrow, short=short, video=videos.get(c.topic))
+            for c in channels
+        ]
 
     cells = rows_with(short=narrow)
     if drawn is not None:
@@ -310,7 +342,12 @@ def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
 
 
 def _channel_row(
-    channel: ChannelEntry, *, is_decoded: bool, narrow: bool, short: bool
+    channel: ChannelEntry,
+    *,
+    is_decoded: bool,
+    narrow: bool,
+    short: bool,
+    video: VideoSummary | None = None,
 ) -> list[str]:
     from hybridlog.query.latching import depth_of
     from hybridlog.schema.states import State, state_of
@@ -331,6 +368,8 @@ def _channel_row(
         notes.append("fields only")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
+    if video is not None:
+        notes.append(_video_text(video, stats.messages))
     skew = "-" if is_decoded else "?"
     if stats.stamped:
         skew = output.short_duration(round(stats.skew_sum / stats.stamped))
@@ -346,6 +385,16 @@ def _channel_row(
     if not narrow:
         cells.insert(4, output.size(stats.payload_bytes))
     return cells
+
+
+def _video_text(video: VideoSummary, messages: int) -> str:
+    frames = "" if video.frames >= messages else f" in the first {video.frames}"
+    keys = output.counted(video.key_frames, "key frame")
+    text = f"{', '.join(video.formats)}, {keys}{frames}" if video.formats else ""
+    if video.unreadable:
+        text = f"{text}; " if text else ""
+        text += f"{output.counted(video.unreadable, 'frame')} of no known video{frames}"
+    return text
 
 
 def _source(source: Mapping[str, Any]) -> str:

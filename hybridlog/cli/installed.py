@@ -19,6 +19,7 @@ NEEDED_FOR: Final = {
     "plot": "plot, except as a page",
     "protobuf": "fields of protobuf messages",
     "sql": "sql",
+    "video": "pictures of video topics",
     "view": "view",
 }
 """What each extra is needed for."""

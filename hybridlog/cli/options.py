@@ -205,12 +205,12 @@ between = click.option(
 no_latched = click.option(
     "--no-latched",
     is_flag=True,
-    help="With --between: leave out the latched messages from before it.",
+    help="With --between: leave out the latched messages and frames of video from before it.",
 )
 original_times = click.option(
     "--original-times",
     is_flag=True,
-    help="Latched messages from before the time range keep their log time.",
+    help="Latched messages and frames from before the time range keep their log time.",
 )
 where = click.option(
     "--where",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from hybridlog.arrays.message_arrays import COMPRESSED_IMAGES, IMAGES, depth_picture, to_numpy
+from hybridlog.arrays.message_arrays import COMPRESSED_IMAGES, IMAGES, depth_picture
 from hybridlog.drawing.pixels import pixels, png
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 
@@ -75,7 +75,7 @@ def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] =
     Raises:
         PayloadError: it is no image, is empty, or does not fit its encoding.
         DefinitionError: no usable definition exists.
-        MissingDependencyError: Pillow is required and not installed.
+        MissingDependencyError: Pillow or PyAV is required and not installed.
     """
     kind = message.type.replace("/msg/", "/")
     if kind not in IMAGES:
@@ -85,7 +85,7 @@ def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] =
         found = _as_it_came(decoded, raw=raw)
         if found is not None:
             return found
-    image = to_numpy(message.type, decoded)
+    image = message.to_numpy()
     deep = raw and form == "png"
     shown = pixels(image, str(getattr(decoded, "encoding", "rgba8")), deep=deep)
     if not shown.size:

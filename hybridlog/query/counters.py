@@ -19,6 +19,7 @@ class Counters:
     Attributes:
         messages: Messages in the answer.
         latched: Latched messages in front of it, which are not in `messages`.
+        frames: Frames of video in front of it, from the key frame on; not in `messages`.
         payload_bytes: Bytes of their payloads.
         bytes_read: Bytes read from segments and tables.
         chunks_read: Chunks read and decompressed.
@@ -33,6 +34,7 @@ class Counters:
 
     messages: int = 0
     latched: int = 0
+    frames: int = 0
     payload_bytes: int = 0
     bytes_read: int = 0
     chunks_read: int = 0

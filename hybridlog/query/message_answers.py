@@ -36,9 +36,11 @@ class MessageAnswers(Steps):
     def __iter__(self) -> Iterator[Message]:
         """The messages, ordered by log time, recording and arrival."""
         from hybridlog.message import messages_in
+        from hybridlog.query.answers.video import picture_of
 
+        picture = picture_of(self.session)
         for run in self._planner().runs():
-            yield from messages_in(run)
+            yield from messages_in(run, picture)
 
     def follow(self, *names: str) -> Following:
         """The messages that running recordings flush from now on, until all of them have ended.
@@ -121,8 +123,9 @@ class MessageAnswers(Steps):
     ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """Latched messages from before the time range that are in force when it begins.
 
-        They are those that a subscriber receives which joins at that time. Their log time is
-        the beginning of the range. Take them before `batches`, and with separate counters.
+        They are those that a subscriber receives which joins at that time, and the frames of
+        video topics from the last key frame on. Their log time is the beginning of the range.
+        Take them before `batches`, and with separate counters.
 
         Args:
             original_times: They keep their own log time.

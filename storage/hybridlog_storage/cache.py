@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar, cast
 
 MAX_BYTES: Final = 224 << 20
 
-Kind: TypeAlias = Literal["chunk", "column", "density", "matches", "recording", "rebuilt"]
+Kind: TypeAlias = Literal["chunk", "column", "density", "matches", "recording", "rebuilt", "videos"]
 Value = TypeVar("Value")
 
 

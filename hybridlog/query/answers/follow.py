@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.message import messages_in
 from hybridlog.query.answers.lost import flush_interval_ns
+from hybridlog.query.answers.video import picture_of
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
 from hybridlog.query.engines.payload_scan import PayloadScan
@@ -82,7 +83,8 @@ class Following(Planner, Iterator["Message"]):
                 self._read[entry.id] = max([0, *map(int, entry.digests), *entry.flushed]), 0
                 _ = [*self._arrivals(entry, None)]
             _ = self.examples, self.ranks  # of this moment
-        self._messages = (message for run in self.runs() for message in messages_in(run))
+        picture = picture_of(session)
+        self._messages = (message for run in self.runs() for message in messages_in(run, picture))
 
     def __next__(self) -> Message:
         """The next message; ends with the recordings."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.message import Documents, Message, messages_in
+from hybridlog.query.answers.video import picture_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import TimeLike, is_relative, parse_time
 from hybridlog_storage.times import END, earlier, span_of
@@ -91,7 +92,7 @@ def _last_of(
         for begin in earlier(latest, start):
             narrow = just_before(question, recording.id, begin, latest)
             for run in Planner(session, narrow, counters).runs():
-                return next(messages_in(run))
+                return next(messages_in(run, picture_of(session)))
         return None
     wanted = set(question.topics)
     channels = {
@@ -127,6 +128,7 @@ def _last_of(
         view=batch.payload(0),
         documents=Documents(channels, batch),
         row=0,
+        picture_of=picture_of(session),
     )
 
 

@@ -1,4 +1,4 @@
-"""Latched messages: those that a subscriber receives which joins when a slice begins."""
+"""Messages in front of a slice: latched ones, and frames of video from the key frame on."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.query.answers.video import begins_anew, is_video
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.counters import Counters
 from hybridlog.query.latching import depth_of, publisher_of
@@ -33,22 +34,26 @@ _FIRST: _Key = (-1, -1)
 def in_force(
     session: Session, question: Question, counters: Counters, *, original_times: bool
 ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
-    """Latched messages from before the time range of a question, which precede its answer.
+    """Messages from before the time range of a question, which precede its answer.
 
+    They are the latched ones that a subscriber receives which joins then, and the frames that
+    the first ones of video refer to: those from the last key frame on.
     Their log time becomes the beginning of the range, which keeps the slice within the
     range. The publish time remains the time at which they were sent.
 
     Args:
         session: The open store.
         question: The question.
-        counters: Count the messages, as `latched`, and what is read.
+        counters: Count the messages, as `latched` and `frames`, and what is read.
         original_times: The messages keep their log time.
     """
     for summary, begin in _beginnings(session, question):
         recording = session.entry_of(summary)
         channels = _latching(session, question, recording)
         for batch, own in _LatchedScan(session, recording, begin, counters).read(channels):
-            counters.latched += len(batch)
+            frames = np.array([is_video(c.channel) for c in own])[batch.channel].sum()
+            counters.frames += int(frames)
+            counters.latched += len(batch) - int(frames)
             if not original_times:
                 has_publish_time = np.array([c.channel.has_publish_time for c in own])
                 batch.publish_time = np.where(
@@ -76,12 +81,13 @@ def _beginnings(session: Session, question: Question) -> Iterator[tuple[Recordin
 def _latching(
     session: Session, question: Question, recording: RecordingEntry
 ) -> list[RecordedChannel]:
-    """The latching channels of a question in a recording."""
+    """The latching channels of a question in a recording, and those of video."""
     wanted = set(question.topics)
     return [
         channel
         for channel in session.channels(recording)
-        if channel.channel.topic in wanted and depth_of(channel.channel)
+        if channel.channel.topic in wanted
+        and (depth_of(channel.channel) or is_video(channel.channel))
     ]
 
 
@@ -114,7 +120,13 @@ class _LatchedScan:
         cuts: list[_Key] = []
         scans: list[RecordingScan] = []
         for group in publishers.values():
-            cut = self._first_in_force(group)
+            if is_video(group[0].channel):
+                found = self._last_key_frame(group)
+                if found is None:
+                    continue
+                cut = found
+            else:
+                cut = self._first_in_force(group)
             scans.append(self._scan(group, cut[0], len(own)))
             own += group
             cuts += [cut] * len(group)
@@ -146,6 +158,15 @@ class _LatchedScan:
             if not left:
                 break
         return cut
+
+    def _last_key_frame(self, group: Sequence[RecordedChannel]) -> _Key | None:
+        """The last key frame of some channels of video; None if there is none."""
+        plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
+        for run in ChunkScan(plan, self._session.segment, ahead=False).runs():
+            for row, index in enumerate(run.batch.channel.tolist()):
+                if begins_anew(run.channels[index], run.batch.payload(row)):
+                    return int(run.batch.log_time[row]), int(run.seq[row])
+        return None
 
     def _scan(self, group: Sequence[RecordedChannel], begin: int, first: int) -> RecordingScan:
         """The scan of some channels from a log time on; their indexes begin with `first`."""

@@ -11,8 +11,10 @@ const accepts = ofTypes(
   "sensor_msgs/Image",
   "sensor_msgs/CompressedImage",
   "foxglove_msgs/CompressedImage",
+  "foxglove_msgs/CompressedVideo",
   "foxglove_msgs/RawImage",
   "foxglove.CompressedImage",
+  "foxglove.CompressedVideo",
   "foxglove.RawImage",
 );
 

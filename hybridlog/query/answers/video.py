@@ -1,0 +1,199 @@
+"""Pictures of video topics, each decoded from the key frame before it, and their key frames."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.arrays.bitstream import frame_of, is_key_frame
+from hybridlog.arrays.message_arrays import VIDEOS
+from hybridlog.arrays.video import VideoDecoder
+from hybridlog.message import messages_in
+from hybridlog.query.answers.lost import lost_times
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Question
+from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.times import BEGIN
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message, PictureOf
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.session import Session
+    from hybridlog_storage.messages import Buffer, Channel
+
+_MAX_OPEN = 4
+_MAX_BYTES = 256 << 20  # between two key frames
+_MAX_LOOKED = 600
+_SIZE = 16 << 20  # of the pictures of some topics, about
+
+
+def is_video(channel: Channel) -> bool:
+    """True if a channel's messages are frames of video."""
+    return channel.schema is not None and channel.schema.name.replace("/msg/", "/") in VIDEOS
+
+
+def begins_anew(channel: RecordedChannel, payload: Buffer) -> bool:
+    """True if a message of a video topic is a key frame."""
+    try:
+        return is_key_frame(*frame_of(channel.codec.decode(memoryview(payload))))
+    except (PayloadError, DefinitionError):
+        return False
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSummary:
+    """The first frames of a video topic.
+
+    Attributes:
+        formats: Their formats, such as `h264`.
+        frames: Number of frames that were looked at.
+        key_frames: Number of key frames among them.
+        unreadable: Number of those that are no video that can be read.
+    """
+
+    formats: tuple[str, ...]
+    frames: int
+    key_frames: int
+    unreadable: int
+
+
+def summary_of(session: Session, recording: str, topic: str) -> VideoSummary:
+    """Codec and key frames of the first 600 frames of a topic.
+
+    Raises:
+        SegmentError: A chunk is damaged.
+    """
+    question = Question((topic,), (recording,), limit=_MAX_LOOKED)
+    formats: set[str] = set()
+    frames = keys = unreadable = 0
+    for run in Planner(session, question, Counters()).runs():
+        for message in messages_in(run):
+            frames += 1
+            try:
+                form, data = frame_of(message.decode())
+            except (PayloadError, DefinitionError):
+                unreadable += 1
+                continue
+            formats.add(form)
+            keys += is_key_frame(form, data)
+    return VideoSummary(tuple(sorted(formats)), frames, keys, unreadable)
+
+
+@dataclass(slots=True)
+class _Playing:
+    """A decoder, and the frame that it has taken last: log time, arrival number, picture."""
+
+    decoder: VideoDecoder
+    place: tuple[int, int]
+    picture: NDArray[Any]
+
+
+class VideoPictures:
+    """Decodes frames of video topics. Those in a row are decoded once each.
+
+    Args:
+        session: The open store.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._lock = threading.Lock()
+        self._playing: OrderedDict[tuple[str, str], _Playing] = OrderedDict()
+
+    def picture(self, message: Message) -> NDArray[Any]:
+        """The picture of a frame, red first; read-only.
+
+        Raises:
+            PayloadError: There is no key frame before it, one between is lost or damaged, or
+                it cannot be decoded.
+            DefinitionError: No usable definition exists.
+            MissingDependencyError: PyAV is not installed.
+        """
+        with self._lock:
+            key, place = (message.recording, message.topic), _place(message)
+            playing = self._playing.pop(key, None)
+            if playing is None or playing.place != place:
+                playing = self._decoded(message, playing)
+                playing.picture.flags.writeable = False
+            self._playing[key] = playing
+            if len(self._playing) > _MAX_OPEN:
+                self._playing.popitem(last=False)
+            return playing.picture
+
+    def _decoded(self, message: Message, playing: _Playing | None) -> _Playing:
+        frames, is_continued = self._frames(message, playing)
+        begin = playing.place[0] if is_continued and playing else frames[0][0]
+        self._check_whole(message, frames[-1][1], begin)
+        decoder = playing.decoder if is_continued and playing else VideoDecoder(frames[0][1])
+        for number, (_, form, data) in enumerate(frames, 1):
+            picture = decoder.decode(form, data, is_wanted=number == len(frames))
+        assert picture is not None
+        return _Playing(decoder, _place(message), picture)
+
+    def _frames(
+        self, message: Message, playing: _Playing | None
+    ) -> tuple[list[tuple[int, str, bytes]], bool]:
+        """Time, format and bytes of the frames to decode, and whether a decoder goes on."""
+        place = _place(message)
+        bounds = (None, message.log_time_ns + 1)
+        question = Question((message.topic,), (message.recording,), bounds, reverse=True)
+        frames: list[tuple[int, str, bytes]] = []
+        size = 0
+        for run in Planner(self._session, question, Counters()).runs():
+            for each in messages_in(run):
+                if _place(each) > place:
+                    continue
+                if playing is not None and _place(each) == playing.place:
+                    if not playing.decoder.is_over:
+                        return frames[::-1], True
+                    playing = None
+                if each.is_reduced:
+                    raise PayloadError(
+                        "a frame of video cannot be decoded: the payload of one between it and "
+                        "the key frame before it was dropped under pressure"
+                    )
+                form, data = frame_of(each.decode())
+                frames.append((each.log_time_ns, form, data))
+                size += len(data)
+                if is_key_frame(form, data):
+                    return frames[::-1], False
+                if size > _MAX_BYTES:
+                    raise PayloadError(
+                        "a frame of video cannot be decoded: there is no key frame in the "
+                        f"{_MAX_BYTES >> 20} MiB before it"
+                    )
+        raise PayloadError("a frame of video cannot be decoded: there is no key frame before it")
+
+    def _check_whole(self, message: Message, form: str, begin: int) -> None:
+        """Refuse a frame that may refer to a lost one.
+
+        Raises:
+            PayloadError: Messages are lost since `begin`, ns.
+        """
+        # Losses are noted from the last message before them to the first one behind them.
+        if begin + 1 < message.log_time_ns:
+            bounds = (begin + 1, message.log_time_ns)
+            question = Question((message.topic,), (message.recording,), bounds)
+            lost = lost_times(self._session, question)
+            # H.264 and H.265 tell themselves what is missing: an unknown time is enough for AV1.
+            if any(form == "av1" or one.begin_ns > BEGIN for one in lost):
+                raise PayloadError(
+                    "a frame of video cannot be decoded: messages are lost between it and the "
+                    "key frame before it"
+                )
+
+
+def picture_of(session: Session) -> PictureOf:
+    """What decodes frames of video of an open store."""
+    made = partial(VideoPictures, session)
+    return lambda m: session.cache.made("videos", make=made, size_of=lambda _: _SIZE).picture(m)
+
+
+def _place(message: Message) -> tuple[int, int]:
+    return message.log_time_ns, message.seq
