@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
+    from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.question import Clock, Question
     from hybridlog.query.ranges import Resolved
     from hybridlog.session import Session
@@ -170,9 +171,12 @@ class Aligned:
             )
         for stream in streams:
             found += remarks(self._session, stream.question, (), is_empty=False)
-        asked_for = [(stream.question, stream.counters) for stream in streams]
-        found += completeness_of(self._session, *asked_for[0], *asked_for[1:]).sentences
-        return [*dict.fromkeys(found)]
+        return [*dict.fromkeys([*found, *self.completeness().sentences])]
+
+    def completeness(self) -> Completeness:
+        """What the rows lack, as for `Query.completeness`, after they were read."""
+        asked_for = [(stream.question, stream.counters) for stream in self._streams]
+        return completeness_of(self._session, *asked_for[0], *asked_for[1:])
 
     def __repr__(self) -> str:
         names = [name for stream in self._others for name in stream.question.topics]

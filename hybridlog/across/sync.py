@@ -85,6 +85,8 @@ class Synced(Sequence[tuple["Message", ...]]):
             raise UsageError("A set is of two topics or more: name them.")
         if any(not q.returns_all or q.reverse for q in questions):
             raise UsageError("Sets use all messages: leave out limit, every and reverse.")
+        if any(q.frame is not None for q in questions):
+            raise UsageError("Sets are of messages as they came: leave out in_frame.")
         self.topics = tuple(question.topics[0] for question in questions)
         self.counters = Counters()
         self._open_again = open_again

@@ -114,7 +114,13 @@ def align_command(
             for text in predicates:
                 add(opened, queries, text)
         if frame is not None:
-            queries = [query.in_frame(frame) for query in queries]
+            from hybridlog.tf.in_frame import has_places
+
+            placed = [has_places(query) for query in queries]
+            queries = [
+                query.in_frame(frame) if is_placed or not any(placed) else query
+                for query, is_placed in zip(queries, placed, strict=True)
+            ]
         if between is not None:
             queries[0] = queries[0].between(*between)
         if strict:
@@ -133,6 +139,8 @@ def align_command(
         if not quiet:
             print_cost(aligned.counters, time.monotonic() - started, count=False)
             notes(aligned.remarks(base, *topic))
+        if strict:  # that there is a transform shows only now
+            aligned.completeness().check()
 
 
 def _queries(

@@ -27,8 +27,8 @@ class Counters:
         reduced: Messages left out because only their fields were recorded.
         unreadable: Messages of the predicate's topics that do not fit their definition.
         unindexed: Messages of running recordings that the index lacks, if it has answered.
-        no_transform: Reasons why points or poses are not in the frame asked for, and numbers
-            of messages.
+        no_transform: The frame asked for with a reason why points or poses are not in it, and
+            the number of messages; several.
         elapsed_s: Wall time, seconds.
     """
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from hybridlog.message import Message
     from hybridlog.query.counters import Counters
+    from hybridlog.query.query import Query
     from hybridlog.query.question import Question
     from hybridlog.session import Session
     from hybridlog.tf.tree import FrameTree
@@ -89,6 +90,12 @@ def has_points(planner: Planner) -> bool:
         raise UsageError("An answer in a frame is of one topic; `align` takes several.")
     types = {one.channel.schema.name for one in planner.examples if one.channel.schema}
     return bool(types) and all(plain_type(name) in POINT_MAKERS for name in types)
+
+
+def has_places(query: Query) -> bool:
+    """True if messages of a topic have points or poses, with a frame and a time of their own."""
+    planner = Planner(query.session, query.question, query.counters)
+    return has_points(planner) or _places_in(planner) is not None
 
 
 def points_of(session: Session, question: Question, counters: Counters) -> Iterator[Points]:
@@ -157,7 +164,9 @@ class _Looked:
             found = tree.lookup(self._target, frame, times[rows])
             made.translation[rows], made.rotation[rows] = found.translation, found.rotation
             missing.update(found.missing)
-        self._counters.no_transform += tuple(missing.items())
+        self._counters.no_transform += tuple(
+            (f"to {self._target}: {why}", count) for why, count in missing.items()
+        )
         return made
 
 
@@ -190,18 +199,26 @@ def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
         yield pa.table({"log_time": pa.array([], stamp)})
 
 
-def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
-    session, question = planner.session, planner.question
-    looked = _Looked(session, question, planner.counters)
-    known = session.field_types(question.topics, question.recordings) or {}
+def _places_in(planner: Planner) -> tuple[list[_Pose], str, str] | None:
+    """The poses of a topic, and the paths of their time and their frame; None without."""
+    question = planner.question
+    known = planner.session.field_types(question.topics, question.recordings) or {}
     poses = [*_poses_among(known)]
     stamp = next((name for name in _STAMPS if name in known), None)
     frame = next((name for name in _FRAMES if name in known), None)
-    if not poses or stamp is None or frame is None:
+    return None if not poses or stamp is None or frame is None else (poses, stamp, frame)
+
+
+def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
+    session, question = planner.session, planner.question
+    looked = _Looked(session, question, planner.counters)
+    found = _places_in(planner)
+    if found is None:
         raise UsageError(
             f"{question.topics[0]} has no points or poses with a frame and a time of their own, "
             "so it cannot be in another frame."
         )
+    poses, stamp, frame = found
     several = question.names_recording or len(session.chosen(question)) > 1
     plain = replace(question, frame=None)
     asked, hidden = question.fields, set() if several else {"recording"}

@@ -95,6 +95,14 @@ def test_scans_of_a_real_log(demo: Path, store: hl.Store, tmp_path: Path) -> Non
     assert "before the first transform of" in said
     with pytest.raises(IncompleteError, match="without a transform"):
         query.completeness().check()
+    aligned = ("align", "--to", "scan", "-t", "temperature", "-r", "tilt", "-F", "jsonl")
+    done = run(*aligned, "--in-frame", "tilt_base", store=demo / "store")
+    assert said in done.err
+    rows = [json.loads(line) for line in done.out.splitlines()]
+    assert rows[-1]["scan.x"] == table["x"][-1].as_py()
+    assert rows[-1]["temperature.reading"] is not None
+    done = run(*aligned, "--in-frame", "tilt_base", "--strict", store=demo / "store", code=11)
+    assert "without a transform" in done.err
 
 
 def test_poses_of_many_rows(demo: Path, store: hl.Store) -> None:
@@ -156,3 +164,5 @@ def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:
         store.recordings("robot").topic("battery").in_frame("map").to_arrow()
     with pytest.raises(UsageError, match="of one topic"):
         store.recordings("robot").topic("odom", "scan").in_frame("map").to_arrow()
+    with pytest.raises(UsageError, match="as they came: leave out in_frame"):
+        store.sync([store.topic("odom").in_frame("map"), "scan"])

@@ -146,7 +146,7 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     for why, number in counters.no_transform:
         reasons[why] += number
     for why, number in reasons.items():
-        yield f"{counted(number, 'message')} without a transform to {question.frame}: {why}."
+        yield f"{counted(number, 'message')} without a transform {why}."
 
 
 def _unreadable(messages: int, question: Question) -> str:
