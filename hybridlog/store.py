@@ -452,7 +452,7 @@ class Store:
 
     @of_one_moment
     def check(self, recording: Texts = None) -> list[TopicCheck]:
-        """How regularly the topics of recordings came, the worst first; see `Query.check`.
+        """Check how regularly the topics of recordings came, the worst first; see `Query.check`.
 
         Args:
             recording: Label, name, id or glob; None for all recordings.
@@ -490,7 +490,7 @@ class Store:
         tolerance: float = 0.0,
         contract: Contract | None = None,
     ) -> list[Difference]:
-        """What differs between two recordings, or two choices of recordings, by topic.
+        """Compare two recordings, or two choices of recordings, by topic.
 
         Args:
             a: Label, name, id or glob; several recordings are compared together.

@@ -174,7 +174,7 @@ class Aligned:
         return [*dict.fromkeys([*found, *self.completeness().sentences])]
 
     def completeness(self) -> Completeness:
-        """What the rows lack, as for `Query.completeness`, after they were read."""
+        """Return what the rows lack, as `Query.completeness` does, after they were read."""
         asked_for = [(stream.question, stream.counters) for stream in self._streams]
         return completeness_of(self._session, *asked_for[0], *asked_for[1:])
 

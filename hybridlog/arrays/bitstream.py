@@ -1,4 +1,4 @@
-"""What the headers of compressed video say: key frames, and whether a frame follows another.
+"""Headers of compressed video: key frames, and whether a frame follows another.
 
 The bytes are untrusted. At most `_MAX_UNITS` headers of a frame are looked at, and the few bits
 behind them.

@@ -235,7 +235,7 @@ POINT_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
 
 
 def positions(points: NDArray[Any]) -> NDArray[np.float64]:
-    """Where points are: float64[..., 3], m; those of a scan in its plane.
+    """Positions of points: float64[..., 3], m; those of a scan in its plane.
 
     Args:
         points: Records with `x`, `y` and `z`, or with `range` and `angle`.

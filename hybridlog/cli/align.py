@@ -114,9 +114,10 @@ def align_command(
             for text in predicates:
                 add(opened, queries, text)
         if frame is not None:
+            from hybridlog.query.planner import Planner
             from hybridlog.tf.in_frame import has_places
 
-            placed = [has_places(query) for query in queries]
+            placed = [has_places(Planner(q.session, q.question, q.counters)) for q in queries]
             queries = [
                 query.in_frame(frame) if is_placed or not any(placed) else query
                 for query, is_placed in zip(queries, placed, strict=True)

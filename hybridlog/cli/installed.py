@@ -1,4 +1,4 @@
-"""What is installed, and what is missing for which command: `--version --all`."""
+"""`--version --all`: what is installed, and what is missing for which command."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class TopicRules:
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """What a good recording keeps.
+    """Rules that a good recording keeps.
 
     Attributes:
         topics: Rules by full name of the topic.

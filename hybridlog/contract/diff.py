@@ -43,7 +43,7 @@ class Difference:
 
 
 class _Side:
-    """What is compared of some recordings together."""
+    """Figures of some recordings together, to be compared."""
 
     def __init__(self, recordings: Recordings) -> None:
         self.query: Query = recordings.all_topics()
@@ -56,7 +56,7 @@ class _Side:
             self.fields[row.topic][row.field] = row
 
     def values(self, topic: str) -> dict[str, Value]:
-        """What a topic is like, by name; durations in ns."""
+        """Figures of a topic, by name; durations in ns."""
         ones = self.topics[topic]
         rated = [one for one in ones if one.rate_hz]
         steps = sum(one.messages - 1 for one in rated)
@@ -81,7 +81,7 @@ def diff(
     tolerance: float = 0.0,
     contract: Contract | None = None,
 ) -> list[Difference]:
-    """What differs between two choices of recordings, by topic.
+    """Differences between two choices of recordings, by topic.
 
     Args:
         session: The open store.
@@ -145,7 +145,7 @@ def _of_fields(
 
 
 def _broken(session: Session, contract: Contract, side: _Side) -> dict[tuple[str, str, str], str]:
-    """What the recordings have where they break rules, by topic, rule and what it wants."""
+    """Values of the recordings where they break rules, by topic, rule and what it wants."""
     results = [one for summary in side.summaries for one in judge(session, contract, summary)]
     return {(one.topic, one.rule, one.wanted): one.found for one in broken(results)}
 

@@ -90,7 +90,7 @@ class _Judge:
                 yield self._result(name, "messages", "some", "none", holds=False)
 
     def _beyond(self) -> int:
-        """How long a recorder saw a silence that lasted beyond the last message, ns."""
+        """The silence behind the last message, as a recorder saw it, ns."""
         end = self._summary.extent[1]
         ends = [
             one.end or 0

@@ -75,7 +75,7 @@ class RecordedChunks:
         )
 
     def _has_grown(self, number: int, before: ChunkTable) -> bool:
-        """Whether a segment has its chunks of before, and maybe more; it may be sealed now."""
+        """True if a segment has its chunks of before, and maybe more; it may be sealed now."""
         recording = self._recording
         if number not in recording.flushed and str(number) not in recording.digests:
             return False

@@ -103,7 +103,7 @@ class BoundsFinder:
         self._known: dict[str, dict[str, Ends]] = {}
 
     def of(self, parts: Collection[Part]) -> Found:
-        """What is to be found for some parts with the same topics and types."""
+        """Bounds to be found for some parts with the same topics and types."""
         return Found(self, [one for one in self._fields if self._lacks(one, parts)])
 
     def _lacks(self, asked: Field, parts: Collection[Part]) -> bool:

@@ -146,7 +146,7 @@ class TableAnswers(Steps):
 
     @of_one_moment
     def check(self) -> list[TopicCheck]:
-        """How regularly the topics came: rate, jitter, gap, late start, early stop, losses.
+        """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
 
         Returns:
             One for each recording and topic, also for topics without messages; those that were

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from hybridlog.message import Message
     from hybridlog.query.counters import Counters
-    from hybridlog.query.query import Query
     from hybridlog.query.question import Question
     from hybridlog.session import Session
     from hybridlog.tf.tree import FrameTree
@@ -92,9 +91,8 @@ def has_points(planner: Planner) -> bool:
     return bool(types) and all(plain_type(name) in POINT_MAKERS for name in types)
 
 
-def has_places(query: Query) -> bool:
+def has_places(planner: Planner) -> bool:
     """True if messages of a topic have points or poses, with a frame and a time of their own."""
-    planner = Planner(query.session, query.question, query.counters)
     return has_points(planner) or _places_in(planner) is not None
 
 

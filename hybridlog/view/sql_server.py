@@ -1,4 +1,4 @@
-"""What the process does that answers SQL for the page."""
+"""The process that answers SQL for the page."""
 
 from __future__ import annotations
 

@@ -487,7 +487,7 @@ class Described:
 
 @dataclass(slots=True)
 class _Part:
-    """What is known of a part: its list.
+    """The list of a part.
 
     Attributes:
         version: As of the folder; empty before it was read again.

@@ -66,7 +66,7 @@ def is_of_another(store: str, data: bytes) -> bool:
 
 @dataclass(slots=True)
 class PartContent:
-    """What a part has.
+    """The content of a part.
 
     Attributes:
         rows: For each recording, by id, its texts by kind.

@@ -59,7 +59,7 @@ def touches(windows: NDArray[np.int64], first: int, last: int) -> bool:
 
 
 def inside(times: NDArray[np.int64], windows: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which times, ns, lie in any of some windows, as for `touches`."""
+    """True for times, ns, that lie in any of some windows, as for `touches`."""
     times = placed(times)
     found = windows[:, 1].searchsorted(times, "right")
     known = found < len(windows)

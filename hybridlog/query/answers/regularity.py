@@ -1,4 +1,4 @@
-"""How regularly the messages of topics came: rates, gaps, jitter, late starts, losses."""
+"""Regularity of topics: rates, gaps, jitter, late starts, losses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TopicCheck:
-    """How regularly the messages of a topic came in a recording, or in a range of it.
+    """Regularity of a topic in a recording, or in a range of it.
 
     Attributes:
         recording: Label of the recording.
@@ -71,7 +71,7 @@ class TopicCheck:
 
 
 def check(session: Session, question: Question, counters: Counters) -> list[TopicCheck]:
-    """How regularly topics came, the worst first; see `Query.check`."""
+    """Regularity of topics, the worst first; see `Query.check`."""
     lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
     for row in completeness_of(session, question).rows:
         lost[row["recording"], row["topic"]].append(row["count"])

@@ -190,7 +190,7 @@ class VideoPictures:
 
 
 def picture_of(session: Session) -> PictureOf:
-    """What decodes frames of video of an open store."""
+    """Decodes frames of video of an open store."""
     made = partial(VideoPictures, session)
     return lambda m: session.cache.made("videos", make=made, size_of=lambda _: _SIZE).picture(m)
 

@@ -1,4 +1,4 @@
-"""What a playback sends: messages from any time on, those that are current, and its clock."""
+"""Content of a playback: messages from any time on, those that are current, and its clock."""
 
 from __future__ import annotations
 

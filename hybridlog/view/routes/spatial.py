@@ -1,4 +1,4 @@
-"""What is drawn in space: images, scans and clouds, tracks on the map."""
+"""Content of panels in space: images, scans and clouds, tracks on the map."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ _PASSED: Final = frozenset({Opcode.HEADER, Opcode.METADATA_INDEX, PADDING_OPCODE
 
 
 class Flushed(NamedTuple):
-    """What a segment has at one moment, as the summary of a sealed one says it.
+    """Content of a segment at one moment, as the summary of a sealed one says it.
 
     Attributes:
         table: Its chunks.
@@ -158,7 +158,7 @@ class OpenSegment:
 
     @property
     def flushed(self) -> Flushed:
-        """What it has so far."""
+        """Its content so far."""
         if self._flushed is None:
             parts = np.concatenate([np.empty(0, PART), *self._parts_so_far])
             self._parts_so_far = [parts]
