@@ -179,7 +179,8 @@ class Message:
                 it refers to is missing.
             MissingDependencyError: Pillow or PyAV is required and not installed.
         """
-        from hybridlog.arrays.message_arrays import VIDEOS, to_numpy
+        from hybridlog.arrays import VIDEOS
+        from hybridlog.arrays.message_arrays import to_numpy
 
         if self._picture_of is not None and self.type.replace("/msg/", "/") in VIDEOS:
             return self._picture_of(self)

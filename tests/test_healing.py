@@ -606,5 +606,5 @@ def test_damaged_tables_are_made_again(store: Path, way: str) -> None:
         }[way]()
     done = run(*question, store=store)
     assert done.out == want.out
-    assert done.err == "2 tables made again: missing or damaged.\n"
+    assert done.err == "4 tables made again: missing or damaged.\n"
     assert run(*question, store=store) == want

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns.payload_files import WalkedSegment
 from hybridlog.demo.write import write_bag
-from hybridlog.maintenance import index
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -213,18 +213,18 @@ def test_a_store_is_adopted_where_mongodb_is(
         for name in ("one", "two"):
             store.record(bag, name=name, again=True, settings=SMALL)
         chunks = {entry.label: entry.chunks for entry in store.recordings()}
-    read = index._chunks
+    read = WalkedSegment.chunks
     left = [chunks["one"] + chunks["two"] // 2]
 
-    def some(*args: Any, **options: Any) -> Any:
-        for one in read(*args, **options):
+    def some(segment: WalkedSegment, *args: Any) -> Any:
+        for one in read(segment, *args):
             if not left[0]:
                 raise StoreError("killed")
             left[0] -= 1
             yield one
 
     with hl.open(path, mongo=EMBEDDED) as store, monkeypatch.context() as patch:
-        patch.setattr(index, "_chunks", some)
+        patch.setattr(WalkedSegment, "chunks", some)
         with pytest.raises(StoreError, match="killed"):
             store.connect()
     with hl.open(path, mongo=EMBEDDED) as store:

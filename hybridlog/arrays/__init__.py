@@ -1,1 +1,8 @@
 """Messages, images and points as numpy arrays."""
+
+from __future__ import annotations
+
+from typing import Final
+
+VIDEOS: Final = frozenset(("foxglove.CompressedVideo", "foxglove_msgs/CompressedVideo"))
+"""Types of messages with a frame of video, without `/msg/`."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from hybridlog.arrays import VIDEOS
 from hybridlog.arrays.array_views import MAX_EMPTY, byte_array, check_rows, view_of
 from hybridlog.arrays.point_arrays import POINT_MAKERS
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
@@ -226,8 +227,6 @@ COMPRESSED_IMAGES: Final = frozenset(
 )
 """Types of messages with a picture in a file format, without `/msg/`."""
 _RAW_IMAGES = ("sensor_msgs/Image", "foxglove.RawImage", "foxglove_msgs/RawImage")
-VIDEOS: Final = frozenset(("foxglove.CompressedVideo", "foxglove_msgs/CompressedVideo"))
-"""Types of messages with a frame of video, without `/msg/`."""
 IMAGES: Final = COMPRESSED_IMAGES.union(_RAW_IMAGES, VIDEOS)
 """Types of messages with a picture, without `/msg/`."""
 _MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {

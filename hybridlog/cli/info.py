@@ -134,7 +134,8 @@ def _is_segment(what: str) -> bool:
 
 def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
     """Codec and key frames of video topics, by topic; none of those that cannot be read."""
-    from hybridlog.query.answers.video import is_video, summary_of
+    from hybridlog.query.answers.video import summary_of
+    from hybridlog.query.latching import is_video
 
     found: dict[str, VideoSummary] = {}
     for channel in store.session.channels(entry):

@@ -7,6 +7,7 @@ from collections.abc import Hashable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.arrays import VIDEOS
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 
 if TYPE_CHECKING:
@@ -30,6 +31,11 @@ def depth_of(channel: Channel) -> int:
     if metadata.get("latching", "").lower() in {"1", "true"}:
         return 1
     return _offered_depth(metadata.get("offered_qos_profiles", ""))
+
+
+def is_video(channel: Channel) -> bool:
+    """True if a channel's messages are frames of video."""
+    return channel.schema is not None and channel.schema.name.replace("/msg/", "/") in VIDEOS
 
 
 def publisher_of(channel: Channel) -> Hashable:

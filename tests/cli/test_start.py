@@ -247,7 +247,7 @@ UNNEEDED = {
 @pytest.mark.parametrize(
     ("wanted", "most"),
     # A slice parses definitions, to complete them.
-    [(("--count",), 111), (("-F", "raw"), 111), (("-F", "mcap"), 124)],
+    [(("--count",), 113), (("-F", "raw"), 113), (("-F", "mcap"), 130)],
 )
 def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     wanted: tuple[str, ...], most: int, store: Path

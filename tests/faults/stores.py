@@ -18,6 +18,7 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog.columns.folders import recordings_of
 from hybridlog.columns.layout import PARTS
+from hybridlog.entries import take_inventory
 from hybridlog.maintenance.lease import place_of
 from hybridlog.maintenance.opening import describe_now
 from hybridlog.record.losses import losses_of
@@ -357,12 +358,12 @@ def _check_catalog(store: hl.Store) -> None:
         row = rows.get(described.entry.id)
         _check(row is not None, f"{label} is not in the catalog")
         _check(row == (described.files, described.entry), f"the catalog's row of {label} differs")
-        summary = next(one for one in store.catalog.summaries() if one.id == described.entry.id)
-        same = summary._replace(indexed_by="") == described.summary
+        known = next(one for one in store.catalog.summaries() if one.id == described.entry.id)
+        same = known._replace(indexed_by="") == described.summary
         _check(same, f"the catalog's summary of {label} differs")
-        for number, table in described.tables.items():
-            kept = store.catalog.table(described.entry, number)
-            _check(kept.to_bytes() == table.to_bytes(), f"the chunks of {label} {number} differ")
+        for number, summary in take_inventory(store.directory, label).summaries.items():
+            found, wanted = store.catalog.table(described.entry, number), summary.table
+            _check(found.to_bytes() == wanted.to_bytes(), f"the chunks of {label} {number} differ")
 
 
 def look_quietly(case: Case) -> State | None:

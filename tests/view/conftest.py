@@ -109,9 +109,12 @@ def installed() -> Chromium:
     return found
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser(installed: Chromium) -> Iterator[Browser]:
-    """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`."""
+    """A real browser. Tests that use it are marked `@pytest.mark.peer("browser")`.
+
+    While it is open, an event loop runs in this thread, and other files' tests can have none.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
 
@@ -20,6 +20,7 @@ from hybridlog.view import context
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask
 from hybridlog.view.server import make_app
+from hybridlog_storage.cache import Kind
 from hybridlog_storage.messages import Channel
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
@@ -58,6 +59,12 @@ def test_a_question_that_is_given_up_stops(
     assert_stops(demo_store, monkeypatch, path, QUESTIONS[path])
 
 
+def forget(store: hl.Store) -> None:
+    """Other tests may have asked the same."""
+    for kind in get_args(Kind):
+        store.session.cache.drop(kind)
+
+
 def assert_stops(
     store: hl.Store,
     monkeypatch: pytest.MonkeyPatch,
@@ -66,6 +73,7 @@ def assert_stops(
     module: str = "",
 ) -> None:
     """The client leaves when a module, or any, is about to read."""
+    forget(store)
     leaves = threading.Event()
 
     class Watched(threading.Event):
@@ -102,6 +110,7 @@ def test_reading_payloads_is_given_up(
 
 
 def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> None:
+    forget(demo_store)
     app = make_app(demo_store, Admission(token=TOKEN, port=PORT))
     shared: context.Context = app._app.state.context
     with ExitStack() as held:

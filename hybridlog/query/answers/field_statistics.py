@@ -15,7 +15,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.kinds import NUMBERS
 from hybridlog.schema.summary import Totals
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import DefinitionError, UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -136,11 +136,14 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         snapshot = session.look(one.recordings)
         having = {snapshot.summaries[place].id for place in session.chosen(one).tolist()}
         running: dict[str, _Running] = {}
-        for recording in recordings:
-            if recording in having:
+        try:
+            for recording in filter(having.__contains__, recordings):
                 part = replace(one, recordings=(recording,))
                 for name, column in _columns(session, part, counters):
                     running.setdefault(name, _Running()).add(column)
+        except DefinitionError:
+            if question.fields is not None or len(question.topics) == 1:
+                raise  # otherwise, those of the topics that have fields
         found += [values.result(topic, name) for name, values in running.items()]
     if question.fields is not None and not found:
         raise UsageError(f"{', '.join(question.fields)}: no field with numbers.")

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.answers.video import begins_anew, is_video
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.counters import Counters
-from hybridlog.query.latching import depth_of, publisher_of
+from hybridlog.query.latching import depth_of, is_video, publisher_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 
@@ -161,6 +160,8 @@ class _LatchedScan:
 
     def _last_key_frame(self, group: Sequence[RecordedChannel]) -> _Key | None:
         """The last key frame of some channels of video; None if there is none."""
+        from hybridlog.query.answers.video import begins_anew
+
         plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
         for run in ChunkScan(plan, self._session.segment, ahead=False).runs():
             for row, index in enumerate(run.batch.channel.tolist()):

@@ -9,7 +9,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.arrays.bitstream import frame_of, is_key_frame
-from hybridlog.arrays.message_arrays import VIDEOS
 from hybridlog.arrays.video import VideoDecoder
 from hybridlog.message import messages_in
 from hybridlog.query.answers.lost import lost_times
@@ -25,17 +24,12 @@ if TYPE_CHECKING:
     from hybridlog.message import Message, PictureOf
     from hybridlog.query.question import RecordedChannel
     from hybridlog.session import Session
-    from hybridlog_storage.messages import Buffer, Channel
+    from hybridlog_storage.messages import Buffer
 
 _MAX_OPEN = 4
 _MAX_BYTES = 256 << 20  # between two key frames
 _MAX_LOOKED = 600
 _SIZE = 16 << 20  # of the pictures of some topics, about
-
-
-def is_video(channel: Channel) -> bool:
-    """True if a channel's messages are frames of video."""
-    return channel.schema is not None and channel.schema.name.replace("/msg/", "/") in VIDEOS
 
 
 def begins_anew(channel: RecordedChannel, payload: Buffer) -> bool:
