@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.marks import marks_in
@@ -22,7 +23,6 @@ from hybridlog.record.marks import CONTRACT
 from hybridlog_storage.errors import WhereError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.contract.contract import Contract, TopicRules
@@ -130,8 +130,8 @@ class _Judge:
         for table in Query(self._session, self._question(topic)).fields("stamp").to_tables():
             rows = table.select(["log_time", "stamp"]).drop_null()
             if rows.num_rows:
-                stamp = _ns(rows["stamp"])
-                age = _ns(rows["log_time"]) - stamp
+                stamp = rows["stamp"].cast("int64").to_numpy()
+                age = rows["log_time"].cast("int64").to_numpy() - stamp
                 low, high = int(age.min()), int(age.max())
                 least = low if least is None else min(least, low)
                 greatest = high if greatest is None else max(greatest, high)
@@ -154,7 +154,8 @@ class _Judge:
         times = self._times(one.topic) if rules.offset else np.empty(0, np.int64)
         for other, limit in rules.offset.items():
             others = self._times(other) if other in self._known else times[:0]
-            far = int((nearest(times, others) > limit).sum()) if len(others) else len(times)
+            matched = match(times, others, "nearest", None)
+            far = int((np.abs(matched.distance) > limit).sum()) if len(others) else len(times)
             found = f"{far} of {len(times)} messages are farther"
             wanted = f"{other} within {format_duration(limit)}"
             yield self._result(one.topic, "offset", wanted, found, holds=not far)
@@ -189,19 +190,6 @@ class _Judge:
 
     def _question(self, *topics: str) -> Question:
         return Question(*self._session.having(topics, [self._summary.id]))
-
-
-def nearest(times: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Distance from each of some times to the nearest of others, ascending and not empty, ns."""
-    after = np.searchsorted(others, times)
-    low, high = others[np.maximum(after - 1, 0)], others[np.minimum(after, len(others) - 1)]
-    found: NDArray[np.int64] = np.minimum(abs(times - low), abs(high - times))
-    return found
-
-
-def _ns(column: pa.ChunkedArray[pa.Scalar]) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = column.combine_chunks().view("int64").to_numpy()
-    return found
 
 
 def broken(results: Sequence[Result]) -> list[Result]:

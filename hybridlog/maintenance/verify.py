@@ -357,17 +357,19 @@ class _Check:
 
         While it is recorded, what was decoded since the entry was made may be missing.
         """
-        known = self._catalog.recording(entry.id)
-        if known is None or not is_open:
-            return known is not None and known[1] == entry
-        return _not_decoded(known[1]) == _not_decoded(entry)
+        row = self._catalog.recording(entry.id)
+        if row is None:
+            return False
+        return row[1] == entry or (is_open and _not_decoded(row[1]) == _not_decoded(entry))
 
     def _row(self, entry: RecordingEntry, *, is_open: bool) -> None:
         """Check the catalog's row and its chunk tables."""
-        if self._catalog.recording(entry.id) is None:
-            self.found("catalog", "the recording is missing", _REPAIR)
-        elif not self._is_noted(entry, is_open=is_open):
-            self.found("catalog", "its entry differs from the files", _REPAIR)
+        if not self._is_noted(entry, is_open=is_open):
+            is_missing = self._catalog.recording(entry.id) is None
+            problem = (
+                "the recording is missing" if is_missing else "its entry differs from the files"
+            )
+            self.found("catalog", problem, _REPAIR)
         for number, _, _ in entry.spans:
             try:
                 self._catalog.table(entry, number)
