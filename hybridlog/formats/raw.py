@@ -17,9 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hybridlog.formats.writing import BatchWriter, FileWriter, Sink, Target, failures
-from hybridlog_storage.disk.unfinished import beside
-from hybridlog_storage.errors import UsageError
+from hybridlog.formats.writing import BatchWriter, FileWriter, Sink, Target, failures, new_directory
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
@@ -85,14 +83,8 @@ class DirectoryWriter(FileWriter):
         super().__init__()
         self._name = os.fspath(target)
         with failures(self._name):
-            self._final = Path(os.path.realpath(target))
-            if self._final.exists() and not self._final.is_dir():
-                raise UsageError(f"{target} is a file; messages go into a directory")
-            if self._final.is_dir() and next(self._final.iterdir(), None) is not None:
-                raise UsageError(f"{target} is not empty; name a directory that does not exist")
-            self._unfinished = beside(self._final)
+            self._final, self._unfinished = new_directory(target, "messages go into a directory")
             self._temporary = self._unfinished.path
-            self._temporary.mkdir()
             self._index = (self._temporary / INDEX).open("x", encoding="ascii")
         self._last: dict[str, tuple[int, int]] = {}
 

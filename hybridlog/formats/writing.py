@@ -301,6 +301,27 @@ def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
     return path, path.is_file() or not path.exists()
 
 
+def new_directory(target: str | os.PathLike[str], content: str) -> tuple[Path, Unfinished]:
+    """A directory to write, with links resolved, and the unfinished one that will replace it.
+
+    Args:
+        target: The directory; it must be missing or empty.
+        content: What it is to hold, for messages.
+
+    Raises:
+        UsageError: It is a file, or not empty.
+        OSError: It cannot be made.
+    """
+    path = Path(os.path.realpath(target))
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{target} is a file; {content}")
+    if path.is_dir() and next(path.iterdir(), None) is not None:
+        raise UsageError(f"{target} is not empty; name a directory that does not exist")
+    unfinished = beside(path)
+    unfinished.path.mkdir()
+    return path, unfinished
+
+
 @contextlib.contextmanager
 def failures(name: str) -> Iterator[None]:
     """Map system errors while writing `name` to hybridlog errors, except a broken pipe."""

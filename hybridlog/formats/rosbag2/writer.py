@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
@@ -14,9 +13,8 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hybridlog.formats.mcap.writer import McapWriter
 from hybridlog.formats.rosbag2.directory import NAME
-from hybridlog.formats.writing import FileWriter, Target, failures
+from hybridlog.formats.writing import FileWriter, Target, failures, new_directory
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
-from hybridlog_storage.disk.unfinished import beside
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -86,13 +84,7 @@ class Rosbag2Writer(FileWriter):
         self._name = os.fspath(target)
         self._max_file = max_file
         with failures(self._name):
-            self._final = Path(os.path.realpath(target))
-            if self._final.exists() and not self._final.is_dir():
-                raise UsageError(f"{target} is a file; a bag of ROS 2 is a directory")
-            if self._final.is_dir() and next(self._final.iterdir(), None) is not None:
-                raise UsageError(f"{target} is not empty; name a directory that does not exist")
-            self._unfinished = beside(self._final)
-            self._unfinished.path.mkdir()
+            self._final, self._unfinished = new_directory(target, "a bag of ROS 2 is a directory")
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._known: dict[Channel, _Topic] = {}
         self._files: dict[str, _Span] = {}
