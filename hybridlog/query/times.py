@@ -220,6 +220,16 @@ def parse_duration(text: DurationLike) -> int:
     return ns
 
 
+def decoded_time(value: object) -> int | None:
+    """A time in the fields of a message, ns; JSON has seconds and nanoseconds. None for others."""
+    if isinstance(value, dict):
+        parts = value.get("sec", 0), value.get("nsec", 0)
+        if not all(isinstance(part, int) for part in parts):
+            return None
+        value = parts[0] * 10**9 + parts[1]
+    return value if isinstance(value, int) and BEGIN <= value <= END else None
+
+
 def format_time(ns: int) -> str:
     """A time as ISO 8601 in UTC, the fraction without trailing zeros.
 

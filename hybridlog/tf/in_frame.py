@@ -19,6 +19,7 @@ from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
 from hybridlog.frames import answer
 from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
+from hybridlog.query.times import decoded_time
 from hybridlog.tf.reader import frame_tree
 from hybridlog.tf.transform import Transform
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
@@ -316,10 +317,8 @@ def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:
 
 
 def _stamp_of(message: Message) -> int:
-    value = _field(message, _STAMPS)
-    if isinstance(value, dict):  # JSON has seconds and nanoseconds
-        value = int(value.get("sec", 0)) * 10**9 + int(value.get("nsec", 0))
-    return value if isinstance(value, int) else message.log_time_ns
+    stamp = decoded_time(_field(message, _STAMPS))
+    return message.log_time_ns if stamp is None else stamp
 
 
 def _field(message: Message, paths: Sequence[str]) -> Any:

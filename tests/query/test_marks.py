@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import foxglove
@@ -13,6 +14,8 @@ from foxglove.messages import Event, KeyValuePair, Log, Timestamp
 from starlette.testclient import TestClient
 
 import hybridlog as hl
+from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.counters import Counters
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage import journal
@@ -105,3 +108,23 @@ def test_a_mark_ends_after_it_begins(store: hl.Store) -> None:
     state = journal.parse(b"\n".join([*lines, journal.encode(wrong).strip()]) + b"\n")
     assert state.damaged == [len(lines) + 1]
     assert state.marks == [mark]
+
+
+def test_an_odd_event_is_a_mark_where_its_message_is(tmp_path: Path) -> None:
+    """Times and metadata of JSON that are none are left out."""
+    odd: list[dict[str, Any]] = [
+        {"start_time": {"sec": "x"}, "end_time": [], "metadata": [5, {"key": "name"}]},
+        {"start_time": {"sec": 10**30}, "end_time": 10**30, "metadata": "x"},
+        {"start_time": None, "metadata": [{"key": "name", "value": ["a"]}]},
+    ]
+    event = foxglove.Schema(name="foxglove.Event", encoding="jsonschema", data=b"{}")
+    with foxglove.open_mcap(str(tmp_path / "odd.mcap")):
+        channel = foxglove.Channel("/odd", schema=event, message_encoding="json")
+        for number, value in enumerate(odd):
+            channel.log(json.dumps(value).encode(), log_time=(BEGIN + number) * S)
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        (recording,) = [store.record(tmp_path / "odd.mcap", name="odd").entry.id]
+        found = [*marks_in(store.session, [recording], Counters())]
+    assert [(one.begin, one.end) for one in found] == [
+        ((BEGIN + number) * S, None) for number in range(len(odd))
+    ]

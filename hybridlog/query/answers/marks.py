@@ -9,6 +9,7 @@ from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
+from hybridlog.query.times import decoded_time
 from hybridlog.record.marks import MARK
 from hybridlog_storage.errors import HybridlogError
 
@@ -91,9 +92,9 @@ def _mark_of(message: Message) -> Mark:
         begin, end = message.log_time_ns, fields.get("end")
         text, tags = fields.get("text"), fields.get("tags")
     else:
-        begin, end = _time(fields.get("start_time")), _time(fields.get("end_time"))
-        pairs = fields.get("metadata")
-        pairs = pairs if isinstance(pairs, list) else []
+        begin, end = (decoded_time(fields.get(f"{edge}_time")) for edge in ("start", "end"))
+        found = fields.get("metadata")
+        pairs = [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
         tags = {str(one.get("key")): str(one.get("value")) for one in pairs}
         known = next((tags[name] for name in _NAMES if name in tags), None)
         text = known or ", ".join(f"{key}={value}" for key, value in tags.items())
@@ -106,10 +107,3 @@ def _mark_of(message: Message) -> Mark:
         str(text or ""),
         tags if isinstance(tags, dict) else {},
     )
-
-
-def _time(value: Any) -> int | None:
-    """A time in ns; JSON has seconds and nanoseconds."""
-    if isinstance(value, dict):
-        value = int(value.get("sec", 0)) * 10**9 + int(value.get("nsec", 0))
-    return value if isinstance(value, int) else None
