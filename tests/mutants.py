@@ -548,7 +548,7 @@ FORMAT_2 = [
         ),
         (
             "chunks-of-another-segment-are-believed",
-            'if summary.recording.get("id") != entry.id or summary.whole_digest != key[2]:',
+            'if summary.recording.get("id") != entry.id or summary.whole_digest != digest:',
             "if False:",
             "tests/test_entries.py::test_chunks_of_another_segment_are_refused",
         ),

@@ -9,7 +9,9 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar, cast
 
 MAX_BYTES: Final = 224 << 20
 
-Kind: TypeAlias = Literal["chunk", "column", "density", "matches", "recording", "rebuilt", "videos"]
+Kind: TypeAlias = Literal[
+    "chunk", "column", "density", "matches", "recording", "rebuilt", "table", "videos"
+]
 Value = TypeVar("Value")
 
 
@@ -69,10 +71,11 @@ class Cache:
             self.put(kind, *key, value=found, size=size_of(found))
         return cast("Value", found)
 
-    def drop(self, kind: Kind) -> None:
-        """Forget the values of a kind."""
+    def drop(self, kind: Kind, *begin: Hashable) -> None:
+        """Forget the values of a kind, or those whose keys begin so."""
         with self._lock:
-            for key in [key for key in self._values if key[0] == kind]:
+            wanted = (kind, *begin)
+            for key in [key for key in self._values if key[: len(wanted)] == wanted]:
                 self._remove(key)
 
     def _remove(self, key: tuple[Hashable, ...]) -> None:

@@ -15,7 +15,7 @@ import json
 import math
 import stat
 from base64 import b64decode, b64encode
-from collections import Counter, OrderedDict, defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -28,6 +28,7 @@ from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
 
+from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog_parts import (
     BOUNDS,
     DAMAGE,
@@ -81,7 +82,7 @@ _SCHEMA: Final = "schema-"
 _RECORDINGS: Final = "recordings"
 _TOPICS = RecordingSummary._fields.index("topics")
 _BUSY_S: Final = 1.0
-_CACHED_BYTES: Final = 64 << 20  # of chunk tables
+_MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _MAX_BOUNDED_BYTES: Final = 56 << 10  # of a part from which recordings keep bounds of one kind
 _BOUND_BYTES: Final = 128  # of a line with bounds, about
 _MAX_BOUNDED_PARTS: Final = 256  # parts that are replaced at the end for the sake of bounds
@@ -566,9 +567,7 @@ class Catalog:
         self._damaged: set[int] = set()  # numbers of parts
         # Bounds and the content that they are of, by kind and recording.
         self._noted: dict[str, dict[str, tuple[str, Ends]]] = defaultdict(dict)
-        self._tables: OrderedDict[tuple[str, int, str], tuple[ChunkTable, NDArray[np.void] | None]]
-        self._tables = OrderedDict()
-        self._cached = 0
+        self._tables = Cache(_MAX_TABLES)
         if not in_memory:
             self._folder = DiskFolder(store / CATALOG)
             self._check_folder()
@@ -1103,30 +1102,28 @@ class Catalog:
         """
         if number in entry.flushed:
             return entry.flushed[number].table, None
-        key = entry.id, number, entry.digests.get(str(number), "")
-        with self._lock:
-            cached = self._tables.get(key)
-            if cached is not None:
-                self._tables.move_to_end(key)
-                return cached
+        digest = entry.digests.get(str(number), "")
+        return self._tables.made(
+            "table",
+            entry.id,
+            number,
+            digest,
+            make=lambda: self._read_table(entry, number, digest),
+            size_of=lambda found: _size(found[0]),
+        )
+
+    def _read_table(
+        self, entry: RecordingEntry, number: int, digest: str
+    ) -> tuple[ChunkTable, NDArray[np.void] | None]:
         path = self._store / _RECORDINGS / entry.label / sealed_name(number)
         try:
             with SegmentReader(path, number) as reader:
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
-        if summary.recording.get("id") != entry.id or summary.whole_digest != key[2]:
+        if summary.recording.get("id") != entry.id or summary.whole_digest != digest:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
-        table = summary.table
-        with self._lock:
-            cached = table, self.stamps(entry, number, table)
-            if key not in self._tables:
-                self._tables[key] = cached
-                self._cached += _size(table)
-            while self._cached > _CACHED_BYTES and len(self._tables) > 1:
-                _, (oldest, _) = self._tables.popitem(last=False)
-                self._cached -= _size(oldest)
-        return cached
+        return summary.table, self.stamps(entry, number, summary.table)
 
     def chunk_stats(
         self, entry: RecordingEntry, segment: int, number: int
@@ -1150,11 +1147,10 @@ class Catalog:
     def _forget(self, recording: str | None = None) -> None:
         if recording is None:
             self._noted.clear()
+            self._tables.drop("table")
         else:
             self._drop_noted([recording])
-        for key in [k for k in self._tables if recording in {None, k[0]}]:
-            table, _ = self._tables.pop(key)
-            self._cached -= _size(table)
+            self._tables.drop("table", recording)
 
 
 def _are_topics(kind: str, key: str, text: str) -> bool:
