@@ -12,11 +12,12 @@ from hybridlog.formats.writing import FileWriter, Sink, Target
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
 _TIMES = ("header.stamp", "timestamp", "time", "log_time")
 """Columns with the time of a row, the best first."""
-_POSITIONS = ("position", "translation")
+POSITIONS = ("position", "translation")
+"""Fields with a place. The rotation beside it is of the same place in `_ROTATIONS`."""
 _ROTATIONS = ("orientation", "rotation")
 _FIX = ("latitude", "longitude", "altitude")
 
@@ -71,7 +72,7 @@ class TumWriter(_RowWriter):
     """Writes poses as lines of `time x y z qx qy qz qw`, s and m, which evo reads."""
 
     def _columns(self, names: Sequence[str]) -> list[str]:
-        time, pose = _time_among(names), next(_poses_among(names), None)
+        time, pose = _time_among(names), next(_pose_columns(names), None)
         if time is not None and pose is not None:
             return [time, *pose]
         raise UsageError(
@@ -132,19 +133,25 @@ def _time_among(names: Sequence[str]) -> str | None:
     return next((name for name in _TIMES if name in names), None)
 
 
-def _poses_among(names: Sequence[str]) -> Iterator[list[str]]:
+def _pose_columns(names: Sequence[str]) -> Iterator[list[str]]:
     """Seven columns for each pose, the shortest path first."""
-    known = set(names)
     plain = [*"xyz", "qx", "qy", "qz", "qw"]
-    if known.issuperset(plain):
+    if set(names).issuperset(plain):
         yield plain
-    for name in sorted(names, key=lambda one: (one.count("."), one)):
-        for position, rotation in zip(_POSITIONS, _ROTATIONS, strict=True):
+    for position, rotation in poses_among(names):
+        yield [f"{position}.{axis}" for axis in "xyz"] + [f"{rotation}.{axis}" for axis in "xyzw"]
+
+
+def poses_among(names: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Paths above x, y and z of each pose, and above x, y, z and w of it; the shortest first."""
+    known = set(names)
+    for name in sorted(known, key=lambda one: (one.count("."), one)):
+        for position, rotation in zip(POSITIONS, _ROTATIONS, strict=True):
             if name.endswith(f"{position}.x"):
                 stem = name.removesuffix(f"{position}.x")
-                pose = [f"{stem}{position}.{axis}" for axis in "xyz"]
-                pose += [f"{stem}{rotation}.{axis}" for axis in "xyzw"]
-                if known.issuperset(pose):
+                pose = f"{stem}{position}", f"{stem}{rotation}"
+                numbers = {f"{pose[0]}.{axis}" for axis in "xyz"}
+                if known >= numbers | {f"{pose[1]}.{axis}" for axis in "xyzw"}:
                     yield pose
 
 

@@ -16,6 +16,7 @@ import pyarrow as pa
 
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
+from hybridlog.formats.places import POSITIONS, poses_among
 from hybridlog.frames import answer
 from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 _STAMPS: Final = ("header.stamp", "timestamp")
 _FRAMES: Final = ("header.frame_id", "frame_id", "parent_frame_id")
 _XYZ: Final = ("x", "y", "z")
-_PAIRS: Final = {"position": "orientation", "translation": "rotation"}
 _UNKNOWN: Final = "messages without a frame or a time"
 
 
@@ -61,10 +61,12 @@ class Points(NamedTuple):
 
     Attributes:
         message: The message.
+        stamp: Its header stamp, or its log time without one, ns.
         points: Records with `x`, `y`, `z` (float64), and its further fields; any shape.
     """
 
     message: Message
+    stamp: int
     points: NDArray[Any]
 
 
@@ -107,25 +109,29 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
     """
     looked = _Looked(session, question, counters)
     for run in Planner(session, replace(question, frame=None), counters).runs():
-        found: list[tuple[Message, NDArray[Any]]] = []
+        found: list[tuple[Points, dict[str, object]]] = []
         for message in messages_in(run):
             if message.is_reduced:
                 counters.reduced += 1
                 continue
             try:
-                found.append((message, message.to_numpy()))
+                array, fields = message.to_numpy(), message.fields
             except (PayloadError, DefinitionError):
                 counters.unreadable += 1
-        times = np.array([_stamp_of(one) for one, _ in found], np.int64)
-        frames = [str(_field(one, _FRAMES) or "") for one, _ in found]
-        recordings = [one.recording for one, _ in found]
+                continue
+            stamp = decoded_time(_first_of(fields, _STAMPS))
+            stamp = message.log_time_ns if stamp is None else stamp
+            found.append((Points(message, stamp, array), fields))
+        times = np.array([one.stamp for one, _ in found], np.int64)
+        frames = [str(_first_of(fields, _FRAMES) or "") for _, fields in found]
+        recordings = [one.message.recording for one, _ in found]
         poses = looked.transforms(recordings, frames, times)
-        for row, (message, array) in enumerate(found):
+        for row, (one, fields) in enumerate(found):
             pose = Transform(poses.translation[row], poses.rotation[row])
-            own = message.fields.get("pose")  # of the points, in Foxglove's messages
+            own = fields.get("pose")  # of the points, in Foxglove's messages
             if isinstance(own, dict):
                 pose = pose @ _transform(own)
-            yield Points(message, _moved(array, pose))
+            yield one._replace(points=_moved(one.points, pose))
 
 
 class _Looked:
@@ -178,8 +184,7 @@ def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
     labels = {one.id: one.label for one in summaries}
     stamp = pa.timestamp("ns", "UTC")
     given = False
-    for message, points in points_of(planner.session, question, planner.counters):
-        time = _stamp_of(message)
+    for message, time, points in points_of(planner.session, question, planner.counters):
         own = {
             "log_time": pa.array([message.log_time_ns], stamp),
             **({"recording": pa.array([labels[message.recording]])} if several else {}),
@@ -276,18 +281,15 @@ def _numbers(columns: Mapping[str, Any], path: str, axes: str) -> NDArray[np.flo
 
 def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
     """The poses, points and vectors of a message that are in the frame of its header."""
-    for path in paths:
-        stem, _, last = path.rpartition(".")
-        above, _, word = stem.rpartition(".")
-        if last != "x" or not all(f"{stem}.{axis}" in paths for axis in _XYZ) or "[" in path:
-            continue
-        turn = f"{above}.{_PAIRS.get(word)}".lstrip(".")
-        if word in _PAIRS and all(f"{turn}.{axis}" in paths for axis in "xyzw"):
+    for position, rotation in poses_among(paths):
+        above, _, word = position.rpartition(".")
+        if word in POSITIONS and "[" not in position:
             beside = f"{above.rpartition('.')[0]}.covariance".lstrip(".")
             known = above.endswith("pose") and paths.get(beside, "").endswith("[36]")
-            yield _Pose(stem, turn, beside if known else "", is_vector=False)
-        elif word in {"point", "vector"} and not above:
-            yield _Pose(stem, "", "", is_vector=word == "vector")
+            yield _Pose(position, rotation, beside if known else "", is_vector=False)
+    for word in ("point", "vector"):
+        if all(f"{word}.{axis}" in paths for axis in _XYZ):
+            yield _Pose(word, "", "", is_vector=word == "vector")
 
 
 def _columns_of(poses: Sequence[_Pose]) -> Iterator[str]:
@@ -316,15 +318,10 @@ def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:
     return made
 
 
-def _stamp_of(message: Message) -> int:
-    stamp = decoded_time(_field(message, _STAMPS))
-    return message.log_time_ns if stamp is None else stamp
-
-
-def _field(message: Message, paths: Sequence[str]) -> Any:
-    """The value of the first of some fields that the message has."""
+def _first_of(fields: Mapping[str, Any], paths: Sequence[str]) -> Any:
+    """The value of the first of some paths that the fields of a message have."""
     for path in paths:
-        value: Any = message.fields
+        value: Any = fields
         for name in path.split("."):
             value = value.get(name) if isinstance(value, dict) else None
         if value is not None:
