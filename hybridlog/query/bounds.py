@@ -1,4 +1,4 @@
-"""Leaves out recordings of which bounds say that no message matches.
+"""Leaves out recordings whose bounds exclude every match.
 
 Bounds are the least and the greatest number of a field of a topic in a recording. Columns that
 answer a question about many recordings tell them, the catalog keeps them, and later questions

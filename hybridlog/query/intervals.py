@@ -46,7 +46,7 @@ class Events(Protocol):
 
     @property
     def question(self) -> Any:
-        """What they answer."""
+        """The questions that they answer."""
 
     def during(self, intervals: Intervals) -> Events:
         """Only those in some intervals."""

@@ -32,7 +32,7 @@ _MAX_LOOKED = 600
 _SIZE = 16 << 20  # of the pictures of some topics, about
 
 
-def begins_anew(channel: RecordedChannel, payload: Buffer) -> bool:
+def has_key_frame(channel: RecordedChannel, payload: Buffer) -> bool:
     """True if a message of a video topic is a key frame."""
     try:
         return is_key_frame(*frame_of(channel.codec.decode(memoryview(payload))))
