@@ -179,10 +179,10 @@ class Message:
                 it refers to is missing.
             MissingDependencyError: Pillow or PyAV is required and not installed.
         """
-        from hybridlog.arrays import VIDEOS
+        from hybridlog.arrays import is_video_type
         from hybridlog.arrays.message_arrays import to_numpy
 
-        if self._picture_of is not None and self.type.replace("/msg/", "/") in VIDEOS:
+        if self._picture_of is not None and is_video_type(self.type):
             return self._picture_of(self)
         return to_numpy(self.type, self.decode())
 

@@ -134,17 +134,19 @@ def _is_segment(what: str) -> bool:
 
 def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
     """Codec and key frames of video topics, by topic; none of those that cannot be read."""
+    from hybridlog.arrays import is_video_type
+
+    topics = dict.fromkeys(one.topic for one in entry.channels if is_video_type(one.type))
+    if not topics:
+        return {}
     from hybridlog.query.answers.video import summary_of
-    from hybridlog.query.latching import is_video
 
     found: dict[str, VideoSummary] = {}
-    for channel in store.session.channels(entry):
-        topic = channel.channel.topic
-        if topic not in found and is_video(channel.channel):
-            try:
-                found[topic] = summary_of(store.session, entry.id, topic)
-            except SegmentError as error:
-                output.note(f"{entry.label}: {error}")
+    for topic in topics:
+        try:
+            found[topic] = summary_of(store.session, entry.id, topic)
+        except SegmentError as error:
+            output.note(f"{entry.label}: {error}")
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.arrays import VIDEOS
+from hybridlog.arrays import is_video_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def depth_of(channel: Channel) -> int:
 
 def is_video(channel: Channel) -> bool:
     """True if a channel's messages are frames of video."""
-    return channel.schema is not None and channel.schema.name.replace("/msg/", "/") in VIDEOS
+    return channel.schema is not None and is_video_type(channel.schema.name)
 
 
 def publisher_of(channel: Channel) -> Hashable:
