@@ -161,6 +161,8 @@ class Session:
         progress: Called while an index is brought up to date.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
             settings.
+        recover: False to leave what a crash has cut, and what the index lacks of it, to another
+            opening.
 
     Attributes:
         directory: The store's directory.
@@ -176,12 +178,13 @@ class Session:
         mongo: str | None,
         progress: Progress | None,
         cache_mb: int | None = None,
+        recover: bool = True,  # noqa: FBT001, FBT002 - `begins_anew` takes positions
     ) -> None:
-        begins_anew(self, directory, mongo, progress, cache_mb)
+        begins_anew(self, directory, mongo, progress, cache_mb, recover)
         self.directory = directory
         self._progress = progress
         self.connection = Connection(directory, mongo, cache_mb)
-        self.repairs = RepairReport()
+        self.repairs = RepairReport(may_recover=recover)
         self.cache = Cache()
         self.field_indexes: list[FieldIndex] = []
         self._uncertain: tuple[int, dict[str, set[str]]] | None = None
@@ -229,10 +232,16 @@ class Session:
 
         A failure is remembered for some seconds.
         """
-        is_ready = self.connected is not None and self._is_indexed
-        if not is_ready and time.monotonic() >= self._rests_until:
+        return self._connected_for(None)
+
+    def _connected_for(self, entries: Sequence[RecordingEntry] | None) -> Database | None:
+        """The index with some recordings, None for all; connected when it is needed."""
+        is_ready = self._is_indexed or (
+            entries is not None and self._indexed.issuperset(entry.id for entry in entries)
+        )
+        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
             with suppress(HybridlogError):
-                self.connect()
+                self.connect(entries)
         return self.connected
 
     def database_about(self, purpose: str, entries: Sequence[RecordingEntry]) -> Database:
@@ -245,13 +254,10 @@ class Session:
         Raises:
             DatabaseError: it is unavailable; has the purpose and the reason.
         """
-        is_ready = self._is_indexed or self._indexed.issuperset(entry.id for entry in entries)
-        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
-            with suppress(HybridlogError):
-                self.connect(entries)
-        if self.connected is None:
+        database = self._connected_for(entries)
+        if database is None:
             raise self._missing_database(purpose)
-        return self.connected
+        return database
 
     def connect(self, recordings: Collection[RecordingEntry] | None = None) -> Database:
         """Connect to the index and bring it up to date; try again if the connection breaks.
@@ -352,7 +358,10 @@ class Session:
             DatabaseError: it is unavailable, or may not be changed; has the purpose and the
                 reason.
         """
-        database = self.database
+        return self._checked(self.database, purpose, writes=writes)
+
+    def _checked(self, database: Database | None, purpose: str, *, writes: bool) -> Database:
+        """The index, if there is one that may be used; raises as `database_for` does."""
         if database is None:
             raise self._missing_database(purpose)
         if writes and not self.connection.may_write:
@@ -384,14 +393,16 @@ class Session:
             if self.connected.ping():
                 return IndexTarget(self.connected, renew=self._another_database)
             self.disconnect()
-        if self.database is None and self._unavailable is not None:
+        # Those that a crash has cut are brought into the index by another opening.
+        database = self._connected_for(None if self.repairs.may_recover else [])
+        if database is None and self._unavailable is not None:
             if isinstance(self._unavailable, ConnectionLostError):
                 return IndexTarget(failure=self._unavailable, renew=self._another_database)
             if self.connection.has_none:
                 return IndexTarget()
             if isinstance(self._unavailable, StoreError):
                 raise self._unavailable
-        database = self.database_for(purpose, writes=True)
+        database = self._checked(database, purpose, writes=True)
         return IndexTarget(database, renew=self._another_database)
 
     def _another_database(self) -> Database:

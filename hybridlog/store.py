@@ -95,6 +95,7 @@ def open_store(
     require_database: bool = False,
     progress: Progress | None = None,
     cache_mb: int | None = None,
+    recover: bool = True,
 ) -> Store:
     """Open a store; recover first after a crash.
 
@@ -111,6 +112,8 @@ def open_store(
         cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
             `HYBRIDLOG_CACHE_SIZE`, the store's own setting, or 256. A new store keeps it. A
             MongoDB that runs already is not changed.
+        recover: False to leave recordings that a crash has cut, and what the index lacks of
+            others, to the next opening: a recorder need not wait for them.
 
     Raises:
         UsageError: MongoDB does not accept such a cache.
@@ -132,7 +135,7 @@ def open_store(
                 consent.remember(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where)
-    store = Store(directory, mongo=wanted, progress=progress, cache_mb=cache)
+    store = Store(directory, mongo=wanted, progress=progress, cache_mb=cache, recover=recover)
     try:
         if require_database:
             store.connect()
@@ -170,6 +173,7 @@ class Store:
         progress: Called while an index is brought up to date.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
             settings.
+        recover: False to leave what a crash has cut to another opening.
 
     Attributes:
         session: Its state while it is open.
@@ -184,9 +188,10 @@ class Store:
         mongo: str | None = None,
         progress: Progress | None = None,
         cache_mb: int | None = None,
+        recover: bool = True,
     ) -> None:
         self.directory = directory
-        self.session = Session(directory, mongo, progress, cache_mb)
+        self.session = Session(directory, mongo, progress, cache_mb, recover)
         self._sql: SqlEngine | None = None
         try:
             self.session.snapshot()

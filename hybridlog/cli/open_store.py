@@ -30,6 +30,7 @@ def opened_store(
     quiet: bool = False,
     is_lasting: bool = False,
     records: bool = False,
+    recover: bool = True,
 ) -> Iterator[Store]:
     """The open store; what a command asks is of one moment.
 
@@ -44,6 +45,7 @@ def opened_store(
         is_lasting: The command goes on while recordings change: each question is of its own
             moment.
         records: The command records, also while MongoDB is unavailable.
+        recover: False to leave what a crash has cut to another opening, which reports it.
     """
     from hybridlog.store import open_store
 
@@ -57,6 +59,7 @@ def opened_store(
             require_database=needs_database,
             progress=bar,
             cache_mb=cache_mb,
+            recover=recover,
         )
     finally:
         bar.close()
@@ -65,7 +68,10 @@ def opened_store(
         if records:
             target = store.session.index_to_record("Recording")
             doing = "so the index is made later" if target.is_wanted else "so there is no index"
-        _print_repairs(store, doing)
+        if recover:
+            _print_repairs(store, doing)
+        else:
+            _print_rebuilt(store, doing)
         try:
             yield store
         finally:

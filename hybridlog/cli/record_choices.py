@@ -165,8 +165,10 @@ def segment_settings(choices: RecordChoices) -> SegmentSettings:
     )
 
 
-def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
-    """The store, which is made if there is none."""
+def opened_to_record(
+    choices: RecordChoices, *, recover: bool = True
+) -> AbstractContextManager[Store]:
+    """The store, which is made if there is none; see `opened_store`."""
     return opened_store(
         choices.store,
         choices.mongo,
@@ -176,4 +178,5 @@ def opened_to_record(choices: RecordChoices) -> AbstractContextManager[Store]:
         quiet=choices.quiet,
         is_lasting=True,
         records=True,
+        recover=recover,
     )

@@ -18,8 +18,10 @@ from hybridlog.cli import output
 from hybridlog.cli.live_options import recorder_options, sources_of
 from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short
+from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.record_choices import opened_to_record
 from hybridlog.cli.signals import SIGNALS, write_note
+from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
     from hybridlog.cli.record_choices import RecordChoices
     from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
+    from hybridlog.store import Store
 
 _STATE_S = 1.0
 _EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
@@ -46,11 +49,12 @@ def record_live(choices: RecordChoices) -> None:
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
-        store = held.enter_context(opened_to_record(choices))
+        store = held.enter_context(opened_to_record(choices, recover=False))
         check_room(shutil.disk_usage(store.directory.path).free, options.reserve_bytes)
         with _stop_flag() as stop:
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()
+            recovery = _begin_recovery(choices, store)
             with display.table(), _snapshot_on_signal(recorder, options):
                 last = _watch(recorder, stop, display)
             if quiet:
@@ -59,12 +63,32 @@ def record_live(choices: RecordChoices) -> None:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
                 with _explain_wait(last):
                     reports = recorder.stop()
+            if not stop.is_set:
+                recovery.join()
         summary = LiveSummary(reports, recorder, sources, options)
         if options.contract is not None:
             labels = [report.entry.label for report in reports]
             results = [one for label in labels for one in store.judge(options.contract, label)]
             summary.add_verdict(results)
         summary.print_and_exit(as_json=choices.as_json, quiet=quiet)
+
+
+def _begin_recovery(choices: RecordChoices, store: Store) -> threading.Thread:
+    """Open the store again, which recovers what a crash has cut, beside the recorder.
+
+    A process that ends meanwhile cuts nothing: the next command recovers it.
+    """
+
+    def recover() -> None:
+        try:
+            with opened_store(store.directory.path, choices.mongo, quiet=True) as opened:
+                opened.session.database  # noqa: B018 - brings the index up to date
+        except HybridlogError as error:
+            output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
+
+    thread = threading.Thread(target=recover, daemon=True)
+    thread.start()
+    return thread
 
 
 def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:

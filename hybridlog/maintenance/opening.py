@@ -83,7 +83,7 @@ def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairRe
 
     # A recording has its directory before it has tables.
     gone = set() if catalog.is_in_memory else tables.unfinished(directory)
-    if not catalog.is_in_memory:
+    if report.may_recover and not catalog.is_in_memory:
         for name in directory.names():
             if name.startswith(REMOVED):
                 directory.sweep(name)
@@ -273,7 +273,7 @@ def _refresh(
     report: RepairReport,
 ) -> Described | None:
     """Recover a recording after a crash and update its catalog row; None if it is gone."""
-    may_write = not catalog.is_in_memory
+    may_write = report.may_recover and not catalog.is_in_memory
     listing = directory.listing(label)
     is_empty = not (listing.journal or listing.sealed or listing.open)
     if is_empty and not _OURS.issuperset(listing.others):

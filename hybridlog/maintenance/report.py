@@ -25,6 +25,7 @@ class RepairReport:
     """Repairs at the opening of a store; recordings by label.
 
     Attributes:
+        may_recover: False to leave what a crash has cut to another opening.
         recovered: Segments that a crash left open.
         indexed: Recordings whose index was behind, and the number of missing chunks.
         removed: Recordings whose removal was finished, or whose files are gone.
@@ -37,6 +38,7 @@ class RepairReport:
         disk_full: The error if the disk had no room for repairs, else None.
     """
 
+    may_recover: bool = True
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)
     indexed: dict[str, int] = field(default_factory=dict)
     removed: list[str] = field(default_factory=list)

@@ -10,9 +10,10 @@ import shlex
 import signal
 import struct
 import subprocess
+import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -44,12 +45,14 @@ uint32 nanosec
 
 
 @contextmanager
-def recorder(store: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+def recorder(
+    store: Path, *arguments: object, program: Sequence[str] = COMMAND
+) -> Iterator[subprocess.Popen[str]]:
     """A recorder that says on standard output, in JSON, how it is doing."""
     process = subprocess.Popen(
         [
             *BACKGROUND,
-            *COMMAND,
+            *program,
             "record",
             "--store",
             str(store),
@@ -144,6 +147,55 @@ def test_a_second_ctrl_c_leaves_at_once_and_what_was_flushed_is_there(
     (entry,) = listed.json
     assert entry["messages"] > 0
     run("verify", store=store)
+
+
+RECOVERS_WHEN_TOLD = """
+import sys, threading, time
+from importlib import import_module
+from pathlib import Path
+from hybridlog.maintenance import index, opening
+
+told = Path(sys.argv.pop(1))
+
+def blocked(work):
+    def wait(*args, **options):
+        assert threading.current_thread() is not threading.main_thread()
+        while not told.exists():
+            time.sleep(0.01)
+        return work(*args, **options)
+    return wait
+
+opening.recover, index._bring_one = blocked(opening.recover), blocked(index._bring_one)
+import_module("hybridlog.cli.main").main()
+"""
+
+
+def test_what_a_power_cut_left_is_recovered_behind_the_new_recording(
+    logs: Path, tmp_path: Path
+) -> None:
+    store, told = tmp_path / "store", tmp_path / "told"
+    replay = ("--replay", logs / "robot.bag", "--flush-interval", "100ms")
+    with recorder(store, *replay) as process:
+        until_it_speaks(process)
+        process.kill()
+    program = (sys.executable, "-c", RECOVERS_WHEN_TOLD, str(told))
+    with recorder(store, *replay, "--speed", 0.1, program=program) as process:
+        assert until_it_speaks(process)["name"] == "robot-2"
+        assert [one.suffix for one in (store / "recordings/robot").glob("0*")] == [".open"]
+        told.touch()
+        assert process.stderr is not None
+        kept = re.search(r"robot was cut short by a crash: (\d+) mes", process.stderr.readline())
+        report, _ = end_and_hear(process)
+    (recording,) = report["recordings"]
+    assert recording["messages"] == report["messages_received"] > 0
+    found = {one["recording"]: one for one in run("ls", "--json", store=store).json}
+    assert {label: one["status"] for label, one in found.items()} == {
+        "robot": "recovered",
+        "robot-2": "complete",
+    }
+    assert kept is not None
+    assert found["robot"]["messages"] == int(kept[1]) > 0
+    assert "all is well" in run("verify", store=store).out
 
 
 def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
