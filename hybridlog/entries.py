@@ -344,6 +344,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
         entry.tags |= state.tags
         entry.notes = list(state.notes)
         entry.marks = list(state.marks)
+        entry.pins = list(state.pins.values())
     entry.payloads = [asdict(file) for file in inventory.payloads.values()]
     return entry
 
@@ -507,6 +508,7 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
             journal.event(journal.NOTED, text=n["text"]) | {"at": n["at"]} for n in state.notes
         ]
         lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
+        lines += [journal.event(journal.PINNED, **pin) for pin in state.pins.values()]
     lines += _compacted_lines(inventory)
     if inventory.end is not None:
         lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
@@ -551,8 +553,8 @@ def sealed_line(inventory: Inventory, number: int) -> journal.Event:
 
 
 def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
-    """The journal line for a segment."""
-    return journal.event(
+    """The journal line for a segment; one that was listed has the time of that."""
+    line = journal.event(
         journal.SEALED,
         segment=sealed.segment,
         file=sealed.file,
@@ -560,6 +562,8 @@ def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
         digest=sealed.digest,
         channels=[dict(c) if isinstance(c, Mapping) else asdict(c) for c in sealed.channels],
     )
+    written = sealed.at if isinstance(sealed, journal.SealedSegment) else 0
+    return {**line, "at": written} if written else line
 
 
 def text(name: str) -> str:

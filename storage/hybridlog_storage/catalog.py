@@ -194,6 +194,7 @@ class RecordingEntry:
         metadata_records: Number of metadata records of its log.
         notes: Notes of users: `at` (ns) and `text`.
         marks: Marks set after it ended: `time` (ns), `text`, `tags`; those that last, `end` (ns).
+        pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
         digests: Digest of each valid segment, by its number as text.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
@@ -219,6 +220,7 @@ class RecordingEntry:
     metadata_records: int = 0
     notes: list[dict[str, Any]] = field(default_factory=list)
     marks: list[dict[str, Any]] = field(default_factory=list)
+    pins: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[int, int, int]] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False

@@ -13,6 +13,7 @@ would have announced never began.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -45,7 +46,9 @@ ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
 COMPACTED: Final = "compacted"
-RESERVED: Final = ("pinned", "unpinned", "expired", "signature")
+PINNED: Final = "pinned"
+UNPINNED: Final = "unpinned"
+RESERVED: Final = ("expired", "signature")
 """Events of later versions; this version preserves and ignores them."""
 
 Event = Mapping[str, Any]
@@ -90,6 +93,7 @@ class SealedSegment:
         digest: Digest of its summary: `sha256:` and hexadecimal digits.
         channels: `id`, `topic`, `messages`, `payload_bytes`, `first`, `last` (log time, ns) of
             each channel in it.
+        at: When the line about it was written, ns since the epoch; 0 if unknown.
     """
 
     segment: int
@@ -97,6 +101,7 @@ class SealedSegment:
     bytes: int
     digest: str
     channels: tuple[Mapping[str, Any], ...]
+    at: int = 0
 
     @property
     def messages(self) -> int:
@@ -135,6 +140,7 @@ class JournalState:
         tags: The present tags.
         notes: Notes in the order of writing: `at` and `text`.
         marks: Marks set after the end: `time`, `text`, `tags`, `segment`; those that last, `end`.
+        pins: Pins by id: `id`, `from` and `to` (log times, ns), `topics`, `reason`; None for all.
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
         payloads: Files of payloads, by path.
@@ -157,6 +163,7 @@ class JournalState:
     tags: dict[str, str] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
     marks: list[dict[str, Any]] = field(default_factory=list)
+    pins: dict[str, dict[str, Any]] = field(default_factory=dict)
     sealed: dict[int, SealedSegment] = field(default_factory=dict)
     replaced: list[tuple[SealedSegment, SealedSegment]] = field(default_factory=list)
     payloads: dict[str, PayloadFile] = field(default_factory=dict)
@@ -190,14 +197,6 @@ class JournalState:
             self.end = end_of(line["end"])
         elif name == RENAMED:
             self._rename(line)
-        elif name == TAGGED:
-            self.tags[_key(line["key"])] = _text(line["value"])
-        elif name == UNTAGGED:
-            self.tags.pop(_key(line["key"]), None)
-        elif name == NOTED:
-            self.notes.append(_values(line, {"at": _time, "text": _text}))
-        elif name == MARKED:
-            self._mark(line)
         elif name == ADOPTED:
             self.store = _text(line["store"])
         elif name == COMPACTED:
@@ -205,6 +204,24 @@ class JournalState:
         elif name in {REMOVING, REBUILT}:
             self.removing |= name == REMOVING
             self.rebuilt = _text(line["reason"]) if name == REBUILT else self.rebuilt
+        else:
+            self._edit(line)
+
+    def _edit(self, line: Event) -> None:
+        """Apply an event of a user's command."""
+        name = line["event"]
+        if name == TAGGED:
+            self.tags[_key(line["key"])] = _text(line["value"])
+        elif name == UNTAGGED:
+            self.tags.pop(_key(line["key"]), None)
+        elif name == NOTED:
+            self.notes.append(_values(line, {"at": _time, "text": _text}))
+        elif name == MARKED:
+            self._mark(line)
+        elif name == PINNED:
+            self._pin(line)
+        elif name == UNPINNED:
+            self.pins.pop(_text(line["id"]), None)
 
     def _begin(self, line: Event) -> None:
         if self.begun:
@@ -228,9 +245,15 @@ class JournalState:
         self.marks = [m for m in self.marks if m["segment"] in self.sealed]
         self.marks.append(mark)
 
+    def _pin(self, line: Event) -> None:
+        pin = {name: check(line.get(name)) for name, check in _PIN.items()}
+        if None not in (pin["from"], pin["to"]) and pin["to"] < pin["from"]:
+            raise ValueError("a pin that ends before it begins")
+        self.pins[pin["id"]] = pin
+
     def _seal(self, line: Event) -> None:
         channels = tuple(_values(channel, _CHANNEL) for channel in _list(line["channels"]))
-        sealed = SealedSegment(**_values(line, _SEALED), channels=channels)
+        sealed = SealedSegment(**_values(line, _SEALED), channels=channels, at=_written(line))
         number, _ = sealed.segment, _number(sealed.messages)
         before = self.sealed.get(number)
         if before is not None and before.digest != sealed.digest:
@@ -243,6 +266,14 @@ class JournalState:
         self.payloads.update({file.file: file for file in found})
         for one in segments:
             self.thinned.setdefault(one["segment"], []).append((one["digest"], one["bytes"]))
+
+
+def _written(line: Event) -> int:
+    """When a line was written, ns; 0 if it does not say that."""
+    try:
+        return int(_time(line.get("at")))
+    except ValueError:
+        return 0
 
 
 def payload_files(values: Iterable[Mapping[str, Any]]) -> list[PayloadFile]:
@@ -344,19 +375,29 @@ def read(recording: Path) -> JournalState | None:
 class Journal:
     """The journal of one recording, open for appending. The user holds the recording's lock.
 
+    Pins of a running recording need no lock: `append` alone keeps others out.
+
     Args:
         recording: The recording's directory.
         sync: Whether lines are forced to the disk before `append` returns.
+        check: Called with the state before lines are appended; raises to append none.
     """
 
-    def __init__(self, recording: Path, *, sync: bool = True) -> None:
+    def __init__(
+        self,
+        recording: Path,
+        *,
+        sync: bool = True,
+        check: Callable[[JournalState], None] | None = None,
+    ) -> None:
         self.path = recording / JOURNAL
         self._sync = sync
+        self._check = check
 
     def append(self, *lines: Event) -> None:
         """Append lines; they are on the disk when this returns.
 
-        An incomplete line left by a crash is cut off first.
+        An incomplete line left by a crash is cut off first. Nobody else appends meanwhile.
 
         Raises:
             DiskFullError: There is no room; the journal is as it was.
@@ -367,8 +408,11 @@ class Journal:
         try:
             fd = files.open_file(self.path, flags, depth=files.IN_RECORDING)
             try:
+                fcntl.flock(fd, fcntl.LOCK_EX)
                 size = os.lseek(fd, 0, os.SEEK_END)
                 whole = _whole(fd, size)
+                if self._check is not None:
+                    self._check(parse(os.pread(fd, whole, 0)))
                 if whole < size:
                     files.system.truncate(fd, whole)
                 os.lseek(fd, whole, os.SEEK_SET)
@@ -504,6 +548,12 @@ _MARK: Final[Mapping[str, _Check]] = {
     "text": _text,
     "tags": _tags,
     "segment": _segment,
+}
+_PIN: Final[Mapping[str, _Check]] = {
+    "id": _text,
+    **dict.fromkeys(("from", "to"), _or_none(_time)),
+    "topics": _or_none(lambda value: [_text(topic) for topic in _list(value)]),
+    "reason": lambda value: "" if value is None else _text(value),
 }
 _SOURCE: Final[Mapping[str, _Check]] = {
     **dict.fromkeys(("path", "kind", "profile", "fingerprint"), _text),

@@ -12,9 +12,10 @@ import os
 import re
 import stat
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeGuard
+from typing import Any, Final, TypeGuard
 from urllib.parse import quote
 
 from hybridlog_storage.disk import files
@@ -58,6 +59,7 @@ class StoreSettings:
         requires: Features that a reader must know to read the store.
         optional: Features that a reader may ignore.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
+        retention: The table `[retention]`, as it stands there.
     """
 
     store_id: str
@@ -66,6 +68,7 @@ class StoreSettings:
     requires: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
     cache_mb: int | None = None
+    retention: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_settings(path: Path) -> StoreSettings:
@@ -115,7 +118,10 @@ def read_settings(path: Path) -> StoreSettings:
         except UsageError as error:
             raise StoreError(str(error)) from None
     optional = _names(file, values, "optional")
-    return StoreSettings(store_id, mongo, shared, requires, optional, cache_mb)
+    retention = values.get("retention", {})
+    if not isinstance(retention, dict):
+        raise StoreError(f"{file}: retention must be a table, [retention].")
+    return StoreSettings(store_id, mongo, shared, requires, optional, cache_mb, retention)
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
@@ -139,7 +145,10 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
         lines.append(f"cache_mb = {settings.cache_mb}")
     for name, features in (("requires", settings.requires), ("optional", settings.optional)):
         if features:
-            lines.append(f"{name} = [{', '.join(map(_quoted, features))}]")
+            lines.append(f"{name} = {_as_toml(features)}")
+    if settings.retention:
+        lines.append("\n[retention]")
+        lines += [f"{_quoted(k)} = {_as_toml(v)}" for k, v in settings.retention.items()]
     content = ("\n".join(lines) + "\n").encode()
     files.write_file(path / NAME, content, depth=files.IN_STORE)
 
@@ -374,6 +383,18 @@ def _names(file: Path, values: dict[str, object], key: str) -> tuple[str, ...]:
     if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
         raise StoreError(f"{file}: {key} must be a list of names in quotes.")
     return tuple(found)
+
+
+def _as_toml(value: object) -> str:
+    """A value of TOML on one line."""
+    if isinstance(value, dict):
+        pairs = (f"{_quoted(key)} = {_as_toml(inner)}" for key, inner in value.items())
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_as_toml, value))}]"
+    if isinstance(value, str):
+        return _quoted(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _quoted(text: str) -> str:

@@ -9,6 +9,7 @@ import random
 import string
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,13 @@ from hybridlog_storage.journal import (
     JOURNAL,
     MARKED,
     NOTED,
+    PINNED,
     REBUILT,
     REMOVING,
     RENAMED,
     SEALED,
     TAGGED,
+    UNPINNED,
     UNTAGGED,
     Journal,
     JournalState,
@@ -95,6 +98,9 @@ def whole_life() -> list[dict[str, Any]]:
         event(MARKED, time=-7, text="slipped", tags={"a": "b"}, segment=2),
         sealed(2),
         event(ADOPTED, store="6" * 32),
+        event(PINNED, id="a", **{"from": -7, "to": 9}, topics=["/a"], reason="slipped"),
+        event(PINNED, id="b"),
+        event(UNPINNED, id="b"),
         event("expired", anything=[1, {"b": None}]),
         event("compacted", files=[PAYLOADS]),
         event("of another version"),
@@ -200,6 +206,9 @@ def test_a_whole_life() -> None:
         n: (f"{n:06d}.mcap", 1000 + n, "sha256:a", 5 + n) for n in range(3)
     }
     assert state.sealed[1].channels == tuple(lines[2]["channels"])
+    assert state.sealed[1].at == lines[2]["at"]
+    pin = {"id": "a", "from": -7, "to": 9, "topics": ["/a"], "reason": "slipped"}
+    assert state.pins == {"a": pin}
     assert state.end == {"status": "complete", "losses": []}
     assert state.removing
     assert (state.moving, state.rebuilt, state.replaced) == (None, None, [])
@@ -280,6 +289,7 @@ def incomplete() -> Iterator[tuple[str, dict[str, Any]]]:
         UNTAGGED: ("key",),
         NOTED: ("at", "text"),
         MARKED: ("time", "text", "tags", "segment"),
+        UNPINNED: ("id",),
         ADOPTED: ("store",),
         REBUILT: ("reason",),
     }
@@ -296,6 +306,8 @@ def incomplete() -> Iterator[tuple[str, dict[str, Any]]]:
                 yield f"{kind} {name} {wrong}", {**line, name: wrong}
     for wrong in ("", "0" * 31, "0" * 33, "g" * 32, "A" * 32):
         yield f"id {wrong}", {**complete[BEGUN], "id": wrong}
+    for name, wrong in (("id", 5), ("from", 0.5), ("to", -9), ("topics", "/a"), ("reason", 1)):
+        yield f"pin {name} {wrong}", {**complete[PINNED], name: wrong}
     for wrong in ("../000000.mcap", "/etc/passwd", "a/b", "", "..", "."):
         yield f"file {wrong}", {**complete[SEALED], "file": wrong}
     (counted,) = complete[SEALED]["channels"]
@@ -360,7 +372,7 @@ def test_an_odd_value_damages_its_line_or_can_be_kept_anywhere(
     )
     state = parse(b"".join(map(as_written, [*FULL[:number], odd, *FULL[number + 1 :]])))
     kept = {field: getattr(state, field) for field in ("begun", "name", "tags", "notes", "end")}
-    kept["marks"] = state.marks
+    kept["marks"], kept["pins"] = state.marks, [*state.pins.values()]
     kept["sealed"] = [asdict(segment) for segment in state.sealed.values()]
     kept["payloads"] = [asdict(file) for file in state.payloads.values()]
     kept["thinned"], kept["moving"] = [*state.thinned.values()], state.moving
@@ -458,6 +470,32 @@ def test_appended_is_what_is_read(folder: Path) -> None:
     log.append(*LINES[3:])
     assert (folder / JOURNAL).read_bytes() == DATA
     assert journal.read(folder) == parse(DATA)
+
+
+def test_a_check_sees_what_was_appended_before_and_keeps_a_line_out(folder: Path) -> None:
+    def check(state: JournalState) -> None:
+        if state.pins:
+            raise StoreError("it is pinned")
+
+    careful = Journal(folder, check=check)
+    Journal(folder).append(begun())
+    careful.append(event("expired"))
+    Journal(folder).append(event(PINNED, id="a"))
+    before = (folder / JOURNAL).read_bytes()
+    with pytest.raises(StoreError, match="pinned"):
+        careful.append(event("expired"))
+    assert (folder / JOURNAL).read_bytes() == before
+
+
+def test_lines_of_several_writers_are_whole(folder: Path) -> None:
+    Journal(folder).append(begun())
+    notes = [event(NOTED, text=f"{n} " + "x" * n) for n in range(60)]
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(lambda note: Journal(folder, sync=False).append(note), notes))
+    state = journal.read(folder)
+    assert state is not None
+    assert not state.damaged
+    assert sorted(n["text"] for n in state.notes) == sorted(n["text"] for n in notes)
 
 
 @pytest.mark.parametrize("torn", [1, 8, 9, 30, 99_000])

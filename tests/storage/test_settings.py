@@ -31,6 +31,11 @@ def write(store: Path, text: str | bytes) -> Path:
         StoreSettings("ab12"),
         StoreSettings("ab12", "mongodb://me@h1:1,h2/db?tls=true"),
         StoreSettings("ab12", cache_mb=300),
+        StoreSettings(
+            "ab12",
+            requires=(),
+            retention={"quota": "2GB", "topic": {"/c/**": "7d", "/b": "1h"}, "never-tag": ["a=b"]},
+        ),
         StoreSettings("ab12", shared=True, optional=("colours", "Größe \U0001f600 \x7f\"'\\")),
     ],
 )
@@ -70,6 +75,7 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = 3\nstore_id = 'x'\nrequires = 'a'", "requires"),
         (b"format = 3\nstore_id = 'x'\noptional = [1]", "optional"),
         (b"format = 3\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
+        (b"format = 3\nstore_id = 'x'\nretention = 5", "retention"),
         (b"format = [", "damaged"),
         (b"\xff\xfe", "damaged"),
         (b"format = " + b"[" * 100_000, "damaged"),

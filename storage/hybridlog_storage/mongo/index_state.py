@@ -51,6 +51,7 @@ _MAX_NAMES: Final = (
     "status",
     "notes",
     "marks",
+    "pins",
     "payloads",
     "stored_bytes",
 )
