@@ -13,11 +13,28 @@ if TYPE_CHECKING:
 _MAX_PIXELS = 1 << 26
 
 
+def pyav() -> Any:
+    """The module of PyAV.
+
+    Raises:
+        MissingDependencyError: It is not installed.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise MissingDependencyError(
+            "pictures of video need PyAV: pip install 'hybridlog[video]'"
+        ) from error
+    return av
+
+
 class VideoDecoder:
     """Decodes the frames of a topic, the first of which is a key frame.
 
     Args:
         form: One of `hybridlog.arrays.bitstream.CODECS`.
+        in_order: Pictures come in the order in which they are shown, from `take`; else each
+            with its frame, from `decode`.
 
     Attributes:
         is_over: It cannot take further frames.
@@ -26,14 +43,8 @@ class VideoDecoder:
         MissingDependencyError: PyAV is not installed, or lacks the decoder.
     """
 
-    def __init__(self, form: str) -> None:
-        try:
-            import av
-        except ImportError as error:
-            raise MissingDependencyError(
-                "pictures of video need PyAV: pip install 'hybridlog[video]'"
-            ) from error
-        self._av = av
+    def __init__(self, form: str, *, in_order: bool = False) -> None:
+        av = self._av = pyav()
         self._form = form
         self._order = FrameOrder()
         self._count = 0
@@ -46,7 +57,8 @@ class VideoDecoder:
         context.options = {
             "err_detect": "explode",
             "max_pixels": str(_MAX_PIXELS),
-            "flags": "low_delay",
+            # Strictly, a decoder waits unless a stream says that nothing is out of order.
+            **({"strict": "strict"} if in_order else {"flags": "low_delay"}),
         }
         self._context: Any = context
 
@@ -61,33 +73,58 @@ class VideoDecoder:
         Raises:
             PayloadError: It cannot be decoded, or does not follow the frames so far.
         """
+        number = self._count
+        found = next((one for one in self.take(form, data) if one.pts == number), None)
+        if not is_wanted:
+            return None
+        if found is None:  # the decoder holds it back
+            found = next((one for one in self.rest() if one.pts == number), None)
+        if found is None:
+            raise PayloadError("a frame of video has no picture")
+        try:
+            picture: NDArray[Any] = found.to_ndarray(format="rgb24")
+        except (self._av.FFmpegError, ValueError, MemoryError) as error:
+            raise PayloadError(f"a frame of video cannot be decoded: {error}") from error
+        return picture
+
+    def take(self, form: str, data: bytes) -> list[Any]:
+        """Take the next frame; returns the pictures of PyAV that are ready, as a rule its own.
+
+        Their `pts` is the number of their frame, from 0 on.
+
+        Raises:
+            PayloadError: It cannot be decoded, or does not follow the frames so far.
+        """
         self.is_over = True  # unless all is well
         if form != self._form:
             raise PayloadError(f"a frame of {form} follows one of {self._form}")
+        if not data:
+            raise PayloadError("a frame of video is empty")
         if not self._order.follows(form, data):
             raise PayloadError(
                 "a frame of video cannot be decoded: one that it refers to was never received"
             )
+        packet = self._av.Packet(data)
+        packet.pts = packet.dts = self._count
+        found = self._decoded(packet)
+        self._count += 1
+        self.is_over = False
+        return found
+
+    def rest(self) -> list[Any]:
+        """The pictures that are held back, at the end.
+
+        Raises:
+            PayloadError: One cannot be decoded.
+        """
+        self.is_over = True
+        return self._decoded(None)
+
+    def _decoded(self, packet: Any) -> list[Any]:
         try:
-            packet = self._av.Packet(data)
-            packet.pts = packet.dts = self._count
-            found = self._picture(self._context.decode(packet))
-            is_late = found is None and is_wanted
-            if is_late:  # the decoder holds it back
-                found = self._picture(self._context.decode(None))
-            if found is None and is_wanted:
-                raise PayloadError("a frame of video has no picture")
-            if found is not None and found.is_corrupt:
-                raise PayloadError("a frame of video is damaged")
-            picture: NDArray[Any] | None = None
-            if is_wanted and found is not None:
-                picture = found.to_ndarray(format="rgb24")
+            found: list[Any] = self._context.decode(packet)
         except (self._av.FFmpegError, ValueError, MemoryError) as error:
             raise PayloadError(f"a frame of video cannot be decoded: {error}") from error
-        self._count += 1
-        self.is_over = is_late
-        return picture
-
-    def _picture(self, frames: list[Any]) -> Any:
-        """The picture of the frame that was taken last, if it is among some."""
-        return next((frame for frame in frames if frame.pts == self._count), None)
+        if any(one.is_corrupt for one in found):
+            raise PayloadError("a frame of video is damaged")
+        return found

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         TableWriter,
         Target,
     )
+    from hybridlog.message import Message
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
@@ -304,8 +305,8 @@ def write_answer(
         def progress() -> None:
             bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
-        if content == "pictures":
-            _write_pictures(query, form, target, progress)
+        if content in {"pictures", "video"}:
+            _write_pictures(query, form, target, progress, front)
             return 0
         if content in {"log", "payloads"}:
             before = front if content == "log" else Front(latched=False)
@@ -406,7 +407,9 @@ def _schema_of(query: Query) -> pa.Schema | None:
         return schema_of(Planner(query.session, query.question, Counters()))
 
 
-def _write_pictures(query: Query, form: str, target: Target, progress: Progress) -> None:
+def _write_pictures(
+    query: Query, form: str, target: Target, progress: Progress, front: Front
+) -> None:
     """Write the images; messages that are unreadable are left out and told.
 
     Raises:
@@ -415,13 +418,16 @@ def _write_pictures(query: Query, form: str, target: Target, progress: Progress)
         DefinitionError: the same.
     """
     from hybridlog.arrays.message_arrays import IMAGES
-    from hybridlog.drawing.images import picture
+    from hybridlog.query.answers.video import frames_in_front
 
+    before: list[Message] = []
+    if OUTPUTS[form].content == "video" and front.latched:
+        before = frames_in_front(query.session, query.question)
     written = left_out = 0
     refused: HybridlogError | None = None
     images: PictureWriter
     with OUTPUTS[form].open(target) as images:
-        for message in query:
+        for message in chain(before, query):
             if message.type.replace("/msg/", "/") not in IMAGES:
                 raise UsageError(
                     f"{message.topic} has {message.type or 'no type'}, which is no image: {form} "
@@ -431,16 +437,16 @@ def _write_pictures(query: Query, form: str, target: Target, progress: Progress)
                 query.counters.reduced += 1
                 continue
             try:
-                found = picture(message, form="jpg" if form == "jpg" else "png")
+                images.write(message)
             except (PayloadError, DefinitionError) as error:
                 refused = refused or error
                 left_out += 1
                 continue
-            images.write(message, found)
             written += 1
             progress()
         if refused is not None and not written:
             raise refused
+    query.counters.frames += len(before)
     if refused is not None:
         are = "is" if left_out == 1 else "are"
         output.note(f"{output.counted(left_out, 'message')} {are} left out; the first: {refused}.")

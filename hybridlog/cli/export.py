@@ -26,7 +26,13 @@ from hybridlog.cli.split import pieces, split_by
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
-from hybridlog_storage.errors import DefinitionError, HybridlogError, TimeError, UsageError
+from hybridlog_storage.errors import (
+    DefinitionError,
+    HybridlogError,
+    PayloadError,
+    TimeError,
+    UsageError,
+)
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
@@ -35,7 +41,8 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
 
 _LOGS = formats_of("log")
-_TABLES = formats_of("table", "lines")
+_FILES = formats_of("table", "lines", "video")
+"""Formats with a file a topic."""
 
 
 @click.command()
@@ -43,13 +50,13 @@ _TABLES = formats_of("table", "lines")
     "target",
     type=options.PATH,
     metavar="OUTPUT",
-    help="File (mcap, bag) or directory (rosbag2, tables).",
+    help="File (mcap, bag) or directory (rosbag2, mp4, tables).",
 )
 @click.option(
     "--format",
     "-F",
     "form",
-    type=click.Choice([*_LOGS, *_TABLES]),
+    type=click.Choice([*_LOGS, *_FILES]),
     help=f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
 )
 @options.store
@@ -83,7 +90,7 @@ def export_command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Export whole recordings; tables get one file a topic."""
+    """Export whole recordings; tables and videos get one file a topic."""
     form = form or _form(target)
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
@@ -109,7 +116,7 @@ def export_command(
                     extras = extras._replace(attachments=[], left_out=0)
                 _write_file(one, form, path, front, extras, force=force, quiet=quiet)
             else:
-                _write_directory(one, form, path, force=force, quiet=quiet)
+                _write_directory(one, form, path, front, force=force, quiet=quiet)
             if not quiet:
                 print_remarks(one, topic, is_empty=None if form in _LOGS else False)
 
@@ -149,17 +156,19 @@ def _write_file(
         output.note(f"{left_out} from behind the time range: left out.")
 
 
-def _write_directory(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    """Write one file a topic, except topics that fit no table or have no message in the range."""
+def _write_directory(
+    query: Query, form: str, directory: Path, front: Front, *, force: bool, quiet: bool
+) -> None:
+    """Write one file a topic, except topics that do not fit or have no message in the range."""
     from hybridlog.query.ranges import RangeResolver
 
     RangeResolver(query.session, query.question).resolve()  # refuses a range without any message
     if directory.exists():
-        _write_tables(query, form, directory, force=force, quiet=quiet)
+        _write_files(query, form, directory, front, force=force, quiet=quiet)
         return
     with undone(partial(_remove_empty, directory)):
         _make(directory)
-        _write_tables(query, form, directory, force=force, quiet=quiet)
+        _write_files(query, form, directory, front, force=force, quiet=quiet)
 
 
 def _remove_empty(directory: Path) -> None:
@@ -167,9 +176,13 @@ def _remove_empty(directory: Path) -> None:
         directory.rmdir()
 
 
-def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quiet: bool) -> None:
-    suffix = OUTPUTS[form].suffixes[0]
-    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in query.topics}
+def _write_files(
+    query: Query, form: str, directory: Path, front: Front, *, force: bool, quiet: bool
+) -> None:
+    suffix, topics = OUTPUTS[form].suffixes[0], [*query.topics]
+    if OUTPUTS[form].content == "video":
+        topics = _image_topics(query)
+    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
     for path in paths.values():
         check_room(path, force=force)
     left_out: list[HybridlogError] = []
@@ -177,8 +190,8 @@ def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quie
         one = query.with_topic(topic)
         try:
             with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
-                missing = write_answer(one, form, path, quiet=quiet)
-        except (DefinitionError, TimeError) as error:
+                missing = write_answer(one, form, path, front=front, quiet=quiet)
+        except (DefinitionError, PayloadError, TimeError) as error:
             what = "" if isinstance(error, DefinitionError) else f"{topic}: "
             output.note(f"{what}{error}")
             left_out.append(error)
@@ -187,6 +200,21 @@ def _write_tables(query: Query, form: str, directory: Path, *, force: bool, quie
         query.counters.reduced += one.counters.reduced
     if len(left_out) == len(paths):
         raise left_out[0]
+
+
+def _image_topics(query: Query) -> list[str]:
+    """The topics of images and of video among those of a query.
+
+    Raises:
+        UsageError: There is none.
+    """
+    from hybridlog.arrays.message_arrays import IMAGES, plain_type
+
+    entries = map(query.session.entry_of, query.summaries())
+    found = {c.topic for entry in entries for c in entry.channels if plain_type(c.type) in IMAGES}
+    if not found.intersection(query.topics):
+        raise UsageError("There is no topic of images or of video.")
+    return [topic for topic in query.topics if topic in found]
 
 
 def _make(directory: Path) -> None:

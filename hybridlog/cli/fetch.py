@@ -158,8 +158,8 @@ def fetch_command(**parameters: Any) -> None:
             output.say(str(count))
         else:
             front = Front(
-                # With --at, the answer is one message.
-                latched=not choices.no_latched and choices.at is None,
+                # With --at, the answer is one message; a video needs those before it.
+                latched=not choices.no_latched and (choices.at is None or to.form == "mp4"),
                 original_times=choices.original_times,
             )
             if choices.split is not None:
@@ -249,7 +249,7 @@ def _destination(choices: _Choices) -> Destination:
         no_latched=choices.no_latched, original_times=choices.original_times, form=form
     )
     options.check_tags(choices.tags, form)
-    as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures"}
+    as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
     if choices.frame is not None and (as_it_came or form == "raw"):
         raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
     to = Destination(form=form, path=choices.output, force=choices.force, quiet=choices.quiet)

@@ -19,7 +19,7 @@ NEEDED_FOR: Final = {
     "plot": "plot, except as a page",
     "protobuf": "fields of protobuf messages",
     "sql": "sql",
-    "video": "pictures of video topics",
+    "video": "pictures of video topics, and mp4",
     "view": "view",
 }
 """What each extra is needed for."""

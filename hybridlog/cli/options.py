@@ -271,7 +271,7 @@ def check_tags(tags: str | None, form: str) -> None:
     Raises:
         UsageError: It has none.
     """
-    if tags is not None and form in formats_of("log", "payloads", "pictures"):
+    if tags is not None and form in formats_of("log", "payloads", "pictures", "video"):
         raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
 
 

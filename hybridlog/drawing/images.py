@@ -85,14 +85,25 @@ def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] =
         found = _as_it_came(decoded, raw=raw)
         if found is not None:
             return found
-    image = message.to_numpy()
-    deep = raw and form == "png"
-    shown = pixels(image, str(getattr(decoded, "encoding", "rgba8")), deep=deep)
-    if not shown.size:
-        raise PayloadError("an image without pixels cannot be a picture")
+    shown = shown_pixels(message, deep=raw and form == "png")
     if form == "jpg":
         return Picture("image/jpeg", ".jpg", _jpeg(shown))
     return Picture("image/png", ".png", png(shown))
+
+
+def shown_pixels(message: Message, *, deep: bool = False) -> NDArray[Any]:
+    """The pixels of an image message, as `hybridlog.drawing.pixels.pixels` gives them.
+
+    Raises:
+        PayloadError: it is no image, is empty, or does not fit its encoding.
+        DefinitionError: no usable definition exists.
+        MissingDependencyError: Pillow or PyAV is required and not installed.
+    """
+    image, encoding = message.to_numpy(), getattr(message.decode(), "encoding", "rgba8")
+    shown = pixels(image, str(encoding), deep=deep)
+    if not shown.size:
+        raise PayloadError("an image without pixels cannot be a picture")
+    return shown
 
 
 def _as_it_came(message: Any, *, raw: bool) -> Picture | None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hybridlog.formats.reading import Source
     from hybridlog.formats.writing import Target
 
-Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures"]
+Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures", "video"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,8 @@ class OutputFormat:
 
     Attributes:
         content: What its writer takes: `lines` of JSON, one a message; Arrow tables (`table`);
-            batches of messages for a `log`, or for a file a payload (`payloads`); `pictures`.
+            batches of messages for a `log`, or for a file a payload (`payloads`); messages that
+            are images, for `pictures` or a `video`.
         writer: The writer, as `module:name`. Called with a path or a binary stream, and with
             the `schema` of tables.
         suffixes: Suffixes of file names, the usual one first; none if it writes a directory.
@@ -136,12 +137,13 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
     ),
     "ply": OutputFormat("payloads", "hybridlog.formats.ply:open_ply_writer", ()),
     "raw": OutputFormat("payloads", "hybridlog.formats.raw:open_raw_writer", ()),
-    "png": OutputFormat("pictures", "hybridlog.formats.pictures:open_pictures_writer", (".png",)),
+    "png": OutputFormat("pictures", "hybridlog.formats.pictures:open_png_writer", (".png",)),
     "jpg": OutputFormat(
-        "pictures", "hybridlog.formats.pictures:open_pictures_writer", (".jpg", ".jpeg")
+        "pictures", "hybridlog.formats.pictures:open_jpg_writer", (".jpg", ".jpeg")
     ),
+    "mp4": OutputFormat("video", "hybridlog.formats.mp4:Mp4Writer", (".mp4",)),
 }
-"""Every output format by its name for `--format`; pictures are for messages that are images."""
+"""Every output format by its name for `--format`."""
 
 
 def formats_of(*contents: Content) -> list[str]:

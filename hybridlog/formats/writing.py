@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
-    from hybridlog.drawing.images import Picture
     from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.attachments import Attachment
@@ -117,9 +116,9 @@ class LineWriter(Writer, Protocol):
 
 
 class PictureWriter(Writer, Protocol):
-    """A writer of images."""
+    """A writer of images, one file a message or all in a video."""
 
-    def write(self, message: Message, picture: Picture) -> None:
+    def write(self, message: Message) -> None:
         """Append the image of a message."""
 
 

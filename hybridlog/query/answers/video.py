@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.arrays import is_video_type
 from hybridlog.arrays.bitstream import frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder
 from hybridlog.message import messages_in
@@ -15,10 +17,12 @@ from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
-from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 from hybridlog_storage.times import BEGIN
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from hybridlog.message import Message, PictureOf
@@ -79,6 +83,72 @@ def summary_of(session: Session, recording: str, topic: str) -> VideoSummary:
     return VideoSummary(tuple(sorted(formats)), frames, keys, unreadable)
 
 
+def frames_in_front(session: Session, question: Question) -> list[Message]:
+    """The frames before a range that its first frame refers to: from the last key frame on.
+
+    There are none before a key frame, nor before messages that are no frames.
+
+    Raises:
+        UsageError: The question leaves out frames between others, which refer to them.
+    """
+    of_first = replace(question, limit=1)
+    runs = Planner(session, of_first, Counters()).runs()
+    first = next((message for run in runs for message in messages_in(run)), None)
+    if first is None or not is_video_type(first.type):
+        return []
+    windows = 0 if question.during is None else len(question.during)
+    if question.every > 1 or question.predicate is not None or windows > 1:
+        raise UsageError(
+            f"The frames of {first.topic} refer to one another, so a video has all of a time "
+            "range: leave out --every and --where, or write --format png."
+        )
+    with suppress(PayloadError, DefinitionError):
+        if not is_key_frame(*frame_of(first.decode())):
+            return [message for message, *_ in back_to_key(session, first)][:0:-1]
+    return []
+
+
+def back_to_key(
+    session: Session, message: Message, stop: tuple[int, int] | None = None
+) -> Iterator[tuple[Message, str, bytes]]:
+    """A frame and those before it, the latest first, with format and bytes: back to a key frame.
+
+    Args:
+        session: The open store.
+        message: The frame.
+        stop: A frame, as log time and arrival number, that ends them before; not among them.
+
+    Raises:
+        PayloadError: There is no key frame, or a payload is missing or damaged.
+    """
+    last, picture = _place(message), picture_of(session)
+    bounds = (None, message.log_time_ns + 1)
+    question = Question((message.topic,), (message.recording,), bounds, reverse=True)
+    size = 0
+    for run in Planner(session, question, Counters()).runs():
+        for each in messages_in(run, picture):
+            if _place(each) > last:
+                continue
+            if _place(each) == stop:
+                return
+            if each.is_reduced:
+                raise PayloadError(
+                    "a frame of video cannot be decoded: the payload of one between it and "
+                    "the key frame before it was dropped under pressure"
+                )
+            form, data = frame_of(each.decode())
+            yield each, form, data
+            if is_key_frame(form, data):
+                return
+            size += len(data)
+            if size > _MAX_BYTES:
+                raise PayloadError(
+                    "a frame of video cannot be decoded: there is no key frame in the "
+                    f"{_MAX_BYTES >> 20} MiB before it"
+                )
+    raise PayloadError("a frame of video cannot be decoded: there is no key frame before it")
+
+
 @dataclass(slots=True)
 class _Playing:
     """A decoder, and the frame that it has taken last: log time, arrival number, picture."""
@@ -121,48 +191,21 @@ class VideoPictures:
             return playing.picture
 
     def _decoded(self, message: Message, playing: _Playing | None) -> _Playing:
-        frames, is_continued = self._frames(message, playing)
-        begin = playing.place[0] if is_continued and playing else frames[0][0]
+        if playing is not None and playing.decoder.is_over:
+            playing = None
+        stop = None if playing is None else playing.place
+        frames = [*back_to_key(self._session, message, stop)][::-1]
+        first, form, data = frames[0]
+        if playing is None or is_key_frame(form, data):
+            begin, decoder = first.log_time_ns, None
+        else:
+            begin, decoder = playing.place[0], playing.decoder
         self._check_whole(message, frames[-1][1], begin)
-        decoder = playing.decoder if is_continued and playing else VideoDecoder(frames[0][1])
-        for number, (_, form, data) in enumerate(frames, 1):
-            picture = decoder.decode(form, data, is_wanted=number == len(frames))
+        decoder = decoder or VideoDecoder(form)
+        for each, form, data in frames:
+            picture = decoder.decode(form, data, is_wanted=each is frames[-1][0])
         assert picture is not None
         return _Playing(decoder, _place(message), picture)
-
-    def _frames(
-        self, message: Message, playing: _Playing | None
-    ) -> tuple[list[tuple[int, str, bytes]], bool]:
-        """Time, format and bytes of the frames to decode, and whether a decoder goes on."""
-        place = _place(message)
-        bounds = (None, message.log_time_ns + 1)
-        question = Question((message.topic,), (message.recording,), bounds, reverse=True)
-        frames: list[tuple[int, str, bytes]] = []
-        size = 0
-        for run in Planner(self._session, question, Counters()).runs():
-            for each in messages_in(run):
-                if _place(each) > place:
-                    continue
-                if playing is not None and _place(each) == playing.place:
-                    if not playing.decoder.is_over:
-                        return frames[::-1], True
-                    playing = None
-                if each.is_reduced:
-                    raise PayloadError(
-                        "a frame of video cannot be decoded: the payload of one between it and "
-                        "the key frame before it was dropped under pressure"
-                    )
-                form, data = frame_of(each.decode())
-                frames.append((each.log_time_ns, form, data))
-                size += len(data)
-                if is_key_frame(form, data):
-                    return frames[::-1], False
-                if size > _MAX_BYTES:
-                    raise PayloadError(
-                        "a frame of video cannot be decoded: there is no key frame in the "
-                        f"{_MAX_BYTES >> 20} MiB before it"
-                    )
-        raise PayloadError("a frame of video cannot be decoded: there is no key frame before it")
 
     def _check_whole(self, message: Message, form: str, begin: int) -> None:
         """Refuse a frame that may refer to a lost one.

@@ -1,0 +1,269 @@
+"""Writes a topic's pictures as a video in an MP4 file, each at its time.
+
+Frames of H.264, H.265 and AV1 are copied; images, and frames in another order than they are shown,
+become H.264. Time 0 is the log time of the first picture, which is in the file's `comment`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections import deque
+from datetime import UTC, datetime
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog.arrays import is_video_type
+from hybridlog.arrays.bitstream import frame_of, is_key_frame
+from hybridlog.arrays.video import VideoDecoder, pyav
+from hybridlog.drawing.images import shown_pixels
+from hybridlog.formats.writing import FileWriter, Sink, Target, failures
+from hybridlog.query.times import format_time
+from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+    from hybridlog_storage.messages import Buffer
+
+_TICKS: Final = 10**6
+"""Units of time in a second. With more of them, two frames could not be far from each other."""
+_MAX_STEP: Final = 2**31 - 1
+"""Ticks from one frame to the next, 35 minutes."""
+_ONLY_STEP: Final = _TICKS // 10
+"""Duration of a picture that is alone."""
+_STREAMS: Final = {"h264": "h264", "h265": "hevc", "av1": "obu"}
+"""Names of streams of frames by the format of a message."""
+_ENCODER: Final = {"preset": "veryfast", "crf": "18"}
+_BT601: Final = 6
+
+
+class Mp4Writer(FileWriter):
+    """Writes a video.
+
+    Args:
+        target: Path of the file.
+
+    Raises:
+        UsageError: The target is a stream, or cannot be written.
+        MissingDependencyError: PyAV is not installed.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        self._av = pyav()
+        if not isinstance(target, str | os.PathLike):
+            raise UsageError("mp4 is no stream: name a file with -o.")
+        self._sink = _SeekableSink(target)
+        self._file: Any = self._av.open(
+            self._sink,
+            "w",
+            format="mp4",
+            options={"video_track_timescale": str(_TICKS), "movie_timescale": str(_TICKS)},
+        )
+        self._track: Any = None
+        self._size = (0, 0)
+        self._copied = ""  # the format of frames that are copied
+        self._source = ("", "")
+        self._form = ""
+        self._decoder: VideoDecoder | None = None
+        self._waiting: deque[int] = deque()  # times of pictures that the decoder holds back
+        self._begin = self._last = self._tick = 0
+        self._step = _ONLY_STEP
+
+    def write(self, message: Message) -> None:
+        """Append the picture of a message.
+
+        Raises:
+            UsageError: It is of another topic, recording, or size than those before, or earlier.
+            PayloadError: It has none, or does not follow the frames before.
+            DefinitionError: No usable definition exists.
+            DiskFullError: No space left.
+        """
+        source = (message.recording, message.topic)
+        if self._track is not None and source != self._source:
+            raise UsageError(
+                "An MP4 is of one topic in one recording: choose one, or name a file for each "
+                "with --split-by recording."
+            )
+        with self._sink.checked():
+            if is_video_type(message.type):
+                self._add_frame(message)
+            else:
+                self._encode(shown_pixels(message), message.log_time_ns)
+        self._source = source
+
+    def _add_frame(self, message: Message) -> None:
+        form, data = frame_of(message.decode())
+        is_key = is_key_frame(form, data)
+        if self._decoder is None or self._decoder.is_over or (is_key and form != self._form):
+            if not is_key:
+                raise PayloadError(
+                    "a frame of video cannot be decoded: there is no key frame before it"
+                )
+            self._end_of_frames()
+            self._form, self._decoder = form, VideoDecoder(form, in_order=True)
+        if form == "av1":
+            message.to_numpy()  # the frames themselves do not tell that one is lost
+        try:
+            pictures = self._decoder.take(form, data)
+        except PayloadError:
+            self._end_of_frames()
+            raise
+        time = message.log_time_ns
+        self._waiting.append(time)
+        if self._track is None and pictures and len(self._waiting) == 1:
+            self._copied = form
+            with self._av.open(io.BytesIO(data), format=_STREAMS[form]) as stream:
+                track = self._file.add_stream_from_template(stream.streams.video[0], opaque=True)
+            self._start(track, (pictures[0].width, pictures[0].height), time)
+        if not self._copied:
+            self._show(pictures)
+            return
+        self._waiting.clear()
+        if len(pictures) != 1 or form != self._copied:
+            raise UsageError(self._changed(f"{self._copied}, then other frames", time))
+        self._check_size((pictures[0].width, pictures[0].height), time)
+        packet = self._av.Packet(data)
+        packet.pts = packet.dts = self._tick_at(time)
+        packet.is_keyframe = is_key
+        self._mux(packet)
+
+    def _show(self, pictures: list[Any]) -> None:
+        for one in pictures:
+            self._encode(one.to_ndarray(format="rgb24"), self._waiting.popleft())
+
+    def _end_of_frames(self) -> None:
+        """Write what the decoder holds back; it takes no more."""
+        if self._decoder is not None and self._waiting:
+            with contextlib.suppress(PayloadError):
+                self._show(self._decoder.rest())
+        self._waiting.clear()
+        self._decoder = None
+
+    def _encode(self, pixels: NDArray[np.uint8], time: int) -> None:
+        height, width = pixels.shape[:2]
+        # H.264 has an even number of rows and columns.
+        even = [(0, height % 2), (0, width % 2), (0, 0)][: pixels.ndim]
+        pixels = np.ascontiguousarray(np.pad(pixels, even, mode="edge"))
+        size = (pixels.shape[1], pixels.shape[0])
+        if self._track is None:
+            self._start(self._encoder(size), size, time)
+        self._check_size(size, time)
+        form = "gray" if pixels.ndim == 2 else "rgb24"
+        frame = self._av.VideoFrame.from_ndarray(pixels, format=form).reformat(format="yuv420p")
+        frame.pts, frame.time_base = self._tick_at(time), Fraction(1, _TICKS)
+        for packet in self._track.encode(frame):
+            self._mux(packet)
+
+    def _encoder(self, size: tuple[int, int]) -> Any:
+        try:
+            track = self._file.add_stream("libx264", rate=30, options=_ENCODER)
+        except (self._av.FFmpegError, ValueError) as error:
+            raise MissingDependencyError("this PyAV cannot encode H.264") from error
+        track.width, track.height = size
+        track.pix_fmt = "yuv420p"
+        context = track.codec_context
+        context.time_base, context.max_b_frames, context.gop_size = Fraction(1, _TICKS), 0, 60
+        context.colorspace = _BT601
+        return track
+
+    def _start(self, track: Any, size: tuple[int, int], time: int) -> None:
+        self._track, self._size = track, size
+        self._begin = self._last = time
+        track.time_base = Fraction(1, _TICKS)
+        moment = datetime.fromtimestamp(time // 10**9, UTC)
+        self._file.metadata["creation_time"] = f"{moment:%Y-%m-%dT%H:%M:%SZ}"
+        self._file.metadata["comment"] = f"log_time_ns={time}"
+
+    def _tick_at(self, time: int) -> int:
+        """The time of the next picture in the file."""
+        if time < self._last:
+            raise UsageError("An MP4 is in the order of time: leave out --reverse.")
+        tick = (time - self._begin + 500) // 1000
+        if time > self._begin or self._tick:
+            tick = max(tick, self._tick + 1)
+            if tick - self._tick > _MAX_STEP:
+                raise UsageError(self._changed("no picture for more than 35 minutes", time))
+            self._step = tick - self._tick
+        self._last, self._tick = time, tick
+        return tick
+
+    def _mux(self, packet: Any) -> None:
+        packet.stream, packet.time_base = self._track, Fraction(1, _TICKS)
+        packet.duration = self._step  # of the last one; that of others is known by the next one
+        self._file.mux_one(packet)
+
+    def _check_size(self, size: tuple[int, int], time: int) -> None:
+        if size != self._size:
+            sizes = [f"{width} x {height}" for width, height in (self._size, size)]
+            raise UsageError(self._changed(f"pictures of {sizes[0]}, then of {sizes[1]}", time))
+
+    def _changed(self, what: str, time: int) -> str:
+        return (
+            f"{self._source[1]} has {what}, at {format_time(time)}; a video cannot: choose the "
+            "time before or after with --between, or write --format png."
+        )
+
+    def _finish(self) -> None:
+        with self._sink.checked():
+            self._end_of_frames()
+            if self._track is None:
+                raise UsageError("There is no image in this answer.")
+            if not self._copied:
+                for packet in self._track.encode(None):
+                    self._mux(packet)
+            self._file.close()
+        self._sink.commit()
+
+    def _discard(self) -> None:
+        self._sink.abort()
+        with contextlib.suppress(Exception):  # it cannot be completed
+            self._file.close()
+
+
+class _SeekableSink(Sink):
+    """A sink whose library goes back to complete its headers, and may lose what is raised in it.
+
+    Args:
+        target: Path.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self._failure: BaseException | None = None
+
+    def write(self, data: Buffer) -> int:
+        """Append bytes; nothing after a failure."""
+        if self._failure is None:
+            try:
+                return super().write(data)
+            except BaseException as error:
+                self._failure = error
+        return memoryview(data).nbytes
+
+    @contextlib.contextmanager
+    def checked(self) -> Iterator[None]:
+        """Raise what writing in the block has raised."""
+        with failures(self.name):
+            yield
+        if self._failure is not None:
+            raise self._failure
+
+    def seekable(self) -> bool:
+        """True."""
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place in the file; after `abort`, nowhere."""
+        return 0 if self.closed else self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """The place in the file."""
+        return 0 if self.closed else self._file.tell()

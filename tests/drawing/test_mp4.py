@@ -1,0 +1,351 @@
+"""`--format mp4`: times and pictures, as PyAV reads the files."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+import hybridlog as hl
+from hybridlog.arrays.video import VideoDecoder
+from hybridlog.cli.answers import write_answer
+from hybridlog.formats import OUTPUTS
+from hybridlog.formats.writing import Sink
+from hybridlog.query.query import Query
+from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
+from tests.cli.within import answer
+from tests.odd_messages import ros_channel
+from tests.ros_values import ROS1
+
+from .test_video import (
+    BASE,
+    COUNT,
+    ENCODERS,
+    GROUP,
+    MS,
+    STEP,
+    decoded,
+    drawn,
+    encoded,
+    payload,
+    psnr,
+    register,
+    write,
+)
+
+av = pytest.importorskip("av")
+
+ODD = [0, 10 * MS + 700, 10 * MS + 700, 35 * MS + 123_456, 3000 * MS, 4000 * MS]
+"""Times of images after `BASE`, two of them equal."""
+DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
+
+
+def read(path: Path) -> tuple[str, list[int], list[NDArray[Any]]]:
+    """Codec, log times of the pictures as the file has them, and the pictures."""
+    with av.open(str(path)) as file:
+        begin = int(file.metadata["comment"].removeprefix("log_time_ns="))
+        track = file.streams.video[0]
+        frames = [*file.decode(track)]
+        times = [begin + round(frame.pts * track.time_base * 10**9) for frame in frames]
+        name = track.codec_context.name
+        return name, times, [frame.to_ndarray(format="rgb24") for frame in frames]
+
+
+def to_mp4(query: Query, path: Path) -> None:
+    """Write a file as `fetch` does."""
+    write_answer(query, "mp4", path, quiet=True)
+
+
+def reordered(form: str) -> list[bytes]:
+    """Frames with others between them that are shown before; in the order of decoding."""
+    context: Any = av.CodecContext.create({"h264": "libx264", "h265": "libx265"}[form], "w")
+    context.width, context.height, context.pix_fmt = 64, 48, "yuv420p"
+    context.time_base, context.framerate = Fraction(1, 10), Fraction(10)
+    context.gop_size, context.max_b_frames = GROUP, 2
+    key = "x264-params" if form == "h264" else "x265-params"
+    quiet = "" if form == "h264" else ":log-level=none"
+    context.options = {"preset": "fast", key: f"repeat-headers=1:annexb=1{quiet}"}
+    frames: list[bytes] = []
+    for number, pixels in enumerate(drawn()):
+        picture = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p")
+        picture.pts = number
+        frames += [bytes(packet) for packet in context.encode(picture)]
+    return frames + [bytes(packet) for packet in context.encode(None)]
+
+
+def write_image_topics(store: hl.Store) -> None:
+    types = ROS1.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = types["std_msgs/msg/Header"](seq=1, stamp=stamp, frame_id="camera")
+    with store.start("images") as recording:
+
+        def add(topic: str, picture: NDArray[Any], time: int, encoding: str) -> None:
+            kind = (
+                "sensor_msgs/msg/Image" if encoding != "jpeg" else "sensor_msgs/msg/CompressedImage"
+            )
+            if encoding == "jpeg":
+                file = io.BytesIO()
+                Image.fromarray(picture).save(file, "JPEG", quality=95)
+                data = np.frombuffer(file.getvalue(), np.uint8)
+                message = types[kind](header, format="jpeg", data=data)
+            else:
+                height, width = picture.shape[:2]
+                row = width * (1 if picture.ndim == 2 else 3)
+                message = types[kind](
+                    header,
+                    height=height,
+                    width=width,
+                    encoding=encoding,
+                    is_bigendian=0,
+                    step=row,
+                    data=picture.reshape(-1),
+                )
+            recording.write(
+                ros_channel(topic, kind, 1),
+                bytes(ROS1.serialize_ros1(message, kind)),
+                log_time=BASE + time,
+            )
+
+        for n, time in enumerate(ODD):
+            picture = drawn()[n]
+            add("/odd", np.ascontiguousarray(picture[:47, :63]), time, "rgb8")
+            add("/compressed", picture, time, "jpeg")
+            mixed = picture[..., 0] if n % 2 else picture[..., ::-1]
+            add("/mixed", np.ascontiguousarray(mixed), time, "mono8" if n % 2 else "bgr8")
+            add("/grows", picture if n < 3 else picture.repeat(2, 0), time, "rgb8")
+            add("/far", picture, time * 1000, "rgb8")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """A recording a format, one with frames in another order, one of images."""
+    path = tmp_path_factory.mktemp("mp4")
+    with hl.open(path / "store", create=True, mongo="none") as store:
+        for form in ENCODERS:
+            topics: dict[str, Any] = {"/cam": ("cdr", encoded(form))}
+            if form == "h264":
+                frames = encoded(form)
+                topics["/gap"] = ("json", [*frames[:7], None, *frames[8:]])
+                topics["/empty"] = ("cdr", [*frames[:7], b"", *frames[8:]])
+                topics["/none"] = ("json", [b"no video"] * 2)
+            if form != "av1":
+                topics["/b"] = ("protobuf", reordered(form))
+            write(path / f"{form}.mcap", topics, form)
+            store.record(path / f"{form}.mcap", name=form)
+        write_image_topics(store)
+        yield store
+
+
+def rounded(times: Sequence[int]) -> list[int]:
+    """Times after the first one to a microsecond, none equal."""
+    made: list[int] = []
+    for time in times:
+        tick = times[0] + (time - times[0] + 500) // 1000 * 1000
+        made.append(max(tick, made[-1] + 1000) if made else tick)
+    return made
+
+
+@pytest.mark.parametrize("form", ENCODERS)
+def test_frames_are_copied(store: hl.Store, form: str, tmp_path: Path) -> None:
+    out = tmp_path / "cam.mp4"
+    answer("fetch", "-t", "/cam", "-r", form, "-o", out, store=store.directory.path)
+    codec, times, pictures = read(out)
+    assert codec == DECODERS[form]
+    assert times == [BASE + n * STEP for n in range(COUNT)]
+    assert np.array_equal(pictures, decoded(form))
+    with av.open(str(out)) as file:
+        keys = [packet.is_keyframe for packet in file.demux(video=0) if packet.size]
+    assert keys == [n % GROUP == 0 for n in range(COUNT)]
+    slices = tmp_path / "slice.mp4"
+    for begin, first in ((7, 5), (5, 5)):
+        asked = ("-t", "/cam", "-r", form, "--between", BASE + begin * STEP, BASE + 9 * STEP)
+        done = answer("fetch", *asked, "-o", slices, "--force", store=store.directory.path)
+        assert ("2 frames of video in front" in done.err) == (begin == 7)
+        _, times, pictures = read(slices)
+        assert times == [BASE + n * STEP for n in range(first, 9)]
+        assert np.array_equal(pictures, decoded(form)[first:9])
+    asked = ("-t", "/cam", "-r", form, "--between", BASE + 7 * STEP, BASE + 12 * STEP)
+    done = answer(
+        "fetch", *asked, "--no-latched", "-o", slices, "--force", store=store.directory.path
+    )
+    assert "3 messages are left out; the first: a frame of video" in done.err
+    assert read(slices)[1] == [BASE + n * STEP for n in (10, 11)]
+
+
+@pytest.mark.parametrize("form", ["h264", "h265"])
+def test_frames_in_another_order_are_encoded(store: hl.Store, form: str, tmp_path: Path) -> None:
+    """Each picture is shown when its place in the order of the pictures came."""
+    out = tmp_path / "b.mp4"
+    answer("fetch", "-t", "/b", "-r", form, "-o", out, store=store.directory.path)
+    codec, times, pictures = read(out)
+    assert codec == "h264"
+    assert times == [BASE + n * STEP for n in range(COUNT)]
+    for picture, wanted in zip(pictures, drawn(), strict=True):
+        assert np.argmin([((picture - one.astype(float)) ** 2).mean() for one in drawn()]) == (
+            np.argmin([((wanted - one.astype(float)) ** 2).mean() for one in drawn()])
+        )
+
+
+@pytest.mark.parametrize("topic", ["/odd", "/compressed", "/mixed"])
+def test_images_are_encoded(store: hl.Store, topic: str, tmp_path: Path) -> None:
+    out = tmp_path / "images.mp4"
+    done = answer("fetch", "-t", topic, "-o", out, "-v", store=store.directory.path)
+    assert "6 messages" in done.err
+    codec, times, pictures = read(out)
+    assert codec == "h264"
+    assert times == rounded([BASE + time for time in ODD])
+    for n, picture in enumerate(pictures):
+        assert picture.shape == (48, 64, 3)  # rows and columns are even
+        shown, wanted = picture, drawn()[n]
+        if topic == "/odd":
+            shown, wanted = picture[:47, :63], wanted[:47, :63]
+        if topic == "/mixed" and n % 2:
+            wanted = np.repeat(wanted[..., :1], 3, axis=2)
+        assert psnr(shown, wanted) > 20
+
+
+def test_one_picture(store: hl.Store, tmp_path: Path) -> None:
+    out = tmp_path / "one.mp4"
+    asked = ("-t", "/odd", "--at", "+11ms", "-o", out)
+    answer("fetch", *asked, store=store.directory.path)
+    _, times, _ = read(out)
+    assert times == [BASE + ODD[2]]
+    with av.open(str(out)) as file:
+        assert file.streams.video[0].duration > 0
+    asked = ("-t", "/cam", "-r", "h265", "--at", BASE + 7 * STEP, "-o", out, "--force")
+    answer("fetch", *asked, store=store.directory.path)
+    assert read(out)[1] == [BASE + n * STEP for n in (5, 6, 7)]
+
+
+def test_frames_that_cannot_be_decoded_are_left_out(store: hl.Store, tmp_path: Path) -> None:
+    for topic, lost in (("/gap", {7, 8, 9}), ("/empty", {7, 8, 9})):
+        out = tmp_path / f"{topic[1:]}.mp4"
+        done = answer("fetch", "-t", topic, "-r", "h264", "-o", out, store=store.directory.path)
+        assert "left out; the first: a frame of video" in done.err
+        _, times, pictures = read(out)
+        kept = [n for n in range(COUNT) if n not in lost]
+        assert times == [BASE + n * STEP for n in kept]
+        assert np.array_equal(pictures, [decoded("h264")[n] for n in kept])
+
+
+def test_a_lost_frame_of_av1(tmp_path: Path) -> None:
+    """Frames of AV1 do not tell that one is missing; the ledger does."""
+    frames = encoded("av1")
+    path = tmp_path / "log.mcap"
+    write(path, {"/cam": ("json", [*frames])}, "av1")
+    log = bytearray(path.read_bytes())
+    log[log.index((BASE + 7 * STEP).to_bytes(8, "little")) + 80] ^= 255
+    path.write_bytes(log)
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        store.record(path)
+        to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
+    assert read(tmp_path / "out.mp4")[1] == [BASE + n * STEP for n in (0, 5, 10)]
+
+
+def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:
+    """Each refusal says why, and leaves no file."""
+    images = store.query(["/odd"], ["images"])
+    cam = store.query(["/cam"], ["h264"])
+    refused: list[tuple[Query, type[Exception], str]] = [
+        (store.query(["/grows"], ["images"]), UsageError, "64 x 48, then of 64 x 96, at 2025-"),
+        (store.query(["/far"], ["images"]), UsageError, "no picture for more than 35 minutes"),
+        (store.query(["/cam"], ["h264", "h265"]), UsageError, "--split-by recording"),
+        (store.query(["/odd", "/mixed"], ["images"]), UsageError, "one topic in one recording"),
+        (images.reverse(), UsageError, "--reverse"),
+        (cam.every(2), UsageError, "refer to one another"),
+        (cam.where("format == 'h264'"), UsageError, "refer to one another"),
+        (store.query(["/none"], ["h264"]), PayloadError, "video"),
+        (images.between("+1s", "+2s"), UsageError, "no image in this answer"),
+        (images.between(1, 2), TimeError, "."),
+    ]
+    for query, error, text in refused:
+        with pytest.raises(error, match=text):
+            to_mp4(query, tmp_path / "out.mp4")
+        assert not list(tmp_path.iterdir())
+    with pytest.raises(UsageError, match="name a file with -o"):
+        OUTPUTS["mp4"].open(io.BytesIO())
+    to_mp4(images.every(2), tmp_path / "out.mp4")
+    assert len(read(tmp_path / "out.mp4")[1]) == 3
+
+
+def test_frames_of_another_size_or_format(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        from mcap.writer import Writer
+
+        path = tmp_path / "log.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            channel = register(writer, "/cam", "json")
+            for n, form in enumerate(("h264", "h265")):
+                time = BASE + n * STEP
+                writer.add_message(channel, time, payload("json", form, encoded(form)[0]), time)
+            writer.finish()
+        store.record(path)
+        with pytest.raises(UsageError, match="/cam has h264, then other frames, at 2025-"):
+            to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
+        assert sorted(one.name for one in tmp_path.iterdir()) == ["log.mcap", "store"]
+
+
+def test_files_that_are_not_completed(
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Aborted, stopped, or on a full disk: nothing stays, and nothing is said twice."""
+    messages = [*store.query(["/odd"], ["images"])]
+    writer = OUTPUTS["mp4"].open(tmp_path / "out.mp4")
+    for message in messages:
+        writer.write(message)
+    writer.abort()
+    assert not list(tmp_path.iterdir())
+
+    def stop(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    def full(*_: object) -> int:
+        raise DiskFullError("no space left")
+
+    query = store.query(["/cam"], ["h264"])
+    for raising, error in ((stop, KeyboardInterrupt), (full, DiskFullError)):
+        monkeypatch.setattr(Sink, "write", raising)
+        with pytest.raises(error):
+            to_mp4(query, tmp_path / "out.mp4")
+        assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+
+    def fails(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(DiskFullError):
+        to_mp4(query, tmp_path / "out.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+def test_export_writes_a_file_a_topic(store: hl.Store, tmp_path: Path) -> None:
+    out = tmp_path / "videos"
+    done = answer("export", out, "-F", "mp4", "-r", "h264", store=store.directory.path)
+    assert sorted(one.name for one in out.iterdir()) == ["b.mp4", "cam.mp4", "empty.mp4", "gap.mp4"]
+    assert "/none: " in done.err
+    assert len(read(out / "cam.mp4")[1]) == COUNT
+    split = ("fetch", "-t", "/cam", "-o", tmp_path / "cam.mp4", "--split-by", "recording")
+    answer(*split, store=store.directory.path)
+    for form in ENCODERS:
+        assert np.array_equal(read(tmp_path / f"cam-{form}.mp4")[2], decoded(form))
+
+
+def test_a_decoder_in_order_gives_each_picture_once() -> None:
+    decoder = VideoDecoder("h264", in_order=True)
+    shown = [one.pts for data in reordered("h264") for one in decoder.take("h264", data)]
+    shown += [one.pts for one in decoder.rest()]
+    assert sorted(shown) == [*range(COUNT)]
+    assert shown != sorted(shown)
