@@ -135,13 +135,13 @@ def align_command(
             clock=clock,
             across_recordings=bool(beside),
         )
-        answer_tables(aligned.to_tables(), aligned.schema, to)
+        # That there is a transform shows only at the end.
+        completeness = aligned.completeness if strict else None
+        answer_tables(aligned.to_tables(), aligned.schema, to, completeness)
         sys.stdout.flush()
         if not quiet:
             print_cost(aligned.counters, time.monotonic() - started, count=False)
             notes(aligned.remarks(base, *topic))
-        if strict:  # that there is a transform shows only now
-            aligned.completeness().check()
 
 
 def _queries(

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         Target,
     )
     from hybridlog.message import Message
+    from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
@@ -204,31 +205,37 @@ def table_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return decorated
 
 
-def answer_query(query: Query, to: Destination, *, front: Front) -> Query:
+def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
     """Print or write the messages of a query.
 
     Args:
         query: The query; on the screen and without a limit, its first messages are shown.
         to: Format and place.
         front: The latched messages in front of the answer.
+        strict: Write no file if a pose has no transform, which shows only at the end.
 
     Returns:
         The query that was answered, with its counters.
     """
     if to.form != SCREEN:
         with to.opened() as target:
-            write_answer(query, to.form, target, front=front, quiet=to.quiet or to.path is None)
+            quiet = to.quiet or to.path is None
+            write_answer(query, to.form, target, front=front, quiet=quiet, strict=strict)
         return query
     limit = query.question.limit
     answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
-    _print_rows(answered.to_tables(), limit, answered.topics)
+    tables = _checked(answered.to_tables(), answered.completeness if strict else None)
+    _print_rows(tables, limit, answered.topics)
     counters = answered.counters
     counters.messages = _shown(counters.messages, limit, "message")
     return answered
 
 
 def answer_tables(
-    tables: Iterable[pa.Table], schema: Callable[[], pa.Schema | None], to: Destination
+    tables: Iterable[pa.Table],
+    schema: Callable[[], pa.Schema | None],
+    to: Destination,
+    completeness: Callable[[], Completeness] | None = None,
 ) -> None:
     """Print or write tables that are no messages, all rows or nothing.
 
@@ -236,13 +243,15 @@ def answer_tables(
         tables: The rows, at least one table.
         schema: Gives the columns; None where only the rows tell them.
         to: Format and place.
+        completeness: Gives what the rows lack, after the last one; they must not lack anything.
     """
     if to.form == SCREEN:
         # One more than is shown tells whether there is more.
         some = _limited(tables, SCREEN_ROWS + 1 if to.limit is None else to.limit)
-        _shown(_print_rows(some, to.limit), to.limit, "row")
+        _shown(_print_rows(_checked(some, completeness), to.limit), to.limit, "row")
         return
     limited = tables if to.limit is None else _limited(tables, to.limit)
+    limited = _checked(limited, completeness)
     quiet = to.quiet or to.path is None
     with to.opened() as target, progress_bar(to.form, None, quiet=quiet) as bar:
         counted = _with_progress(limited, bar)
@@ -271,6 +280,7 @@ def write_answer(
     front: Front = IN_FORCE,
     extras: Extras | None = None,
     quiet: bool = False,
+    strict: bool = False,
 ) -> int:
     """Write the answer of a query, all of it or nothing.
 
@@ -281,6 +291,7 @@ def write_answer(
         front: The latched messages in front of the answer, in logs.
         extras: What a log has beside messages; None for nothing.
         quiet: No progress bar.
+        strict: As for `answer_query`.
 
     Returns:
         Messages that are missing, because they do not fit their definition.
@@ -295,7 +306,7 @@ def write_answer(
         yield from lines(Planner(query.session, query.question, query.counters))
 
     if query.question.frame is not None:
-        _write_in_frame(query, form, target)
+        _write_in_frame(query, form, target, strict=strict)
         return 0
     content = OUTPUTS[form].content
     total = 0 if quiet else payload_bytes(query)
@@ -322,10 +333,10 @@ def write_answer(
     return counters.messages - counters.reduced - written
 
 
-def _write_in_frame(query: Query, form: str, target: Target) -> None:
+def _write_in_frame(query: Query, form: str, target: Target, *, strict: bool) -> None:
     """Write points and poses in the frame of the question."""
     if OUTPUTS[form].content != "payloads":
-        tables = query.to_tables()
+        tables = _checked(query.to_tables(), query.completeness if strict else None)
         rows = Rows(
             lines=lambda: chain.from_iterable(map(_lines_of, tables)),
             tables=lambda: tables,
@@ -340,6 +351,21 @@ def _write_in_frame(query: Query, form: str, target: Target) -> None:
         for one in points_of(query.session, query.question, query.counters):
             message = one.message
             writer.add_points(one.points, message.topic, message.type, message.log_time_ns)
+        if strict:
+            query.completeness().check()
+
+
+def _checked(
+    tables: Iterable[pa.Table], completeness: Callable[[], Completeness] | None
+) -> Iterator[pa.Table]:
+    """The tables of an answer, which is checked behind the last one: before a file is complete.
+
+    Raises:
+        IncompleteError: Poses have no transform, or messages are lost.
+    """
+    yield from tables
+    if completeness is not None:
+        completeness().check()
 
 
 def write_following(following: Following, form: str) -> None:

@@ -163,11 +163,9 @@ def fetch_command(**parameters: Any) -> None:
                 original_times=choices.original_times,
             )
             if choices.split is not None:
-                _write_pieces(store, query, choices.split, to, front)
+                _write_pieces(store, query, choices, to, front)
                 return
-            query = answer_query(query, to, front=front)
-            if choices.strict and choices.frame is not None:
-                query.completeness().check(payloads=True)
+            query = answer_query(query, to, front=front, strict=choices.strict)
         sys.stdout.flush()
         if not choices.quiet:
             cost = query.counters.copy()
@@ -178,12 +176,16 @@ def fetch_command(**parameters: Any) -> None:
                 print_lost(query, count)
 
 
-def _write_pieces(store: Store, query: Query, how: str, to: Destination, front: Front) -> None:
+def _write_pieces(
+    store: Store, query: Query, choices: _Choices, to: Destination, front: Front
+) -> None:
     """Write a file for each part of the answer, and a line about each."""
+    how = choices.split
     assert to.path is not None
+    assert how is not None
     folder = is_directory(to.form, to.path)
     for path, one in pieces(store, query, how, to.path, force=to.force, is_directory=folder):
-        answer_query(one, replace(to, path=path), front=front)
+        answer_query(one, replace(to, path=path), front=front, strict=choices.strict)
         if not to.quiet:
             counters = one.counters
             given = output.counted(counters.messages - counters.reduced, "message")

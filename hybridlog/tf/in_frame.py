@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
@@ -54,6 +55,28 @@ class _Pose(NamedTuple):
     rotation: str
     covariance: str
     is_vector: bool
+
+
+class _Places(NamedTuple):
+    """The columns of a topic's messages that are in the frame of their header.
+
+    Attributes:
+        poses: Those of a message.
+        lists: Those of the elements of lists, such as of a path, by the name of the list.
+        stamp: Path of the time.
+        frame: Path of the frame.
+    """
+
+    poses: Sequence[_Pose]
+    lists: Mapping[str, Sequence[_Pose]]
+    stamp: str
+    frame: str
+
+    def columns(self) -> Iterator[str]:
+        yield from (self.stamp, self.frame, *self.lists)
+        for pose in self.poses:
+            yield from (f"{pose.position}.{axis}" for axis in "xyz")
+            yield from (f"{pose.rotation}.{axis}" for axis in ("xyzw" if pose.rotation else ""))
 
 
 class Points(NamedTuple):
@@ -135,12 +158,16 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
 
 
 class _Looked:
-    """Looks up transforms to the frame of a question, and counts what is missing."""
+    """Looks up transforms to the frame of a question, and counts what is missing.
+
+    Attributes:
+        target: The frame.
+    """
 
     def __init__(self, session: Session, question: Question, counters: Counters) -> None:
         self._session = session
         self._counters = counters
-        self._target = str(question.frame)
+        self.target = str(question.frame)
         self._trees: dict[str, FrameTree] = {}
 
     def _tree(self, recording: str) -> FrameTree:
@@ -161,16 +188,16 @@ class _Looked:
         for pair in dict.fromkeys(pairs):
             recording, frame = pair
             tree = self._tree(recording)
-            tree.check(self._target)
+            tree.check(self.target)
             rows = np.flatnonzero([one == pair for one in pairs])
             if frame.removeprefix("/") not in tree.names:
                 missing[f"no frame {frame!r} among the transforms"] += len(rows)
                 continue
-            found = tree.lookup(self._target, frame, times[rows])
+            found = tree.lookup(self.target, frame, times[rows])
             made.translation[rows], made.rotation[rows] = found.translation, found.rotation
             missing.update(found.missing)
         self._counters.no_transform += tuple(
-            (f"to {self._target}: {why}", count) for why, count in missing.items()
+            (f"to {self.target}: {why}", count) for why, count in missing.items()
         )
         return made
 
@@ -203,14 +230,22 @@ def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
         yield pa.table({"log_time": pa.array([], stamp)})
 
 
-def _places_in(planner: Planner) -> tuple[list[_Pose], str, str] | None:
-    """The poses of a topic, and the paths of their time and their frame; None without."""
+def _places_in(planner: Planner) -> _Places | None:
+    """The poses of a topic; None without any, or without a time or a frame of theirs."""
     question = planner.question
     known = planner.session.field_types(question.topics, question.recordings) or {}
-    poses = [*_poses_among(known)]
+    poses, lists = [*_poses_among(known)], {}
+    for name, kind in known.items():
+        if kind.endswith("[]") and "[" not in name:
+            begin = f"{name}[]."
+            inside = {p.removeprefix(begin): k for p, k in known.items() if p.startswith(begin)}
+            if found := [*_poses_among(inside)]:
+                lists[name] = found
     stamp = next((name for name in _STAMPS if name in known), None)
     frame = next((name for name in _FRAMES if name in known), None)
-    return None if not poses or stamp is None or frame is None else (poses, stamp, frame)
+    if not (poses or lists) or stamp is None or frame is None:
+        return None
+    return _Places(poses, lists, stamp, frame)
 
 
 def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
@@ -222,13 +257,12 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
             f"{question.topics[0]} has no points or poses with a frame and a time of their own, "
             "so it cannot be in another frame."
         )
-    poses, stamp, frame = found
+    stamp, frame = found.stamp, found.frame
     several = question.names_recording or len(session.chosen(question)) > 1
     plain = replace(question, frame=None)
     asked, hidden = question.fields, set() if several else {"recording"}
     if asked is not None:
-        needed = [stamp, frame, *_columns_of(poses)]
-        added = [one for one in needed if not _is_in(one, asked)]
+        added = [one for one in found.columns() if not _is_in(one, asked)]
         hidden |= {*added}
         plain = replace(plain, fields=(*asked, *added))
     ids = {one.label: one.id for one in session.snapshot().summaries}
@@ -239,8 +273,11 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
         moved = looked.transforms(recordings, frames, times)
         columns = dict(zip(table.column_names, table.columns, strict=True))
-        for pose in poses:
+        for pose in found.poses:
             columns |= _pose_in_frame(columns, pose, moved)
+        for name, inside in found.lists.items():
+            lookup = _Elements(looked, recordings, frames, times, moved)
+            columns[name] = _list_in_frame(columns[name].combine_chunks(), inside, lookup)
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
 
@@ -274,6 +311,62 @@ def _pose_in_frame(
     return made
 
 
+class _Elements(NamedTuple):
+    """Transforms of the elements of lists: those of their messages, unless they name a frame."""
+
+    looked: _Looked
+    recordings: Sequence[str]
+    frames: Sequence[str]
+    times: NDArray[np.int64]
+    moved: Transform
+
+    def transforms(self, rows: NDArray[np.int64], frames: Sequence[str | None]) -> Transform:
+        """The transforms of elements, by the number of their message, and their own frame."""
+        others: dict[tuple[int, str], int] = {}
+        index = rows.copy()
+        for place, (row, frame) in enumerate(zip(rows.tolist(), frames, strict=True)):
+            if frame and frame != self.frames[row]:
+                index[place] = len(self.moved) + others.setdefault((row, frame), len(others))
+        of = [row for row, _ in others]
+        own = [frame for _, frame in others]
+        found = self.looked.transforms([self.recordings[r] for r in of], own, self.times[of])
+        return Transform(
+            np.concatenate([self.moved.translation, found.translation])[index],
+            np.concatenate([self.moved.rotation, found.rotation])[index],
+        )
+
+
+def _list_in_frame(column: Any, poses: Sequence[_Pose], lookup: _Elements) -> Any:
+    """A list of structures with poses, at the times of their messages."""
+    values, rows = column.flatten(), pc.list_parent_indices(column).to_numpy()
+    flat = pa.Table.from_struct_array(values)
+    while any(pa.types.is_struct(one.type) for one in flat.schema):
+        flat = flat.flatten()
+    columns: dict[str, Any] = dict(zip(flat.column_names, flat.columns, strict=True))
+    frame = next((name for name in _FRAMES if name in columns), None)
+    own = columns[frame].to_pylist() if frame else [None] * len(rows)
+    moved = lookup.transforms(rows.astype(np.int64), own)
+    for pose in poses:
+        columns |= _pose_in_frame(columns, pose, moved)
+    if frame:
+        columns[frame] = pa.array([lookup.looked.target] * len(rows), pa.string())
+    ends = np.cumsum(pc.fill_null(pc.list_value_length(column), 0).to_numpy())
+    offsets = pa.array(np.concatenate([[0], ends]), pa.int32())
+    nested = _nested("", values.type, columns)
+    return pa.ListArray.from_arrays(offsets, nested, mask=column.is_null())
+
+
+def _nested(path: str, kind: Any, columns: Mapping[str, Any]) -> Any:
+    """The array of a structure from the columns of its fields."""
+    if not pa.types.is_struct(kind):
+        found = columns[path]
+        return found.combine_chunks() if isinstance(found, pa.ChunkedArray) else found
+    names = [one.name for one in kind]
+    stem = f"{path}." if path else ""
+    arrays = [_nested(f"{stem}{one.name}", one.type, columns) for one in kind]
+    return pa.StructArray.from_arrays(arrays, names)
+
+
 def _numbers(columns: Mapping[str, Any], path: str, axes: str) -> NDArray[np.float64]:
     found = [columns[f"{path}.{axis}"].cast(pa.float64()).to_numpy() for axis in axes]
     return np.stack(found, axis=1)
@@ -290,12 +383,6 @@ def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
     for word in ("point", "vector"):
         if all(f"{word}.{axis}" in paths for axis in _XYZ):
             yield _Pose(word, "", "", is_vector=word == "vector")
-
-
-def _columns_of(poses: Sequence[_Pose]) -> Iterator[str]:
-    for pose in poses:
-        yield from (f"{pose.position}.{axis}" for axis in "xyz")
-        yield from (f"{pose.rotation}.{axis}" for axis in ("xyzw" if pose.rotation else ""))
 
 
 def _is_in(path: str, asked: Sequence[str]) -> bool:

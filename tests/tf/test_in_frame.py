@@ -21,6 +21,8 @@ from hybridlog_storage.errors import IncompleteError, TopicError, UsageError
 from tests.cli.running import run
 from tests.data import DATA, needs_data
 from tests.formats.test_places import read_ply
+from tests.odd_messages import ros_channel
+from tests.ros_values import ROS2
 from tests.tf.test_oracle import Oracle
 
 TILT = DATA / "real/tilt_laser.bag"
@@ -101,8 +103,18 @@ def test_scans_of_a_real_log(demo: Path, store: hl.Store, tmp_path: Path) -> Non
     rows = [json.loads(line) for line in done.out.splitlines()]
     assert rows[-1]["scan.x"] == table["x"][-1].as_py()
     assert rows[-1]["temperature.reading"] is not None
-    done = run(*aligned, "--in-frame", "tilt_base", "--strict", store=demo / "store", code=11)
-    assert "without a transform" in done.err
+    fetched = ("fetch", "-t", "scan", "-r", "tilt", "--strict", "--in-frame", "tilt_base")
+    for asked in (
+        ("--strict", "--in-frame", "tilt_base", *aligned[1:-2], "-F", "csv"),
+        (*fetched[1:], "-F", "ply"),
+        (*fetched[1:], "-F", "parquet"),
+        (*fetched[1:], "-F", "csv", "--split-by", "recording"),
+    ):
+        command = aligned[0] if "--to" in asked else "fetch"
+        out = tmp_path / "strict"
+        done = run(command, *asked, "-o", out, store=demo / "store", code=11)
+        assert "without a transform" in done.err
+        assert not [*tmp_path.glob("*strict*")]
 
 
 def test_poses_of_many_rows(demo: Path, store: hl.Store) -> None:
@@ -141,6 +153,82 @@ def test_poses_of_many_rows(demo: Path, store: hl.Store) -> None:
     plain = store.align(store.topic("battery"), store.topic("odom")).to_arrow()
     by_stamp = {row["header.stamp"]: row["pose.pose.position.x"] for row in rows}
     assert asof.to_pylist() == [by_stamp.get(one) for one in plain["odom.header.stamp"].to_pylist()]
+
+
+def test_lists_of_poses(tmp_path: Path) -> None:
+    """A path and an array of poses: each pose by its own frame, or by that of the message."""
+    types = ROS2.types
+    stamped, pose, point, turn, header, moment = (
+        types[f"{name[0]}/msg/{name[1]}"]
+        for name in (
+            ("geometry_msgs", "PoseStamped"),
+            ("geometry_msgs", "Pose"),
+            ("geometry_msgs", "Point"),
+            ("geometry_msgs", "Quaternion"),
+            ("std_msgs", "Header"),
+            ("builtin_interfaces", "Time"),
+        )
+    )
+    transform, vector = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/Vector3"]
+    frame = types["geometry_msgs/msg/TransformStamped"]
+    half = float(np.sqrt(0.5))
+
+    def head(name: str) -> Any:
+        return header(stamp=moment(sec=1, nanosec=0), frame_id=name)
+
+    def at(x: float) -> Any:
+        return pose(point(x=x, y=1.0, z=0.0), turn(x=0.0, y=0.0, z=0.0, w=1.0))
+
+    turned = turn(x=0.0, y=0.0, z=half, w=half)
+    links = [
+        frame(head("map"), name, transform(vector(x=shift, y=0.0, z=0.0), turned))
+        for name, shift in (("odom", 10.0), ("other", 20.0))
+    ]
+    own = ["odom", "", "other", "nowhere"]
+    sent: list[tuple[str, str, Any]] = [
+        ("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"](links)),
+        *(
+            ("/path", "nav_msgs/msg/Path", types["nav_msgs/msg/Path"](head(of), listed))
+            for of, listed in (
+                ("odom", []),
+                ("odom", [stamped(head(name), at(float(n))) for n, name in enumerate(own)]),
+                ("nowhere", [stamped(head(""), at(0.0))]),
+            )
+        ),
+        *(
+            ("/array", "geometry_msgs/msg/PoseArray", types["geometry_msgs/msg/PoseArray"](*one))
+            for one in ((head("odom"), [at(0.0), at(1.0)]), (head("other"), [at(2.0)]))
+        ),
+    ]
+    with hl.open(tmp_path / "store", create=True, mongo="none") as made:
+        with made.start("x") as recording:
+            for n, (topic, kind, message) in enumerate(sent):
+                data = bytes(ROS2.serialize_cdr(message, kind))
+                recording.write(ros_channel(topic, kind, 2), data, log_time=10**9 + n)
+        query = made.topic("/path").in_frame("map")
+        table = query.to_arrow()
+        plain = made.topic("/path").to_arrow()
+        assert table.schema.field("poses").type.equals(plain.schema.field("poses").type)
+        empty, path, lost = table["poses"].to_pylist()
+        assert empty == []
+        places = [[one["pose"]["position"][axis] for axis in "xyz"] for one in path]
+        # A quarter turn to the left makes x of y.
+        assert places[3] == [None] * 3
+        np.testing.assert_allclose(places[:3], [[9, 0, 0], [9, 1, 0], [19, 2, 0]], atol=1e-12)
+        rotation = [path[0]["pose"]["orientation"][axis] for axis in "xyzw"]
+        np.testing.assert_allclose(rotation, [0, 0, half, half])
+        assert {one["header"]["frame_id"] for one in path} == {"map"}
+        assert lost[0]["pose"]["position"] == dict.fromkeys("xyz")
+        assert (
+            dict(query.counters.no_transform)
+            == {"to map: no frame 'nowhere' among the transforms": 1}
+            or sum(n for _, n in query.counters.no_transform) == 2
+        )
+        arrays = made.topic("/array").in_frame("map").fields("poses").to_arrow()
+        assert arrays.column_names == ["log_time", "poses"]
+        listed = [one for row in arrays["poses"].to_pylist() for one in row]
+        found = [[one["position"][axis] for axis in "xyz"] for one in listed]
+        np.testing.assert_allclose(found, [[9, 0, 0], [9, 1, 0], [19, 2, 0]], atol=1e-12)
 
 
 def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:
