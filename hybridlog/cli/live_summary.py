@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -63,11 +62,11 @@ class LiveSummary:
 
     def print_and_exit(self, *, as_json: bool, quiet: bool) -> None:
         """Print it; exits with the code of the worst problem, if there is one."""
-        recorder, state = self._recorder, self._state
+        code = self._exit_code()
         if as_json:
-            summary = _summary(self._reports, state, recorder.reason)
+            summary = _summary(self._reports, self._state, self._recorder.reason)
             summary["broken"] = [asdict(one) for one in self._broken]
-            print(json.dumps({"report": summary}), flush=True)  # noqa: T201
+            output.print_json_line({"report": {**summary, "exit_code": code}})
         elif not quiet:
             self._print()
         if not quiet:
@@ -75,7 +74,6 @@ class LiveSummary:
                 output.note(line)
         for line in self._errors(is_reason_shown=not (as_json or quiet)):
             output.note(f"hybridlog: {line}")
-        code = self._exit_code()
         if code:
             raise click.exceptions.Exit(code)
 

@@ -135,12 +135,10 @@ def _cut(name: str, room: int) -> str:
 
 def summary(state: RecorderState) -> str:
     """One line for the whole recorder."""
-    rate = sum(topic.bytes_per_s for topic in state.topics)
-    hz = sum(topic.hz for topic in state.topics)
     parts = [
         f"{state.elapsed_s:.0f} s",
-        f"{hz:.0f} messages/s",
-        f"{output.size(rate)}/s",
+        f"{state.hz:.0f} messages/s",
+        f"{output.size(state.bytes_per_s)}/s",
         f"{output.size(state.stored_bytes)} stored",
         f"memory {100 * state.filled:.0f} %",
         _index(state),

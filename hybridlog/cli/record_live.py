@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -39,6 +38,16 @@ _SNAPSHOT = re.compile(r"snapshot \S+ because of ")
 
 def record_live(choices: RecordChoices) -> None:
     """Record until a bound is reached, the replay has ended, or Ctrl-C."""
+    try:
+        _record(choices)
+    except HybridlogError as error:
+        if choices.as_json:  # the last line is a report in any case
+            report = {"error": str(error), "exit_code": error.exit_code}
+            output.print_json_line({"report": report})
+        raise
+
+
+def _record(choices: RecordChoices) -> None:
     from hybridlog.live.recorder import Recorder, check_room
 
     # Wrong options are found before a store is made.
@@ -192,4 +201,4 @@ class _Display:
         elif self._as_json:
             from hybridlog.live.recorder import summary_of
 
-            print(json.dumps({"state": summary_of(state)}), flush=True)  # noqa: T201
+            output.print_json_line({"state": summary_of(state)})

@@ -15,6 +15,7 @@ MIN_USER_BUDGET = 1 << 20
 _SHARE = 16
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
+_OWN_MEMORY = Path("/proc/self/statm")
 
 
 @cache
@@ -36,6 +37,15 @@ def memory_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUPS) -> int:
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min([machine, *_limits(root, own)])
+
+
+def resident_bytes() -> int:
+    """Bytes of memory that this process holds; 0 where that is unknown."""
+    try:
+        pages = int(_OWN_MEMORY.read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _limits(root: Path, own: Path) -> Iterator[int]:

@@ -13,10 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.live.budget import default_budget
+from hybridlog.live.budget import default_budget, resident_bytes
 from hybridlog.live.control_server import ControlServer
+from hybridlog.live.machine_clock import MachineClock
 from hybridlog.live.policy import (
     PAYLOAD_STRIDE,
     SMALL_BYTES,
@@ -37,8 +39,9 @@ from hybridlog.live.silence import RULE, Commands, SilenceWatch
 from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
+from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause
-from hybridlog.record.marks import CONTRACT, mark_channel, mark_payload
+from hybridlog.record.marks import CLOCK_SET, CONTRACT, mark_channel, mark_payload
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
@@ -54,7 +57,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 _LOOK_S = 1.0
-_JUMP_S = 0.5
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
 _MAX_EXPECTED = 1000  # channels that get a collection before their first message
@@ -135,8 +137,12 @@ class RecorderState:
         free_bytes: Free space of the disk.
         stored_bytes: Payload bytes stored so far.
         snapshots: Snapshots so far; None when everything is stored.
+        ring_s: Seconds that the ring holds; None when everything is stored.
         taken: Messages that are stored or will be, by topic, when the state is requested.
         silent: Topics that are silent for longer than the contract allows.
+        breaches: Such silences so far.
+        clock_set_s: Seconds by which the clock of this machine was set since the start.
+        memory_bytes: Memory of the recorder's process; 0 where that is unknown.
     """
 
     name: str
@@ -152,8 +158,22 @@ class RecorderState:
     free_bytes: int
     stored_bytes: int
     snapshots: int | None = None
+    ring_s: float | None = None
     taken: Mapping[str, int] = field(default_factory=dict)
     silent: Sequence[str] = ()
+    breaches: int = 0
+    clock_set_s: float = 0.0
+    memory_bytes: int = 0
+
+    @property
+    def hz(self) -> float:
+        """Messages a second since the previous look."""
+        return sum(topic.hz for topic in self.topics)
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Payload bytes a second since the previous look."""
+        return sum(topic.bytes_per_s for topic in self.topics)
 
 
 @dataclass(slots=True)
@@ -178,6 +198,7 @@ class Recorder:
         sources: The sources; `start` starts them, `stop` stops them.
         options: Options.
         say: Shows a line to the user; called from any thread.
+        clock: The clock of log times; None for that of this machine.
     """
 
     def __init__(
@@ -186,7 +207,9 @@ class Recorder:
         sources: Sequence[LiveSource],
         options: RecorderOptions,
         say: Callable[[str], None],
+        clock: MachineClock | None = None,
     ) -> None:
+        self._clock = clock or MachineClock()
         self._sources = sources
         self._options = options
         self._tell = say
@@ -207,12 +230,14 @@ class Recorder:
         self._refused: tuple[Cause, str] | None = None
         self._marks = mark_channel()
         self._started = time.monotonic()
-        self._offset = time.time() - self._started
         self._looked = self._started
         self._lateness = Lateness(indexed_within_s(options.flush_interval_s))
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
         self._state: RecorderState | None = None
+        self._breaches = 0
+        self._clock_marks: list[tuple[str, Mapping[str, str], int]] = []
+        self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = None if options.contract is None else SilenceWatch(options.contract)
         self._commands = Commands(options.on_breach)
         self._watching = threading.Thread(target=self._watch, daemon=True)
@@ -233,6 +258,7 @@ class Recorder:
                 lambda reason: self._begin(store, {"trigger": reason}),
                 lambda reason: self.mark(reason, {"trigger": reason}),
                 self._tell,
+                clock=self._clock,
             )
         try:
             self._control = ControlServer(
@@ -290,6 +316,10 @@ class Recorder:
             raise
         if self._silence is not None:
             self._watching.start()
+        now = self._clock.now()
+        if self._newest is not None and self._newest.created > now:
+            says = f"the clock of this machine says {format_time(now)}"
+            self._note_clock(f"{says}, and recording {self._newest.label} was begun later", {}, now)
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
@@ -315,6 +345,7 @@ class Recorder:
         ended_at = self._now() if self._ended_at is None else self._ended_at
         for source in self._sources:
             source.stop()
+        self._mark_clock()
         self._over.set()
         if self._silence is not None:
             if self._watching.is_alive():
@@ -351,8 +382,9 @@ class Recorder:
         self._check_clock(now)
         missing: dict[tuple[str, bool], int] = {}
         lost: dict[str, int] = {}
-        if isinstance(self._target, Snapshots):
-            self._target.look()
+        ring = self._target if isinstance(self._target, Snapshots) else None
+        if ring is not None:
+            ring.look()
         with self._lock:
             totals = dict(self._lost)
         for (topic, cause), count in totals.items():
@@ -361,11 +393,11 @@ class Recorder:
             lost[cause.value] = lost.get(cause.value, 0) + count
         with self._lock:
             rates = sorted(self._topics.items())
-        log_time = self._now()
+        now_steady = self._now()
         topics = [
             rate.look(
                 elapsed,
-                log_time,
+                now_steady,
                 thinned=missing.get((topic, True), 0),
                 lost=missing.get((topic, False), 0),
             )
@@ -387,8 +419,12 @@ class Recorder:
             "" if failure is None else str(failure),
             shutil.disk_usage(self._store_path).free,
             stored_bytes,
-            self._target.count if isinstance(self._target, Snapshots) else None,
+            snapshots=None if ring is None else ring.count,
+            ring_s=None if ring is None else ring.held_s,
             silent=() if self._silence is None else self._silence.silent,
+            breaches=self._breaches,
+            clock_set_s=self._clock.set_by / 1e9,
+            memory_bytes=resident_bytes(),
         )
         self._check_limits(state)
         self._state = state
@@ -410,13 +446,17 @@ class Recorder:
             begin: Its log time, ns; None for now.
             end: Log time of its end, ns; None for a moment.
         """
-        received = time.time_ns() if begin is None else begin
+        received = self._clock.now() if begin is None else begin
         self._sink.take(self._marks, mark_payload(text, tags, end), received=received)
 
     def _now(self) -> int:
-        """The current log time, ns."""
-        now = time.time_ns()
-        return now if self._simulated is None else self._simulated.at(now)
+        """The present as a steady time, ns."""
+        now = self._clock.now()
+        return self._steady(now) if self._simulated is None else self._simulated.at(now)
+
+    def _steady(self, log_time: int) -> int:
+        """A log time, ns, if the clock of this machine had never been set."""
+        return log_time if self._simulated is not None else self._clock.steady(log_time)
 
     def _watch(self) -> None:
         """The thread that tells silences."""
@@ -427,22 +467,22 @@ class Recorder:
     def _tell_silences(self, watch: SilenceWatch, now: int, *, is_end: bool = False) -> None:
         begun, ended = watch.look(now, is_end=is_end)
         for one in begun:
+            self._breaches += 1
             self._tell(f"{one.text} ({RULE} of the contract)")
             if problem := self._commands.run(one):
                 self.say(problem)
         for one in ended:
             recorded = self._recorded.get(self._marks) or self._meet(self._marks, b"{}")
             tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
-            payload = mark_payload(one.text, tags, one.end)
+            begin, end = self._clock.log_time(one.begin), self._clock.log_time(one.end)
+            payload = mark_payload(one.text, tags, max(begin, end))
             recorded.tally.add(len(payload), one.begin)
             try:
-                stored = self._target.write(
-                    recorded.channel, payload, log_time=one.begin, wait=False
-                )
+                stored = self._target.write(recorded.channel, payload, log_time=begin, wait=False)
                 if not stored:
-                    self._lose_for_room(recorded, one.begin)
+                    self._lose_for_room(recorded, begin)
             except HybridlogError as error:
-                self._lose(recorded, Cause.QUEUE, str(error), one.begin)
+                self._lose(recorded, Cause.QUEUE, str(error), begin)
 
     def fire(self, reason: str) -> None:
         """Start a snapshot.
@@ -494,10 +534,11 @@ class Recorder:
         """See `Sink.take`."""
         recorded = self._recorded.get(channel) or self._meet(channel, payload)
         size = len(payload)
-        through = recorded.throttle is None or recorded.throttle.lets_through(received)
+        steady = self._steady(received)
+        through = recorded.throttle is None or recorded.throttle.lets_through(steady)
         if through and not self._claim(size):
             return  # messages after the end are not part of the recording
-        recorded.tally.add(size, received)
+        recorded.tally.add(size, steady)
         if not through:
             self._lose(recorded, Cause.THROTTLE, "", received)
             return
@@ -519,7 +560,7 @@ class Recorder:
                 wait=False,
             ):
                 if self._silence is not None:
-                    self._silence.take(recorded.channel.topic, received)
+                    self._silence.take(recorded.channel.topic, steady)
                 return
             if size > SMALL_BYTES:
                 # Its fields may fit where its payload does not.
@@ -722,7 +763,7 @@ class Recorder:
             wait=False,
         ):
             if self._silence is not None:
-                self._silence.take(recorded.channel.topic, received)
+                self._silence.take(recorded.channel.topic, self._steady(received))
             self._lose(recorded, Cause.DEGRADE, "payload dropped, fields stored", received)
         else:
             self._lose_for_room(recorded, received)
@@ -787,13 +828,24 @@ class Recorder:
                     "simulation, or leave out --use-sim-time"
                 )
             return
-        jump = time.time() - now - self._offset
-        if abs(jump) >= _JUMP_S:
-            self._offset += jump
-            self._tell(
-                f"the clock of this machine was set {'forward' if jump > 0 else 'back'} by "
-                f"{abs(jump):.1f} s; log times jump with it"
-            )
+        for jump in self._clock.jumps():
+            by = format_duration(round(abs(jump.by), -8))
+            where = "forward" if jump.by > 0 else "back"
+            tags = {"set_by_ns": str(jump.by)}
+            text = f"the clock of this machine was set {where} by {by}"
+            self._note_clock(text, tags, jump.at + jump.set_by)
+        self._mark_clock()
+
+    def _note_clock(self, text: str, tags: Mapping[str, str], at: int) -> None:
+        """Report that the clock of this machine was set, or is to be, at a log time, ns."""
+        self._tell(f"{text}; log times are those of the clock")
+        self._clock_marks.append((text, {"cause": CLOCK_SET, **tags}, at))
+
+    def _mark_clock(self) -> None:
+        """Mark what is noted of the clock; alone it makes no recording."""
+        while self._clock_marks and self._recorded_by_content and not self._over.is_set():
+            text, tags, at = self._clock_marks.pop(0)
+            self.mark(text, tags, begin=at)
 
 
 def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> None:
@@ -816,6 +868,8 @@ def summary_of(state: RecorderState) -> dict[str, Any]:
     """A state as JSON, for scripts and other processes."""
     return {
         **{k: v for k, v in asdict(state).items() if k != "topics"},
+        "hz": state.hz,
+        "bytes_per_s": state.bytes_per_s,
         "lost": dict(state.lost),
         "taken": dict(state.taken),
         "topics": [asdict(topic) for topic in state.topics],
@@ -829,4 +883,5 @@ def state_of(summary: Mapping[str, Any]) -> RecorderState:
         TypeError: The summary has other fields.
     """
     topics = [TopicState(**topic) for topic in summary["topics"]]
-    return RecorderState(**{**summary, "topics": topics})
+    own = {key: value for key, value in summary.items() if key not in {"hz", "bytes_per_s"}}
+    return RecorderState(**{**own, "topics": topics})

@@ -15,13 +15,23 @@ _MAX_LATCHED = 32 << 20  # payload bytes of one publisher; its last message alwa
 
 
 class BufferedMessage(NamedTuple):
-    """A message in the ring."""
+    """A message in the ring.
+
+    Attributes:
+        set_by: Nanoseconds by which the clock of log times was set before it came.
+    """
 
     channel: Channel
     payload: bytes
     log_time: int
     publish_time: int | None
     sequence: int
+    set_by: int = 0
+
+    @property
+    def steady(self) -> int:
+        """Its log time, ns, if the clock had never been set."""
+        return self.log_time - self.set_by
 
 
 @dataclass(slots=True)
@@ -52,7 +62,7 @@ class Ring:
     messages cannot be understood without them.
 
     Args:
-        span_ns: The span, by the messages' log time.
+        span_ns: The span, by the messages' steady times.
         max_bytes: Limit for the payload bytes in the ring.
     """
 
@@ -68,9 +78,9 @@ class Ring:
         """Add a message, and drop those that are too old or too many."""
         self._messages.append(message)
         self._bytes += len(message.payload)
-        oldest = message.log_time - self._span
+        oldest = message.steady - self._span
         while (is_full := self._bytes > self._max_bytes) or (
-            self._messages and self._messages[0].log_time < oldest
+            self._messages and self._messages[0].steady < oldest
         ):
             self._cut |= is_full
             dropped = self._messages.popleft()
@@ -78,32 +88,33 @@ class Ring:
             _latch(self._latched, dropped)
 
     def since(self, begin: int) -> list[BufferedMessage]:
-        """The messages from a log time on, ns, in arrival order.
+        """The messages from a steady time on, ns, in arrival order.
 
-        The latched messages in force at that time come first, with the log time `begin`, so
-        that the slice spans no more than requested. Their publish time still tells when they
-        were sent.
+        The latched messages in force at that time come first, with its log time, so that the
+        slice spans no more than requested. Their publish time still tells when they were sent.
         """
         latched: dict[Hashable, _Latched] = {}
         for message in (m for each in self._latched.values() for m in each.messages):
             _latch(latched, message)
+        kept = [m for m in self._messages if m.steady >= begin]
         for message in self._messages:
-            if message.log_time < begin:
+            if message.steady < begin:
                 _latch(latched, message)
         front = sorted(
-            (m for each in latched.values() for m in each.messages if m.log_time < begin),
-            key=attrgetter("log_time"),
+            (m for each in latched.values() for m in each.messages if m.steady < begin),
+            key=attrgetter("steady"),
         )
+        at = begin + next((m.set_by for m in (*kept[:1], *front[-1:])), 0)
         return [
-            *(m._replace(log_time=begin, publish_time=m.publish_time or m.log_time) for m in front),
-            *(m for m in self._messages if m.log_time >= begin),
+            *(m._replace(log_time=at, publish_time=m.publish_time or m.log_time) for m in front),
+            *kept,
         ]
 
     def latest(self, topic: str, begin: int, limit: int) -> list[BufferedMessage]:
-        """The latest messages of a topic since a log time, ns, at most `limit`."""
+        """The latest messages of a topic since a steady time, ns, at most `limit`."""
         found: list[BufferedMessage] = []
         for message in reversed(self._messages):
-            if message.log_time < begin or len(found) == limit:
+            if message.steady < begin or len(found) == limit:
                 break
             if message.channel.topic == topic:
                 found.append(message)
@@ -119,7 +130,7 @@ class Ring:
         """Seconds between the oldest and the newest message."""
         if not self._messages:
             return 0.0
-        return (self._messages[-1].log_time - self._messages[0].log_time) / 1e9
+        return (self._messages[-1].steady - self._messages[0].steady) / 1e9
 
     @property
     def is_short(self) -> bool:

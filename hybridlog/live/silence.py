@@ -23,8 +23,8 @@ class Silence(NamedTuple):
 
     Attributes:
         topic: Full name.
-        begin: Log time of the last message before it, or the beginning of the recording, ns.
-        end: Log time of the next message, or the end of the recording, ns.
+        begin: Time of the last message before it, or the beginning of the recording, ns.
+        end: Time of the next message, or the end of the recording, ns.
         limit: The longest time that is allowed, ns.
     """
 
@@ -42,6 +42,8 @@ class Silence(NamedTuple):
 class SilenceWatch:
     """Follows the topics that have a longest gap in a contract. Thread safe.
 
+    Its times are steady ones, so that a clock that is set is no silence.
+
     Args:
         contract: The rules.
     """
@@ -52,6 +54,7 @@ class SilenceWatch:
         self._optional = {name for name, rule in rules if rule.optional}
         self._last: dict[str, int] = {}
         self._begin: int | None = None
+        self._now = 0
         self._told: set[str] = set()
         self._over: list[Silence] = []
         self._lock = threading.Lock()
@@ -60,7 +63,7 @@ class SilenceWatch:
         """Seconds between two looks, so that a silence is told within twice its limit."""
 
     def take(self, topic: str, time: int) -> None:
-        """A message was stored, at a log time, ns."""
+        """A message was stored, at a time, ns."""
         limit = self._limits.get(topic)
         if limit is None and self._begin is not None:
             return
@@ -79,11 +82,14 @@ class SilenceWatch:
         """The silences that have begun since the last look, and those that have ended.
 
         Args:
-            now: Current log time, ns.
+            now: Current time, ns. A simulation may begin again with an earlier one.
             is_end: True if the recording ends now, and with it all silences.
         """
         with self._lock:
             over, self._over = self._over, []
+            if now < self._now:
+                self._last = {topic: min(last, now) for topic, last in self._last.items()}
+            self._now = now
             lasting = [
                 Silence(topic, last, now, self._limits[topic])
                 for topic, last in self._last.items()

@@ -244,9 +244,8 @@ class SimulatedTime(Sink):
         self._recorder.take(channel, payload, received=log_time, sent=sent, sequence=sequence)
 
     def _report(self, loss: _Loss, first: int, last: int) -> None:
-        low, high = sorted((first, last))  # the clock may have gone back between them
         self._recorder.lost(
-            loss.topic, loss.cause, loss.count, first=low, last=high, detail=loss.detail
+            loss.topic, loss.cause, loss.count, first=first, last=last, detail=loss.detail
         )
 
     def _drop(self, message: _Message, at: int) -> None:

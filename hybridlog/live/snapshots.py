@@ -31,8 +31,10 @@ from hybridlog_storage.errors import (
     UsageError,
     WhereError,
 )
+from hybridlog_storage.times import BEGIN
 
 if TYPE_CHECKING:
+    from hybridlog.live.machine_clock import MachineClock
     from hybridlog.live.recording import LiveRecording
     from hybridlog.query.predicate.tree import Predicate, Test
     from hybridlog.record.recorder import RecordReport
@@ -128,6 +130,7 @@ class Snapshots:
         start: Starts a recording; its argument is the trigger's reason.
         again: Called with the reason of a trigger that fires during a snapshot.
         say: Shows a line to the user.
+        clock: The clock of log times.
 
     Attributes:
         cut_off: Messages of snapshots that a full disk cost, by topic.
@@ -140,6 +143,8 @@ class Snapshots:
         start: Callable[[str], LiveRecording],
         again: Callable[[str], None],
         say: Callable[[str], None],
+        *,
+        clock: MachineClock,
     ) -> None:
         self.cut_off: Counter[str] = Counter()
         self._options = options
@@ -149,8 +154,9 @@ class Snapshots:
         self._ring = Ring(round(options.ring_s * 1e9), budget_bytes)
         self._start = start
         self._say = say
+        self._clock = clock
         self._ledger = Ledger()
-        self._lost: deque[dict[str, Any]] = deque(maxlen=_MAX_ROWS)
+        self._lost: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_MAX_ROWS)
         self._lock = threading.Lock()
         self._active: LiveRecording | None = None
         self._until = 0
@@ -176,14 +182,17 @@ class Snapshots:
         wait: bool = True,
     ) -> bool:
         """Take a message; see `LiveRecording.write`."""
-        message = BufferedMessage(channel, payload, log_time, publish_time, sequence)
+        steady = self._clock.steady(log_time)
+        message = BufferedMessage(
+            channel, payload, log_time, publish_time, sequence, log_time - steady
+        )
         watches = self._watched.get(channel)
         if watches is None:
             watches = self._watched[channel] = tuple(self._watches(channel))
         with self._lock:
             self._ring.add(message)
             active = self._active
-            if active is not None and log_time >= self._until:
+            if active is not None and steady >= self._until:
                 self._end(active)
                 active = None
             if active is None:
@@ -208,7 +217,7 @@ class Snapshots:
             reason: Part of the recording's name, and its tag `trigger`.
             at: Time of the event, ns since the epoch; None for now.
         """
-        now = time.time_ns() if at is None else at
+        now = self._clock.steady(self._clock.now() if at is None else at)
         until = now + round(self._options.after_s * 1e9)
         with self._lock:
             self._until = max(self._until, until)
@@ -227,16 +236,16 @@ class Snapshots:
     def look(self) -> None:
         """End a snapshot whose time is over, even without further messages."""
         with self._lock:
-            if self._active is not None and time.time_ns() >= self._until:
+            now = self._clock.steady(self._clock.now())
+            if self._active is not None and now >= self._until:
                 self._end(self._active)
-            self._lost.extend(self._ledger.take(everything=True))
+            self._take_losses()
             short = self._ring.is_short and not self._has_reported_short
             self._has_reported_short |= short
-            held_s = self._ring.held_s
         if short:
             self._say(
-                f"the ring holds only {held_s:.0f} of {self._options.ring_s:.0f} s: more does not "
-                "fit into the memory budget (--budget)"
+                f"the ring holds only {self.held_s:.0f} of {self._options.ring_s:.0f} s: more does "
+                "not fit into the memory budget (--budget)"
             )
 
     def close(self) -> list[RecordReport]:
@@ -307,10 +316,21 @@ class Snapshots:
         """Number of snapshots, including the one that is being written."""
         return len(self._reports) + (self._active is not None)
 
+    @property
+    def held_s(self) -> float:
+        """Seconds that the ring holds."""
+        with self._lock:
+            return self._ring.held_s
+
+    def _take_losses(self) -> None:
+        """Note the losses since the last call, and what the clock was set by."""
+        set_by = self._clock.set_by
+        self._lost.extend((set_by, row) for row in self._ledger.take(everything=True))
+
     def numbers(self, topic: str, path: str, begin: int) -> list[float]:
         """Values of a field in the ring's latest messages since a log time, ns."""
         with self._lock:
-            latest = self._ring.latest(topic, begin, _MAX_WATCHED)
+            latest = self._ring.latest(topic, self._clock.steady(begin), _MAX_WATCHED)
         fields = (index_fields(codec_for(one.channel), one.payload) for one in latest)
         return [number for message in fields for number in numbers_at(message, path)]
 
@@ -335,7 +355,7 @@ class Snapshots:
     def _write_out(self, reason: str, at: int) -> None:
         """Start a recording with the content of the ring; runs on the worker."""
         before = self._options.before_s
-        begin = 0 if before is None else at - round(before * 1e9)
+        begin = BEGIN if before is None else at - round(before * 1e9)
         try:
             recording = self._start(reason)
         except HybridlogError as error:
@@ -345,19 +365,19 @@ class Snapshots:
         with self._lock:
             # From here on new messages go into the ring and into the recording.
             messages = self._ring.since(begin)
-            lost = [*self._lost, *self._ledger.take(everything=True)]
+            self._take_losses()
+            lost = [row for set_by, row in self._lost if row["to"] - set_by >= begin]
             self._lost.clear()
             self._active = recording
         for row in lost:
-            if row["to"] >= begin:
-                recording.ledger.note(
-                    row["topic"] or "",
-                    Cause(row["cause"]),
-                    row["count"],
-                    first=row["from"],
-                    last=row["to"],
-                    detail=row["reason"],
-                )
+            recording.ledger.note(
+                row["topic"] or "",
+                Cause(row["cause"]),
+                row["count"],
+                first=row["from"],
+                last=row["to"],
+                detail=row["reason"],
+            )
         self._say(f"snapshot {recording.label} because of {reason!r}")
         try:
             for message in messages:

@@ -89,9 +89,11 @@ class Ledger:
             cause: The reason.
             count: Number of messages; None if unknown.
             first: Beginning of the loss, ns since the epoch, by the recorder's clock.
-            last: End of the loss, ns since the epoch, by the recorder's clock.
+            last: End of the loss, ns since the epoch, by the recorder's clock, which may have
+                gone back between them.
             detail: Explanation for people.
         """
+        first, last = sorted((first, last))
         with self._lock:
             row = self._open.get((topic, cause, detail))
             if row is None:

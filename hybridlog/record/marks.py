@@ -10,6 +10,8 @@ from hybridlog_storage.messages import Channel, Schema
 
 MARKS: Final = "/hybridlog/marks"
 """Topic of marks."""
+CLOCK_SET: Final = "clock"
+"""Tag `cause` of marks that a recorder sets when the clock of its machine was set."""
 CONTRACT: Final = "contract"
 """Tag `cause` of marks that a recorder sets while a contract is broken."""
 MARK: Final = "hybridlog.Mark"

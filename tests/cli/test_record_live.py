@@ -131,6 +131,34 @@ def test_ctrl_c_ends_it_with_everything_stored(logs: Path, tmp_path: Path) -> No
     assert run("verify", store=store).code == 0
 
 
+def named(row: str, cell: int) -> set[str]:
+    """What a cell of a table names."""
+    return {*re.findall(r"`(\w+)`", row.split("|")[cell])}
+
+
+def test_each_key_of_its_json_is_in_the_documentation(logs: Path, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs/live.md").read_text("utf-8")
+    section = text.partition("## State for other programs")[2].partition("\n## ")[0]
+    with recorder(
+        tmp_path / "store", "--replay", logs / "small.bag", "--max-messages", 50, "--ring", "9s"
+    ) as process:
+        assert process.stdout is not None
+        lines = [json.loads(line) for line in process.stdout]
+    states = [line["state"] for line in lines[:-1]]
+    keys = {key for line in section.splitlines() if line[:3] == "| `" for key in named(line, 1)}
+    assert keys == states[-1].keys()
+    (topics,) = (named(line, 2) for line in section.splitlines() if line[:10] == "| `topics`")
+    assert {key for state in states for topic in state["topics"] for key in topic} <= topics
+    assert states[-1]["memory_bytes"] > 10 << 20
+    (told,) = (line for line in section.splitlines() if line.startswith("The report has"))
+    report = lines[-1]["report"]
+    assert (report["exit_code"], report["ended"]) == (0, "the limit of messages is reached")
+    assert report.keys() <= {*re.findall(r"`(\w+)`", told)}
+    failed = run("record", "--replay", tmp_path / "none.bag", "--json", store=tmp_path, code=None)
+    assert failed.code != 0
+    assert json.loads(failed.lines[-1])["report"]["exit_code"] == failed.code
+
+
 def test_a_second_ctrl_c_leaves_at_once_and_what_was_flushed_is_there(
     logs: Path, tmp_path: Path
 ) -> None:

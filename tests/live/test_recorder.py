@@ -406,24 +406,6 @@ def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
     robot.recorder.stop()
 
 
-def test_a_clock_that_is_set_is_told(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Running(store)
-    real = time.time
-    robot.recorder.look()
-    assert robot.said == []
-    monkeypatch.setattr(recorder_module.time, "time", lambda: real() - 3600)
-    robot.recorder.look()
-    robot.recorder.look()
-    assert len(robot.said) == 1
-    assert "back by 3600.0 s" in robot.said[0]
-    # A log time from before is stored as it is.
-    now = time.time_ns()
-    robot.speaker.say(text_channel(), text("late"), now)
-    robot.speaker.say(text_channel("/other"), text("early"), now - 3600 * SECOND)
-    robot.recorder.stop()
-    assert store.all_topics().count() == 2
-
-
 def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     def fail(_: object) -> None:
         raise SourceError("no such robot")

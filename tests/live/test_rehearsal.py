@@ -16,6 +16,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.live import rehearsal
+from hybridlog.live.machine_clock import MachineClock
 from hybridlog.live.rehearsal import snapshot_spans
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger
 from hybridlog.record.losses import Ledger
@@ -101,7 +102,9 @@ def recorded(trigger: str, name: str, before_s: float, after_s: float) -> list[t
         return taken[-1]
 
     options = SnapshotOptions(3600, before_s, after_s, (Trigger.of(trigger),))
-    snapshots = Snapshots(options, 1 << 30, start, lambda _: None, lambda _: None)
+    snapshots = Snapshots(
+        options, 1 << 30, start, lambda _: None, lambda _: None, clock=MachineClock()
+    )
     channels = {
         key: Channel(topic, "json", None, metadata) for key, (topic, metadata) in TOPICS.items()
     }

@@ -169,6 +169,15 @@ def test_each_silence_is_told_once_and_ends_once() -> None:
     assert (begun, [(one.topic, one.begin, one.end) for one in over]) == ([], [("/b", 100, 177)])
 
 
+def test_a_simulation_that_begins_again_is_watched_on() -> None:
+    watch = SilenceWatch(Contract({"/a": TopicRules(longest_gap=10)}))
+    watch.take("/a", 1000)
+    assert watch.look(1005) == ([], [])
+    assert watch.look(3) == ([], [])
+    begun, _ = watch.look(14)
+    assert [(one.topic, one.begin, one.end) for one in begun] == [("/a", 3, 14)]
+
+
 def test_the_command_tells_marks_runs_a_command_and_judges(tmp_path: Path) -> None:
     logs = {"/a": out(0.4, 2.2), "/b": STEADY}
     log = write_mcap(tmp_path / "log.mcap", logs)
