@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.engines.base import Values
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Part, Question, RecordedChannel
     from hybridlog.schema.codec import Decoded
@@ -62,9 +63,10 @@ def _collected(planner: Planner) -> TableBuilder:
     for block in decoder.empty():
         builder.append(block)
     parts = planner.parts()
-    if _come_from_tables(planner, parts):
-        for part in parts:
-            for block in _table_blocks(planner, part):
+    found = _values_of_tables(planner, parts)
+    if found is not None:
+        for part, values in zip(parts, found, strict=True):
+            for block in _table_blocks(planner, part, values):
                 builder.append(block)
         return builder
     for run in planner.unordered() if question.returns_all else planner.runs():
@@ -86,8 +88,9 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     groups: Iterator[Iterable[Block]]
     decoder = Decoder(planner)
     part = planner.only_part()
-    if part is not None and not question.reverse and _come_from_tables(planner, [part]):
-        groups = ([block] for block in _table_blocks(planner, part))
+    found = None if question.reverse or part is None else _values_of_tables(planner, [part])
+    if part is not None and found is not None:
+        groups = ([block] for block in _table_blocks(planner, part, found[0]))
     else:
         groups = (decoder.blocks(run) for run in planner.runs())
     groups = chain([decoder.empty()], groups)
@@ -110,16 +113,16 @@ def _builder(question: Question) -> TableBuilder:
     return TableBuilder(question.fields, tag_columns(question.tags))
 
 
-def _come_from_tables(planner: Planner, parts: Sequence[Part]) -> bool:
-    """True if tables of topics provide the whole answer."""
+def _values_of_tables(planner: Planner, parts: Sequence[Part]) -> Sequence[Iterator[Values]] | None:
+    """The fields of each part, if tables of topics provide the whole answer."""
     question = planner.question
     if not question.returns_all or not parts:
-        return False
+        return None
     fields = _fields_of(planner)
     from_messages = set(_own(planner)) - {"topic", "recording"}
     if from_messages or (fields is not None and not fields):
-        return False
-    return all(planner.reads_tables(part, fields) for part in parts)
+        return None
+    return planner.values_of_tables(parts, fields)
 
 
 def _fields_of(planner: Planner) -> list[str] | None:
@@ -131,12 +134,12 @@ def _fields_of(planner: Planner) -> list[str] | None:
     return [path for path in fields if path not in own]
 
 
-def _table_blocks(planner: Planner, part: Part) -> Iterator[Block]:
+def _table_blocks(planner: Planner, part: Part, values: Iterator[Values]) -> Iterator[Block]:
     """The messages of a part from its table, in order."""
     rank = planner.ranks[part.recording.key] << _SEQ_BITS
     # Tables have lists where a definition fixes the length.
     kind = part.channels[0].arrow_type(_fields_of(planner))
-    for found in planner.values(part, _fields_of(planner)):
+    for found in values:
         rows = len(found.log_time)
         planner.counters.messages += rows
         names = {"topic": part.topic, "recording": part.recording.label}

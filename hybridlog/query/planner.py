@@ -268,27 +268,36 @@ class Planner:
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
         (part,) = self._decided([part])
-        return self._first(part, Need.OUTCOMES, lambda engine: engine.outcomes(part))
-
-    def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
-        """True if the fields of the messages of a part come from its table or columns."""
-        (part,) = self._decided([part])
-        engine = self._choose(part, Need.VALUES, fields)[0]
-        if part.recording.payloads and engine is self._columns:
-            return True
-        if engine is not self._tables:
-            return False
-        try:
-            if part.predicate is not None:
-                self._tables.check(part)
-        except _FALLBACK_ERRORS:
-            return False
-        return True
+        engines = self._choose(part, Need.OUTCOMES)
+        return self._first(engines, lambda engine: engine.outcomes(part))
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
         (part,) = self._decided([part])
-        return self._first(part, Need.VALUES, lambda engine: engine.values(part, fields), fields)
+        return self._values(part, fields, self._choose(part, Need.VALUES, fields))
+
+    def _values(
+        self, part: Part, fields: Collection[str] | None, engines: Sequence[Engine]
+    ) -> Iterator[Values]:
+        return self._first(engines, lambda engine: engine.values(part, fields))
+
+    def values_of_tables(
+        self, parts: Sequence[Part], fields: Collection[str] | None
+    ) -> list[Iterator[Values]] | None:
+        """The same of each part, if tables or columns of all of them have the fields."""
+        found = []
+        for part in self._decided(parts):
+            engines = self._choose(part, Need.VALUES, fields)
+            if engines[0] is self._tables:
+                try:
+                    if part.predicate is not None:
+                        self._tables.check(part)
+                except _FALLBACK_ERRORS:
+                    return None
+            elif not part.recording.payloads or engines[0] is not self._columns:
+                return None
+            found.append(self._values(part, fields, engines))
+        return found
 
     def objects(self, part: Part) -> Iterator[Objects]:
         """The matching messages of a part as plain objects, in order."""
@@ -486,16 +495,12 @@ class Planner:
         raise failure
 
     def _first(
-        self,
-        part: Part,
-        need: Need,
-        ask: Callable[[Engine], Iterator[_Rows]],
-        fields: Collection[str] | None = (),
+        self, engines: Sequence[Engine], ask: Callable[[Engine], Iterator[_Rows]]
     ) -> Iterator[_Rows]:
         """Items of the cheapest engine; the next one goes on where it fails."""
         failure: Exception | None = None
         last: _Key | None = None
-        for engine in self._choose(part, need, fields):
+        for engine in engines:
             try:
                 for item in ask(engine):
                     rest = item if last is None else _after(item, last)

@@ -13,6 +13,8 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.answers import field_statistics
+from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.question import Part
 from tests.scale.cost import cost_of
 
 START = 1_577_836_800 * 10**9
@@ -71,10 +73,20 @@ def test_statistics_of_many_topics_are_planned_together(
         return real(*arguments)
 
     monkeypatch.setattr(field_statistics, "Planner", seen)
+    weighed: list[str] = []
+    cost = TablesEngine.cost
+
+    def weigh(engine: TablesEngine, part: Part, *arguments: Any) -> float | None:
+        weighed.append(part.topic)
+        return cost(engine, part, *arguments)
+
+    monkeypatch.setattr(TablesEngine, "cost", weigh)
     for count, path in stores.items():
         planned.append(0)
+        weighed.clear()
         with hl.open(path) as store:
             found = store.all_topics().stats()
+            assert len(weighed) == count  # an engine is chosen once a topic
             store.refresh()
             for work in (store.all_topics().stats, store.sql("show tables").rows):
                 opened = Counter(cost_of(store, work).opened)

@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,9 +77,11 @@ class _Running:
         self.least = low if self.least is None else min(self.least, low)
         self.most = high if self.most is None else max(self.most, high)
         numbers, count = values.astype(np.float64), len(values)
-        before, own, first = self._mean, Totals(1), np.zeros(1, np.intp)
-        for totals in (own, self._total):
-            totals.add(numbers, first, first)
+        before, own, first = self._mean, self._total, np.zeros(1, np.intp)
+        if self.count:
+            own = Totals(1)
+            own.add(numbers, first, first)
+        self._total.add(numbers, first, first)
         mean = float(own.means(np.array([count]))[0])
         size = max(abs(low), abs(high))
         exponent = max(math.frexp(size)[1] if size else self._exponent, self._exponent)
@@ -90,7 +93,9 @@ class _Running:
         step = math.ldexp(mean, -exponent) - math.ldexp(before, -exponent)
         self._squares += step * step * self.count * count / (self.count + count)
         self.count += count
-        self._mean = float(self._total.means(np.array([self.count]))[0])
+        self._mean = mean
+        if own is not self._total:
+            self._mean = float(self._total.means(np.array([self.count]))[0])
 
     @property
     def _std(self) -> float:
@@ -168,19 +173,19 @@ def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
         types = parts[0].field_types or {}
         fields = _single_numbers(types)
         if not fields or not all(
-            part.field_types == types
-            and not any(channel.is_reduced for channel in part.channels)
-            and planner.reads_tables(part, fields)
+            part.field_types == types and not any(channel.is_reduced for channel in part.channels)
             for part in parts
         ):
             continue
+        read = planner.values_of_tables(parts, fields)
+        if read is None:
+            continue
         found[topic] = {path: _Running() for path in fields}
-        for part in parts:
-            for values in planner.values(part, fields):
-                planner.counters.messages += len(values.log_time)
-                for path, running in found[topic].items():
-                    column = pc.struct_field(values.records, path.split("."))
-                    running.add(pa.chunked_array([column]))
+        for values in chain.from_iterable(read):
+            planner.counters.messages += len(values.log_time)
+            for path, running in found[topic].items():
+                column = pc.struct_field(values.records, path.split("."))
+                running.add(pa.chunked_array([column]))
     return found
 
 
