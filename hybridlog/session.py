@@ -1250,6 +1250,16 @@ class Session:
 
     # Closing.
 
+    def write_recordings_file(self) -> None:
+        """List the ended recordings for other readers of their tables, if that is possible."""
+        if self.directory.is_writable:
+            from hybridlog.columns.recordings_file import write_recordings_file
+
+            with suppress(OSError, HybridlogError):
+                present = self.snapshot().by_label.keys() & {*self.directory.names()}
+                write_recordings_file(self.catalog, present)
+                self.catalog.has_changed = False
+
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
         self._begin(_Moment())
@@ -1278,6 +1288,9 @@ class Session:
         if "tables" in vars(self):
             self.tables.invalidate()
         self.disconnect()
+        is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
+        if self.catalog.has_changed or is_missing:
+            self.write_recordings_file()
         self.catalog.close()
 
 

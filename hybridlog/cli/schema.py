@@ -128,6 +128,7 @@ def tables_command(
         ended = [one for one in channels if one.recording.status not in UNFINISHED]
         for one in ended:  # made again where they are missing
             opened.session.table(one.recording, one.channel.topic)
+        opened.session.write_recordings_file()
         found = _found(opened, ended)
         others = len({one.recording.id for one in channels}) - len(
             {one.recording.id for one in ended}

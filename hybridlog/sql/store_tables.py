@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 
+from hybridlog.columns.recordings_file import RECORDINGS, TAGS, TIME, recordings_table, times
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.counters import Counters
 from hybridlog_storage.catalog import ChannelStats
@@ -14,26 +15,6 @@ from hybridlog_storage.catalog import ChannelStats
 if TYPE_CHECKING:
     from hybridlog.sql.content import StoreContent
 
-_TIME: Final = pa.timestamp("us", "UTC")
-_TAGS: Final = pa.map_(pa.string(), pa.string())
-_RECORDINGS: Final = pa.schema(
-    [
-        ("recording", pa.string()),
-        ("id", pa.string()),
-        ("name", pa.string()),
-        ("tags", _TAGS),
-        ("status", pa.string()),
-        ("created", _TIME),
-        ("first_time", _TIME),
-        ("last_time", _TIME),
-        ("first_t", pa.int64()),
-        ("last_t", pa.int64()),
-        ("messages", pa.int64()),
-        ("topics", pa.int64()),
-        ("segments", pa.int64()),
-        ("bytes", pa.int64()),
-    ]
-)
 _TOPICS: Final = pa.schema(
     [
         ("topic", pa.string()),
@@ -44,8 +25,8 @@ _TOPICS: Final = pa.schema(
         ("encoding", pa.string()),
         ("messages", pa.int64()),
         ("bytes", pa.int64()),
-        ("first_time", _TIME),
-        ("last_time", _TIME),
+        ("first_time", TIME),
+        ("last_time", TIME),
         ("first_t", pa.int64()),
         ("last_t", pa.int64()),
         ("problem", pa.string()),
@@ -57,8 +38,8 @@ _LOSSES: Final = pa.schema(
         ("topic", pa.string()),
         ("cause", pa.string()),
         ("messages", pa.int64()),
-        ("first_time", _TIME),
-        ("last_time", _TIME),
+        ("first_time", TIME),
+        ("last_time", TIME),
         ("first_t", pa.int64()),
         ("last_t", pa.int64()),
         ("file", pa.string()),
@@ -67,13 +48,13 @@ _LOSSES: Final = pa.schema(
 )
 _MARKS: Final = pa.schema(
     [
-        ("log_time", _TIME),
+        ("log_time", TIME),
         ("t", pa.int64()),
-        ("end_time", _TIME),
+        ("end_time", TIME),
         ("end_t", pa.int64()),
         ("recording", pa.string()),
         ("text", pa.string()),
-        ("tags", _TAGS),
+        ("tags", TAGS),
     ]
 )
 
@@ -85,30 +66,15 @@ def store_table(name: str, content: StoreContent) -> pa.Table:
         name: `recordings`, `topics`, `losses` or `marks`.
         content: The store.
     """
+    if name == "recordings":
+        return recordings_table(content.snapshot.summaries)
     rows, schema = _TABLES[name]
     return pa.Table.from_pylist(list(rows(content)), schema=schema)
 
 
 def store_schema(name: str) -> pa.Schema:
     """The columns of such a table."""
-    return _TABLES[name][1]
-
-
-def _recordings(content: StoreContent) -> Iterator[Mapping[str, Any]]:
-    for summary in content.snapshot.summaries:
-        yield {
-            "recording": summary.label,
-            "id": summary.id,
-            "name": summary.name,
-            "tags": list(summary.tags.items()),
-            "status": summary.status,
-            "created": summary.created // 1000,
-            **_times(*(summary.span or (None, None))),
-            "messages": summary.messages,
-            "topics": summary.topic_count,
-            "segments": summary.segments,
-            "bytes": summary.stored_bytes,
-        }
+    return RECORDINGS if name == "recordings" else _TABLES[name][1]
 
 
 def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
@@ -131,7 +97,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "encoding": ", ".join(encodings) or None,
                 "messages": total.messages,
                 "bytes": total.payload_bytes,
-                **_times(total.first, total.last),
+                **times(total.first, total.last),
                 "problem": "; ".join(problems) or None,
             }
 
@@ -145,7 +111,7 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "topic": loss.get("topic"),
                 "cause": str(loss["cause"]),
                 "messages": loss["count"],
-                **_times(loss.get("from"), loss.get("to")),
+                **times(loss.get("from"), loss.get("to")),
                 "file": loss.get("file") or None,
                 "reason": loss.get("reason") or None,
             }
@@ -165,18 +131,8 @@ def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
         }
 
 
-def _times(first: int | None, last: int | None) -> dict[str, Any]:
-    return {
-        "first_time": None if first is None else first // 1000,
-        "last_time": None if last is None else last // 1000,
-        "first_t": first,
-        "last_t": last,
-    }
-
-
 _Rows = Callable[["StoreContent"], Iterator[Mapping[str, Any]]]
 _TABLES: Final[Mapping[str, tuple[_Rows, Any]]] = {
-    "recordings": (_recordings, _RECORDINGS),
     "topics": (_topics, _TOPICS),
     "losses": (_losses, _LOSSES),
     "marks": (_marks, _MARKS),

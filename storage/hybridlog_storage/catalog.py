@@ -80,6 +80,7 @@ CATALOG: Final = "catalog"
 _SCHEMA: Final = "schema-"
 """Prefix of the files of schemas, by hash."""
 _RECORDINGS: Final = "recordings"
+_RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
 _TOPICS = RecordingSummary._fields.index("topics")
 _BUSY_S: Final = 1.0
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
@@ -295,6 +296,15 @@ class RecordingEntry:
 
 
 _JSON: Final = {"str": str, "int": int, "float": float, "bool": bool, "dict": dict, "list": list}
+_KINDS: Final = {
+    item: [
+        (name, _JSON[kind], "None" in annotation)
+        for name, annotation in item.__annotations__.items()
+        if (kind := annotation.partition("[")[0].partition(" ")[0]) in _JSON
+    ]
+    for item in (RecordingEntry, ChannelEntry, ChannelStats)
+}
+"""Name and type of the attributes of entries, and whether they may be None."""
 _E = TypeVar("_E", RecordingEntry, ChannelEntry, ChannelStats)
 
 
@@ -311,13 +321,12 @@ def _checked(item: _E) -> _E:
     Raises:
         TypeError: One has another type.
     """
-    for name, kind in type(item).__annotations__.items():
+    for name, wanted, may_lack in _KINDS[type(item)]:
         value = getattr(item, name)
-        wanted = _JSON.get(kind.partition("[")[0].partition(" ")[0])
-        if (value is None and "None" in kind) or wanted is None:
+        if value is None and may_lack:
             continue
         if not isinstance(value, wanted) or (wanted is int and not _is_number(value)):
-            raise TypeError(f"{name} is no {kind}")
+            raise TypeError(f"{name} is no {wanted.__name__}")
     return item
 
 
@@ -553,10 +562,12 @@ class Catalog:
     Attributes:
         was_damaged: True if something damaged was found since this was last set to False.
         locked: The folder, if another process keeps it locked; a catalog in memory replaces it.
+        has_changed: True if an ended recording was changed by this process.
     """
 
     def __init__(self, store: Path, store_id: str, *, in_memory: bool = False) -> None:
         self.was_damaged = False
+        self.has_changed = False
         self.locked: Path | None = None
         self._store = store
         self._store_id = store_id
@@ -578,6 +589,11 @@ class Catalog:
     def path(self) -> Path:
         """Its folder."""
         return self._store / CATALOG
+
+    @property
+    def recordings_file(self) -> Path:
+        """The list of ended recordings for other readers; it is removed before they change."""
+        return self._store / _RECORDINGS_FILE
 
     @property
     def is_in_memory(self) -> bool:
@@ -715,6 +731,22 @@ class Catalog:
             except OSError as error:
                 raise durability.explain(error, self.path, "writing") from error
 
+    @contextmanager
+    def unchanged(self) -> Iterator[list[RecordingSummary]]:
+        """All summaries, while nobody changes them.
+
+        Raises:
+            StoreError: They cannot be read.
+        """
+        with self._changing():
+            yield self.summaries()
+
+    def _remove_recordings_file(self) -> None:
+        self.has_changed = True
+        if self.locked is not None or not self.is_in_memory:
+            with suppress(FileNotFoundError):
+                files.unlink(self.recordings_file, depth=files.IN_FOLDER)
+
     def _tidy(self) -> None:
         """Remove files that are not ours, and what is damaged."""
         for name in self._odd:
@@ -783,6 +815,8 @@ class Catalog:
         text = json.dumps([described.files, entry.to_document()], separators=(",", ":"))
 
         def change(row: dict[str, str]) -> None:
+            if entry.status != "open":
+                self._remove_recordings_file()
             kinds = [kind for kind in row if kind.startswith(BOUNDS)]
             if kinds and _content_of(row) != content_of(entry.digests):
                 for kind in kinds:
@@ -838,9 +872,14 @@ class Catalog:
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
+
+        def clear(row: dict[str, str]) -> None:
+            self._remove_recordings_file()
+            row.clear()
+
         with self._lock:
             self._forget(recording)
-        self._change(recording, dict.clear)
+        self._change(recording, clear)
 
     def put_stamps(
         self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
@@ -875,6 +914,7 @@ class Catalog:
             self.was_damaged |= not self.is_in_memory
             self._forget()
             with self._changing():
+                self._remove_recordings_file()
                 for name in self._folder.versions():
                     self._folder.remove(name)
             self._parts, self._places = {}, {}

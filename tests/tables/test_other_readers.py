@@ -22,6 +22,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.columns import table_writer as writing
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.settings import NONE
 from tests.cli.within import answer
 from tests.data import DATA, needs_data
 from tests.tables.logs import (
@@ -416,3 +417,71 @@ def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) ->
     copytree(many.directory.path, place)
     (item,) = json.loads(answer("tables", "-t", "/small", "--json", store=place).out)
     assert len(duckdb.sql(item["statement"])) == 160
+
+
+def listed(store: Path) -> dict[str, Row]:
+    """The rows of `recordings.parquet` as DuckDB reads them, by label."""
+    query = (
+        "select label, recording, name, tags, status, epoch_us(created), first_t, last_t, "
+        "messages, topics, segments, bytes from read_parquet(?)"
+    )
+    rows = duckdb.connect().execute(query, [str(store / "tables/recordings.parquet")]).fetchall()
+    return {row[0]: row[1:] for row in rows}
+
+
+def listed_by_command(store: Path) -> dict[str, Row]:
+    """The same of ended recordings, as `hybridlog ls --json` prints them."""
+    keys = ("id", "name", "tags", "status", "created_ns", "start_ns", "last_ns", "messages")
+    keys += ("topics", "segments", "stored_bytes")
+    return {
+        one["recording"]: tuple(
+            one[key] // 1000 if key == "created_ns" else one[key] for key in keys
+        )
+        for one in answer("ls", "--json", "--mongo", NONE, store=store).json
+        if one["status"] != "open"
+    }
+
+
+def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path: Path) -> None:
+    """The list is right wherever it exists, and is made again when a store is closed."""
+    place = recorded.directory.path
+    path = place / "tables/recordings.parquet"
+    recorded.close()
+    other = write_log(tmp_path / "other.mcap", [(BASE, "/a", payload(0))])
+    changes: list[Callable[[hl.Store], object]] = [
+        lambda store: store.record(other, name="other"),
+        lambda store: store.tag("log", robot="7", place="hall"),
+        lambda store: store.rename("log", "first"),
+        lambda store: store.mark("first", BASE, "here"),
+        lambda store: store.remove("other"),
+        lambda store: store.catalog.rebuild() or store.refresh(),
+    ]
+    for change in changes:
+        with hl.open(place, mongo=NONE) as store:
+            assert path.exists()
+            change(store)
+            assert not path.exists()
+        assert listed(place) == listed_by_command(place) != {}
+    with hl.open(place, mongo=NONE) as store:
+        store.catalog.rebuild()
+    assert not path.exists()  # the catalog lacks a recording
+    with hl.open(place, mongo=NONE):
+        pass
+    with hl.open(place, mongo=NONE) as store, store.start("live") as live:
+        live.write(Channel("/a", "ros1", STATE), payload(0), log_time=BASE)
+        assert listed(place).keys() == listed_by_command(place).keys() == {"first"}
+    assert listed(place) == listed_by_command(place)
+    assert listed(place).keys() == {"first", "live"}
+    for work in (
+        lambda: answer("tables", "-t", "/a", store=place),
+        lambda: answer("sql", "select count(*) from a", store=place),
+    ):
+        path.unlink()
+        work()
+        assert listed(place).keys() == {"first", "live"}
+    tags = (
+        f"select distinct topic, tags['robot'] from '{place}/tables/test_State~*/*.parquet' "
+        f"join '{path}' using (recording) where label = 'first' order by topic"
+    )
+    topics = ("/large", "/small/one", "/small/two")
+    assert duckdb.sql(tags).fetchall() == [(topic, "7") for topic in topics]

@@ -1,0 +1,107 @@
+"""`tables/recordings.parquet`: the ended recordings of a store, beside their tables.
+
+It is made from the catalog when a store that has changed recordings is closed. The catalog
+removes it before it changes an ended recording, so it is right wherever it exists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hybridlog.columns.layout import IN_TABLES
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.disk import files
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import Catalog
+    from hybridlog_storage.summary import RecordingSummary
+
+TIME: Final = pa.timestamp("us", "UTC")
+TAGS: Final = pa.map_(pa.string(), pa.string())
+RECORDINGS: Final = pa.schema(
+    [
+        ("recording", pa.string()),
+        ("id", pa.string()),
+        ("name", pa.string()),
+        ("tags", TAGS),
+        ("status", pa.string()),
+        ("created", TIME),
+        ("first_time", TIME),
+        ("last_time", TIME),
+        ("first_t", pa.int64()),
+        ("last_t", pa.int64()),
+        ("messages", pa.int64()),
+        ("topics", pa.int64()),
+        ("segments", pa.int64()),
+        ("bytes", pa.int64()),
+        ("has_losses", pa.bool_()),
+    ]
+)
+"""Columns of recordings in SQL."""
+
+
+def recordings_table(summaries: Iterable[RecordingSummary]) -> pa.Table:
+    """A row for each recording."""
+    rows = [
+        {
+            "recording": one.label,
+            "id": one.id,
+            "name": one.name,
+            "tags": list(one.tags.items()),
+            "status": one.status,
+            "created": one.created // 1000,
+            **times(*(one.span or (None, None))),
+            "messages": one.messages,
+            "topics": one.topic_count,
+            "segments": one.segments,
+            "bytes": one.stored_bytes,
+            "has_losses": one.has_losses,
+        }
+        for one in summaries
+    ]
+    return pa.Table.from_pylist(rows, schema=RECORDINGS)
+
+
+def times(first: int | None, last: int | None) -> dict[str, Any]:
+    """Cells of a first and a last log time, ns."""
+    return {
+        "first_time": None if first is None else first // 1000,
+        "last_time": None if last is None else last // 1000,
+        "first_t": first,
+        "last_t": last,
+    }
+
+
+def write_recordings_file(catalog: Catalog, present: set[str]) -> None:
+    """Write the file, with all ended recordings of the catalog, unless the catalog lacks some.
+
+    Args:
+        catalog: The catalog.
+        present: Labels of recordings that it should have.
+
+    Raises:
+        OSError: It cannot be written.
+        StoreError: The catalog cannot be read or locked.
+    """
+    with catalog.unchanged() as summaries:
+        if catalog.is_in_memory or not present <= {one.label for one in summaries}:
+            return
+        ended = [one for one in summaries if one.status not in UNFINISHED]
+        ended.sort(key=lambda one: (one.extent, one.id))
+        # In tables, `recording` is the id, which stays when a recording is renamed.
+        names = {"recording": "label", "id": "recording"}
+        table = recordings_table(ended)
+        sink = pa.BufferOutputStream()
+        pq.write_table(
+            table.rename_columns([names.get(name, name) for name in table.column_names]),
+            sink,
+            compression="zstd",
+            write_page_checksum=True,
+        )
+        path = catalog.recordings_file
+        files.make_folders(path.parent, depth=IN_TABLES - 1)
+        files.write_file(path, sink.getvalue().to_pybytes(), depth=IN_TABLES, sync=False)
