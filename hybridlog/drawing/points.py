@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.arrays.message_arrays import attributes, plain_type, to_numpy
-from hybridlog.arrays.point_arrays import POINT_MAKERS
+from hybridlog.arrays.point_arrays import POINT_MAKERS, positions
+from hybridlog.tf.transform import placed
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
     pose = getattr(decoded, "pose", None)
 
     def axes_of(part: NDArray[Any]) -> list[NDArray[Any]]:
-        return _posed(_scanned(part) if is_scan else _axes(part), pose)
+        return _posed([*positions(part).T] if is_scan else _axes(part), pose)
 
     with np.errstate(over="ignore", invalid="ignore"):
         origin = tuple(_origin(axis) for axis in axes_of(_some(rows)))
@@ -156,12 +157,6 @@ def _every(chosen: NDArray[np.bool_], step: int) -> NDArray[np.intp]:
     return np.concatenate(found)
 
 
-def _scanned(rows: NDArray[Any]) -> list[NDArray[Any]]:
-    """x, y and z of the ranges of a scan."""
-    angle = rows["angle"].astype(np.float64)
-    return [rows["range"] * np.cos(angle), rows["range"] * np.sin(angle), np.zeros(len(rows))]
-
-
 def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:
     """x, y and z of the points of a cloud; one that lacks is 0.
 
@@ -188,23 +183,10 @@ def _posed(axes: list[NDArray[Any]], pose: Any) -> list[NDArray[Any]]:
     """
     if pose is None:
         return axes
-    place = [float(getattr(pose.position, name)) for name in _AXES]
-    turn = np.array([float(getattr(pose.orientation, name)) for name in "xyzw"])
-    length = float(np.linalg.norm(turn))
-    if length > 0:  # all zero is what protobuf has where nothing was set
-        x, y, z, w = turn / length
-        matrix = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        if not np.array_equal(matrix, np.eye(3)):
-            axes = list(matrix @ np.stack([axis.astype(np.float64) for axis in axes]))
-    if any(place):
-        axes = [axis.astype(np.float64) + by for axis, by in zip(axes, place, strict=True)]
-    return axes
+    own = placed(pose)
+    if not (own.translation.any() or own.rotation[:3].any()):
+        return axes
+    return list(own.apply(np.stack(axes, axis=-1)).T)
 
 
 def _origin(axis: NDArray[Any]) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.arrays.message_arrays import plain_type
+from hybridlog.arrays.message_arrays import attributes, plain_type
 from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
 from hybridlog.formats.places import POSITIONS, poses_among
 from hybridlog.frames import answer
@@ -23,7 +23,7 @@ from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.tf.reader import frame_tree
-from hybridlog.tf.transform import Transform
+from hybridlog.tf.transform import Transform, placed
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
             pose = Transform(poses.translation[row], poses.rotation[row])
             own = fields.get("pose")  # of the points, in Foxglove's messages
             if isinstance(own, dict):
-                pose = pose @ _transform(own)
+                pose = pose @ placed(attributes(own))
             yield one._replace(points=_moved(one.points, pose))
 
 
@@ -414,11 +414,3 @@ def _first_of(fields: Mapping[str, Any], paths: Sequence[str]) -> Any:
         if value is not None:
             return value
     return None
-
-
-def _transform(pose: Mapping[str, Any]) -> Transform:
-    position, turn = pose.get("position") or {}, pose.get("orientation") or {}
-    rotation = np.array([float(turn.get(axis, 0)) for axis in "xyzw"])
-    length = np.linalg.norm(rotation)
-    unit = rotation / length if length else np.array([0.0, 0.0, 0.0, 1.0])
-    return Transform(np.array([float(position.get(axis, 0)) for axis in "xyz"]), unit)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -85,6 +85,16 @@ def identity(count: int) -> Transform:
     rotation = np.zeros((count, 4))
     rotation[:, 3] = 1
     return Transform(np.zeros((count, 3)), rotation)
+
+
+def placed(pose: Any) -> Transform:
+    """The transform of a pose of a message, of which JSON may have a part only."""
+    at, turn = (getattr(pose, name, None) for name in ("position", "orientation"))
+    rotation = np.array([float(getattr(turn, axis, 0)) for axis in "xyzw"])
+    length = np.linalg.norm(rotation)
+    # All zero is what protobuf has where nothing was set.
+    unit = rotation / length if length else identity(1).rotation[0]
+    return Transform(np.array([float(getattr(at, axis, 0)) for axis in "xyz"]), unit)
 
 
 def rotated(rotation: Floats, points: Floats) -> Floats:
