@@ -90,7 +90,7 @@ ALLOWED = {
         "hybridlog.formats.rosbag2.writer",
         "hybridlog.schema",
     ),
-    "sqlite3": ("hybridlog.formats.rosbag2.sqlite",),
+    "sqlite3": ("hybridlog.formats.rosbag2.sqlite", "hybridlog.formats.rosbag2.writer"),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
     "websockets": (

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial, wraps
 from itertools import chain, groupby, islice
 from operator import itemgetter
@@ -88,6 +88,7 @@ class Destination:
         force: Overwrite it.
         limit: Maximum number of rows of a table; None for all.
         quiet: No progress bar.
+        settings: Further arguments of the writer.
     """
 
     form: str
@@ -95,6 +96,7 @@ class Destination:
     force: bool
     limit: int | None = None
     quiet: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @contextmanager
     def opened(self) -> Iterator[Target]:
@@ -220,7 +222,15 @@ def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = 
     if to.form != SCREEN:
         with to.opened() as target:
             quiet = to.quiet or to.path is None
-            write_answer(query, to.form, target, front=front, quiet=quiet, strict=strict)
+            write_answer(
+                query,
+                to.form,
+                target,
+                front=front,
+                quiet=quiet,
+                strict=strict,
+                settings=to.settings,
+            )
         return query
     limit = query.question.limit
     answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
@@ -281,6 +291,7 @@ def write_answer(
     extras: Extras | None = None,
     quiet: bool = False,
     strict: bool = False,
+    settings: Mapping[str, Any] | None = None,
 ) -> int:
     """Write the answer of a query, all of it or nothing.
 
@@ -292,6 +303,7 @@ def write_answer(
         extras: What a log has beside messages; None for nothing.
         quiet: No progress bar.
         strict: As for `answer_query`.
+        settings: Further arguments of the writer of a log.
 
     Returns:
         Messages that are missing, because they do not fit their definition.
@@ -321,7 +333,9 @@ def write_answer(
             return 0
         if content in {"log", "payloads"}:
             before = front if content == "log" else Front(latched=False)
-            _write_messages(query, form, target, progress, front=before, extras=extras)
+            _write_messages(
+                query, form, target, progress, front=before, extras=extras, settings=settings or {}
+            )
             return 0
         columns = _schema_of(query) if content == "table" else None
         rows = Rows(lines=objects, tables=query.to_tables, schema=lambda: columns)
@@ -411,11 +425,12 @@ def _write_messages(
     *,
     front: Front,
     extras: Extras | None,
+    settings: Mapping[str, Any],
 ) -> None:
     found = OUTPUTS[form]
     profile = {"profile": profile_of(query)} if found.has_profile else {}
     log: LogWriter
-    with found.open(target, **profile) as log:
+    with found.open(target, **profile, **settings) as log:
         if extras is not None:
             output.notes(add_extras(log, extras))
         for batch, channels in batches_of(query, front):

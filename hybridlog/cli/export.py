@@ -12,11 +12,11 @@ import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answers import (
+    Destination,
     check_room,
     latched,
     not_written,
     print_remarks,
-    replacing,
     write_answer,
 )
 from hybridlog.cli.open_store import opened_store
@@ -65,6 +65,8 @@ _FILES = formats_of("table", "lines", "video")
 @options.between
 @options.no_latched
 @options.original_times
+@options.bag_storage
+@options.bag_file_size
 @click.option(
     "--no-attachments", is_flag=True, help="Leave out attachments; they are in MCAP files only."
 )
@@ -83,6 +85,8 @@ def export_command(
     between: tuple[str, str] | None,
     no_latched: bool,
     original_times: bool,
+    storage: str | None,
+    file_size: str | None,
     no_attachments: bool,
     split: str | None,
     tags: str | None,
@@ -95,6 +99,7 @@ def export_command(
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
     options.check_tags(tags, form)
+    settings = options.bag_settings(storage, file_size, form)
     if form in _LOGS and split is None:
         check_room(target, force=force, is_directory=is_directory(form, target))
     with opened_store(store, mongo, quiet=quiet) as opened:
@@ -114,7 +119,8 @@ def export_command(
                 extras = one.extras()
                 if no_attachments:
                     extras = extras._replace(attachments=[], left_out=0)
-                _write_file(one, form, path, front, extras, force=force, quiet=quiet)
+                to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
+                _write_file(one, to, front, extras)
             else:
                 _write_directory(one, form, path, front, force=force, quiet=quiet)
             if not quiet:
@@ -131,27 +137,25 @@ def _form(target: Path) -> str:
     return suffixes[target.suffix.lower()]
 
 
-def _write_file(
-    query: Query,
-    form: str,
-    target: Path,
-    front: Front,
-    extras: Extras,
-    *,
-    force: bool,
-    quiet: bool,
-) -> None:
-    with (
-        if_stopped(partial(not_written, target)),
-        replacing(target, force=force, is_directory=is_directory(form, target)),
-    ):
-        write_answer(query, form, target, front=front, extras=extras, quiet=quiet)
+def _write_file(query: Query, to: Destination, front: Front, extras: Extras) -> None:
+    assert to.path is not None
+    with to.opened() as target:
+        write_answer(
+            query,
+            to.form,
+            target,
+            front=front,
+            extras=extras,
+            quiet=to.quiet,
+            settings=to.settings,
+        )
+    has_extras = to.form == "mcap" or (to.form, to.settings.get("storage")) == ("rosbag2", "mcap")
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
     beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
-    _print_written(target, query, 0, "" if form == "bag" else beside, quiet=quiet)
-    if beside and form == "bag":
+    _print_written(to.path, query, 0, beside if has_extras else "", quiet=to.quiet)
+    if beside and not has_extras:
         output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
-    if extras.left_out and form == "mcap":
+    if extras.left_out and has_extras:
         left_out = output.counted(extras.left_out, "attachment")
         output.note(f"{left_out} from behind the time range: left out.")
 

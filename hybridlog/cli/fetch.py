@@ -68,6 +68,8 @@ class _Choices:
     output: Path | None
     no_latched: bool
     original_times: bool
+    storage: str | None
+    file_size: str | None
     force: bool
     mongo: str | None
     quiet: bool
@@ -123,6 +125,8 @@ class _Choices:
 @output_option("Write to this file (raw: a directory; png and jpg: a directory, or one picture)")
 @options.no_latched
 @options.original_times
+@options.bag_storage
+@options.bag_file_size
 @options.force
 @options.mongo
 @options.quiet
@@ -254,7 +258,13 @@ def _destination(choices: _Choices) -> Destination:
     as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
     if choices.frame is not None and (as_it_came or form == "raw"):
         raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
-    to = Destination(form=form, path=choices.output, force=choices.force, quiet=choices.quiet)
+    to = Destination(
+        form=form,
+        path=choices.output,
+        force=choices.force,
+        quiet=choices.quiet,
+        settings=options.bag_settings(choices.storage, choices.file_size, form),
+    )
     if choices.split is not None and to.path is None:
         raise UsageError("--split-by writes files: name them with -o.")
     if not choices.count and choices.split is None:

@@ -17,6 +17,7 @@ from hybridlog.cli.completion import (
     complete_topic,
     complete_type,
 )
+from hybridlog.cli.output import parse_size
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
@@ -230,6 +231,16 @@ in_frame = click.option(
     metavar="FRAME",
     help="Points and poses in this frame, such as map, at the times of their headers.",
 )
+bag_storage = click.option(
+    "--storage",
+    type=click.Choice(["mcap", "sqlite3"]),
+    help="For rosbag2: the storage of the bag; without, mcap.",
+)
+bag_file_size = click.option(
+    "--file-size",
+    metavar="SIZE",
+    help="For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
+)
 tag_columns = click.option(
     "--tags", metavar="A,B", help="Tags of the recordings as columns, with commas between them."
 )
@@ -263,6 +274,24 @@ def check_latched(*, no_latched: bool, original_times: bool, form: str | None) -
             f"{form}: "
             "leave out --original-times."
         )
+
+
+def bag_settings(storage: str | None, file_size: str | None, form: str) -> dict[str, Any]:
+    """Arguments of the writer of a bag of ROS 2.
+
+    Raises:
+        UsageError: The format is another one, or the size is none.
+    """
+    if (storage, file_size) != (None, None) and form != "rosbag2":
+        raise UsageError(f"--storage and --file-size are for rosbag2, not for {form}.")
+    if form != "rosbag2":
+        return {}
+    settings: dict[str, Any] = {"storage": storage or "mcap"}
+    if file_size is not None:
+        settings["max_file"] = parse_size(file_size)
+        if not settings["max_file"]:
+            raise UsageError("--file-size must be more than 0.")
+    return settings
 
 
 def check_tags(tags: str | None, form: str) -> None:

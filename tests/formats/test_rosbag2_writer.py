@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,11 @@ from rosbags.rosbag2 import Reader
 from ruamel.yaml import YAML
 
 import hybridlog as hl
-from hybridlog.formats.rosbag2.writer import Rosbag2Writer
-from hybridlog_storage.errors import UsageError
+from hybridlog.formats.rosbag2.writer import STORAGES, Rosbag2Writer
+from hybridlog_storage.errors import DiskFullError, UsageError
 from tests.cli.running import run
 from tests.data import DATA, needs_data
+from tests.formats.batches import many, ros1_channels
 
 LOG = DATA / "real/auv_ros2.mcap"
 Row = tuple[str, str, int, bytes]
@@ -25,11 +27,12 @@ def rows_of(bag: Path) -> list[Row]:
 
 
 @needs_data
-def test_every_byte_and_profile_in_split_files(tmp_path: Path) -> None:
+@pytest.mark.parametrize("storage", STORAGES)
+def test_every_byte_and_profile_in_split_files(storage: str, tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         store.record(LOG, name="auv")
         query = store.all_topics()
-        with Rosbag2Writer(tmp_path / "bag", max_file=300_000) as writer:
+        with Rosbag2Writer(tmp_path / "bag", storage=storage, max_file=300_000) as writer:
             writer.declare([one.channel for one in query.channels()])
             for batch, channels in query.batches():
                 writer.write(batch, [one.channel for one in channels])
@@ -40,8 +43,9 @@ def test_every_byte_and_profile_in_split_files(tmp_path: Path) -> None:
     assert sorted(rows_of(tmp_path / "bag")) == sorted(sent)
     described = YAML(typ="safe").load((tmp_path / "bag/metadata.yaml").read_text())
     bag = described["rosbag2_bagfile_information"]
-    names = [f"bag_{number}.mcap" for number in range(len(bag["files"]))]
+    names = [f"bag_{number}{STORAGES[storage]}" for number in range(len(bag["files"]))]
     assert len(names) > 1
+    assert bag["storage_identifier"] == storage
     assert [one["path"] for one in bag["files"]] == bag["relative_file_paths"] == names
     assert {one.name for one in (tmp_path / "bag").iterdir()} == {*names, "metadata.yaml"}
     assert sum(one["message_count"] for one in bag["files"]) == bag["message_count"] == len(sent)
@@ -52,6 +56,7 @@ def test_every_byte_and_profile_in_split_files(tmp_path: Path) -> None:
         topics = {one.topic: one for one in reader.connections}
         assert reader.message_count == len(sent)
         assert "/coug2/modem_send" in topics  # it has no messages
+        assert topics["/tf_static"].msgtype == "tf2_msgs/msg/TFMessage"
         ext = topics["/tf_static"].ext
         assert isinstance(ext, ConnectionExtRosbag2)
         assert ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
@@ -64,6 +69,14 @@ def test_the_command_and_what_fits_into_no_bag(tmp_path: Path) -> None:
     run("export", bag, "-F", "rosbag2", store=store)
     assert len(rows_of(bag)) == 18558
     run("export", bag, "-F", "rosbag2", store=store, code=2)
+    small = ("--storage", "sqlite3", "--file-size", "500kB")
+    run("export", bag, "-F", "rosbag2", *small, "-f", store=store)
+    assert len(rows_of(bag)) == 18558
+    assert {one.suffix for one in bag.iterdir()} == {".db3", ".yaml"}
+    for other in (("--storage", "mcap"), ("--file-size", "1MB")):
+        said = run("export", tmp_path / "x.mcap", *other, store=store, code=2).err
+        assert "are for rosbag2" in said
+    run("export", tmp_path / "x", "-F", "rosbag2", "--file-size", "0", store=store, code=2)
     some = ("fetch", "-t", "/tf", "-F", "rosbag2", "-o", bag)
     run(*some, "-f", store=store)
     assert {topic for topic, *_ in rows_of(bag)} == {"/tf"}
@@ -75,3 +88,25 @@ def test_the_command_and_what_fits_into_no_bag(tmp_path: Path) -> None:
     assert not (tmp_path / "marked").exists()
     with pytest.raises(UsageError, match="makes a directory"), (tmp_path / "x").open("wb") as file:
         Rosbag2Writer(file)
+
+
+def test_a_full_disk_under_a_database(tmp_path: Path) -> None:
+    """SQLite says so itself; nothing stays."""
+    channels = [replace(one, message_encoding="cdr") for one in ros1_channels()]
+    writer = Rosbag2Writer(tmp_path / "bag", storage="sqlite3")
+    writer.write(many(300), channels)
+    log = writer._log
+    assert log is not None
+    log._db.execute("PRAGMA max_page_count = 1")  # type: ignore[union-attr]
+    with pytest.raises(DiskFullError):
+        writer.write(many(9000), channels)
+    writer.abort()
+    assert not list(tmp_path.iterdir())
+
+
+def test_messages_of_ros_1_say_what_to_do(tmp_path: Path) -> None:
+    with (
+        pytest.raises(UsageError, match="--format bag, and convert that with rosbags-convert"),
+        Rosbag2Writer(tmp_path / "bag") as writer,
+    ):
+        writer.write(many(3), ros1_channels())

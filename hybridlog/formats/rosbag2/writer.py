@@ -1,11 +1,13 @@
-"""Writes bags of ROS 2: a directory with MCAP files and `metadata.yaml`, as Jazzy writes it."""
+"""Writes bags of ROS 2, as Jazzy writes them: a directory with files and `metadata.yaml`."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
@@ -15,7 +17,8 @@ from hybridlog.formats.mcap.writer import McapWriter
 from hybridlog.formats.rosbag2.directory import NAME
 from hybridlog.formats.writing import FileWriter, Target, failures, new_directory
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
-from hybridlog_storage.errors import UsageError
+from hybridlog.schema.completion import with_nested
+from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch, Channel
@@ -23,7 +26,26 @@ if TYPE_CHECKING:
 
 MAX_FILE: Final = 2 << 30
 """Bytes of payload at which a file ends."""
+STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
+"""Suffixes of files by the storage of a bag."""
 _VERSION: Final = 9
+_TABLES: Final = """
+CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
+CREATE TABLE metadata(
+    id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL);
+CREATE TABLE topics(
+    id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+    serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL,
+    type_description_hash TEXT NOT NULL);
+CREATE TABLE message_definitions(
+    id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL,
+    encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL);
+CREATE TABLE messages(
+    id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+    data BLOB NOT NULL);
+CREATE INDEX timestamp_idx ON messages (timestamp ASC);
+INSERT INTO schema VALUES (4, 'hybridlog');
+"""
 
 
 @dataclass(slots=True)
@@ -50,8 +72,18 @@ class _Span:
 
 @dataclass(slots=True)
 class _Topic:
-    """A topic of one type, with the hash of its type."""
+    """A topic of one type.
 
+    Attributes:
+        number: Its number in the bag.
+        channel: One of its channels.
+        type_hash: Hash of its type.
+        messages: Number of messages.
+        offered: QoS profiles that were offered.
+    """
+
+    number: int
+    channel: Channel
     type_hash: str
     messages: int = 0
     offered: dict[str, None] = field(default_factory=dict)
@@ -71,14 +103,16 @@ class Rosbag2Writer(FileWriter):
 
     Args:
         target: Its directory, which must be missing or empty.
+        storage: A name of `STORAGES`.
         max_file: Bytes of payload at which a file ends.
 
     Raises:
         UsageError: The target is a stream, not empty, or cannot be written.
     """
 
-    def __init__(self, target: Target, *, max_file: int = MAX_FILE) -> None:
+    def __init__(self, target: Target, *, storage: str = "mcap", max_file: int = MAX_FILE) -> None:
         super().__init__()
+        self._storage = storage
         if not isinstance(target, str | os.PathLike):
             raise UsageError("rosbag2 makes a directory: name one with -o.")
         self._name = os.fspath(target)
@@ -89,7 +123,7 @@ class Rosbag2Writer(FileWriter):
         self._known: dict[Channel, _Topic] = {}
         self._files: dict[str, _Span] = {}
         self._all = _Span()
-        self._log: McapWriter | None = None
+        self._log: McapWriter | _SqliteFile | None = None
         self._size = 0
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
@@ -126,7 +160,7 @@ class Rosbag2Writer(FileWriter):
         """Add an attachment to the current file, piece by piece."""
         self._current().add_attachment(attachment)
 
-    def _current(self) -> McapWriter:
+    def _current(self) -> McapWriter | _SqliteFile:
         if self._log is None:
             self._next_file()
         assert self._log is not None
@@ -135,21 +169,29 @@ class Rosbag2Writer(FileWriter):
     def _next_file(self) -> None:
         if self._log is not None:
             self._log.close()
-        name = f"{self._final.name}_{len(self._files)}.mcap"
+        name = f"{self._final.name}_{len(self._files)}{STORAGES[self._storage]}"
         self._files[name] = _Span()
         self._size = 0
-        self._log = McapWriter(self._unfinished.path / name, profile="ros2")
+        path = self._unfinished.path / name
+        if self._storage == "mcap":
+            self._log = McapWriter(path, profile="ros2")
+        else:
+            self._log = _SqliteFile(path, self)
 
     def _topic(self, channel: Channel) -> _Topic:
         if channel not in self._known:
             if channel.message_encoding != "cdr" or channel.schema is None:
+                cure = "write --format mcap"
+                if channel.message_encoding == "ros1":
+                    cure = "write --format bag, and convert that with rosbags-convert"
                 raise UsageError(
                     f"{channel.topic} has {channel.message_encoding or 'unknown'} messages"
                     f"{'' if channel.schema else ' without a definition'}, and a ROS 2 bag holds "
                     "ROS 2 messages only; nothing is converted, so that every byte stays as it "
-                    "came: write --format mcap, or leave the topic out with -t"
+                    f"came: {cure}, or leave the topic out with -t"
                 )
-            own = _Topic(channel.metadata.get("topic_type_hash", "").strip())
+            type_hash = channel.metadata.get("topic_type_hash", "").strip()
+            own = _Topic(len(self._topics) + 1, channel, type_hash)
             found = self._topics.setdefault((channel.topic, channel.schema.name), own)
             found.offered[channel.metadata.get("offered_qos_profiles", "")] = None
             self._known[channel] = found
@@ -157,9 +199,19 @@ class Rosbag2Writer(FileWriter):
 
     def _finish(self) -> None:
         self._current().close()
-        bag = {
+        described = {"rosbag2_bagfile_information": self.described()}
+        with failures(self._name):
+            with (self._unfinished.path / NAME).open("x", encoding="utf-8") as file:
+                file.write(_yaml(described))
+                file.flush()
+                os.fsync(file.fileno())
+            self._unfinished.publish(self._final)
+
+    def described(self) -> dict[str, Any]:
+        """The metadata of the bag so far."""
+        return {
             "version": _VERSION,
-            "storage_identifier": "mcap",
+            "storage_identifier": self._storage,
             **self._all.described(),
             "topics_with_message_count": [
                 {
@@ -181,16 +233,98 @@ class Rosbag2Writer(FileWriter):
             "custom_data": None,
             "ros_distro": "hybridlog",
         }
-        described = {"rosbag2_bagfile_information": bag}
-        text = yaml.dump(described, Dumper=yaml.CSafeDumper, sort_keys=False, width=1 << 20)
-        with failures(self._name):
-            with (self._unfinished.path / NAME).open("x", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            self._unfinished.publish(self._final)
+
+    def rows(self) -> Iterator[tuple[_Topic, str, str]]:
+        """The topics so far, with their names and types."""
+        for (name, kind), topic in self._topics.items():
+            yield topic, name, kind
+
+    def number_of(self, channel: Channel) -> int:
+        """The number of a channel's topic."""
+        return self._topic(channel).number
 
     def _discard(self) -> None:
         if self._log is not None:
             self._log.abort()
         self._unfinished.remove()
+
+
+class _SqliteFile:
+    """A file of a bag in SQLite; times of publication and attachments have no place in it.
+
+    Args:
+        path: The file.
+        bag: The bag, which knows the topics.
+    """
+
+    def __init__(self, path: Path, bag: Rosbag2Writer) -> None:
+        self._path = path
+        self._bag = bag
+        with self._failures():
+            self._db = sqlite3.connect(path)
+            # The file is complete, or it is removed.
+            self._db.executescript(f"PRAGMA journal_mode=OFF; PRAGMA synchronous=OFF; {_TABLES}")
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages in the order of the rows."""
+        numbers = {n: self._bag.number_of(channels[n]) for n in set(batch.channel.tolist())}
+        rows = (
+            (numbers[channel], time, batch.payload(row))
+            for row, (channel, time) in enumerate(
+                zip(batch.channel.tolist(), batch.log_time.tolist(), strict=True)
+            )
+        )
+        with self._failures():
+            self._db.executemany(
+                "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows
+            )
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Do nothing: there are no metadata records."""
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Do nothing: there are no attachments."""
+
+    def close(self) -> None:
+        """Complete the file."""
+        types: dict[str, tuple[str, str, str, str]] = {}
+        with self._failures():
+            for topic, name, kind in self._bag.rows():
+                row = (topic.number, name, kind, "cdr", _yaml(topic.profiles()), topic.type_hash)
+                self._db.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", row)
+                schema = topic.channel.schema
+                assert schema is not None
+                text = with_nested(schema).data.decode(errors="replace")
+                types.setdefault(kind, (kind, schema.encoding, text, topic.type_hash))
+            self._db.executemany(
+                "INSERT INTO message_definitions(topic_type, encoding, "
+                "encoded_message_definition, type_description_hash) VALUES (?, ?, ?, ?)",
+                types.values(),
+            )
+            self._db.execute(
+                "INSERT INTO metadata(metadata_version, metadata) VALUES (?, ?)",
+                (_VERSION, _yaml(self._bag.described())),
+            )
+            self._db.commit()
+            self._db.close()
+            with self._path.open("rb") as file:
+                os.fsync(file.fileno())
+
+    def abort(self) -> None:
+        """Close the file, which will be removed."""
+        self._db.close()
+
+    @contextmanager
+    def _failures(self) -> Iterator[None]:
+        try:
+            with failures(os.fspath(self._path)):
+                yield
+        except sqlite3.Error as error:
+            full = getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL
+            kind = DiskFullError if full else HybridlogError
+            raise kind(f"writing {self._path} failed: {error}") from error
+
+
+def _yaml(value: object) -> str:
+    text: str = yaml.dump(value, Dumper=yaml.CSafeDumper, sort_keys=False, width=1 << 20)
+    return text
