@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import (
@@ -26,9 +27,10 @@ from hybridlog.index.connection import Connection
 from hybridlog.maintenance.opening import (
     catch_up,
     current_entry,
+    look_at_all,
+    mend,
     open_catalog,
-    put_again,
-    repair_on_open,
+    read_again,
 )
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_columns import ChunkColumns
@@ -184,7 +186,7 @@ class Session:
         self.directory = directory
         self._progress = progress
         self.connection = Connection(directory, mongo, cache_mb)
-        self.repairs = RepairReport(may_recover=recover)
+        self.repairs = RepairReport()
         self.cache = Cache()
         self.field_indexes: list[FieldIndex] = []
         self._uncertain: tuple[int, dict[str, set[str]]] | None = None
@@ -194,6 +196,8 @@ class Session:
         self._is_indexed = False  # the index has all recordings of the snapshot
         self._indexed: set[str] = set()  # ids of those that it has in any case
         self._stale: set[str] = set()  # recordings that the index may lack
+        self._recovers = recover
+        self._is_opened = False  # what a crash left was repaired, unless it is left to another
         self._latest = _Moment()
         self._pinned = threading.local()  # the moment that this thread asks about
         self._changed = 0, False  # as of the snapshot, see `StoreDirectory.changed`
@@ -201,6 +205,7 @@ class Session:
         self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._running: dict[str, RunningRecording] = {}
         self._following = threading.RLock()
+        self._mending = threading.Lock()
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
         self._index_version: IndexVersion | None = None
         self._places: TopicPlaces | None = None
@@ -210,7 +215,7 @@ class Session:
         self._segments: dict[tuple[str, int], SegmentReader] = {}
         self._contents: dict[Path, RecordingPayloads] = {}
         self._columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
-        self._tables_tried: set[tuple[str, str]] = set()  # looked for, and made if missing
+        self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._lock = threading.Lock()
         self._remember_meanings()
 
@@ -394,7 +399,7 @@ class Session:
                 return IndexTarget(self.connected, renew=self._another_database)
             self.disconnect()
         # Those that a crash has cut are brought into the index by another opening.
-        database = self._connected_for(None if self.repairs.may_recover else [])
+        database = self._connected_for(None if self._recovers else [])
         if database is None and self._unavailable is not None:
             if isinstance(self._unavailable, ConnectionLostError):
                 return IndexTarget(failure=self._unavailable, renew=self._another_database)
@@ -645,16 +650,17 @@ class Session:
             if moment.snapshot is not None:
                 return moment.snapshot
             begun = time.monotonic()
+            mends, self._is_opened = self._recovers and not self._is_opened, True
             self._changed = self.directory.changed()
             self._names = self.directory.names()
             try:
-                found = repair_on_open(self.directory, self.catalog, self.repairs)
+                found = look_at_all(self.directory, self.catalog, self.repairs, mends=mends)
             except DiskFullError as error:
                 # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
                 self.catalog.close()
                 self.catalog = open_catalog(self.directory, in_memory=True)
-                found = repair_on_open(self.directory, self.catalog, self.repairs)
+                found = look_at_all(self.directory, self.catalog, self.repairs, mends=mends)
             moment.snapshot = found
             ended = time.monotonic()
             self._looks_at = ended
@@ -707,7 +713,7 @@ class Session:
                 if entry is not None and entry.id == summary.id:
                     break
                 # Another process may have renamed it.
-                now = repair_on_open(self.directory, self.catalog, self.repairs)
+                now = look_at_all(self.directory, self.catalog, self.repairs)
                 if summary.id not in now.by_id:
                     return None
                 entry = self._current(now.summaries[now.by_id[summary.id]])
@@ -1066,7 +1072,7 @@ class Session:
         try:
             return ask(recording, *args, **kwargs)
         except CatalogError:
-            put_again(self.directory, self.catalog, recording)
+            read_again(self.directory, self.catalog, recording)
             return ask(recording, *args, **kwargs)
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
@@ -1119,7 +1125,7 @@ class Session:
                     reader = self._open_segment(label, number)
                 except SegmentError:
                     # Another process may have renamed the recording.
-                    known = repair_on_open(self.directory, self.catalog, self.repairs)
+                    known = look_at_all(self.directory, self.catalog, self.repairs)
                     place = known.by_id.get(recording)
                     if place is None or known.summaries[place].label == label:
                         raise
@@ -1162,27 +1168,60 @@ class Session:
         return Tables(self.directory.path, self.cache)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic, created again if it is missing; None if there can be none."""
-        from hybridlog.maintenance.tables import made_for
+        """The table of a topic; None without one. `mend` creates a missing one again."""
+        from hybridlog.maintenance.tables import can_be_made
 
         if recording.status in UNFINISHED:
             return None
+        found = self.tables.of(recording, topic)
         key = recording.id, topic
-        if key in self._tables_tried:
-            return self.tables.of(recording, topic)
-        return made_for(
-            self.directory,
-            recording,
-            topic,
-            self.tables,
-            self.repairs,
-            tried=self._tables_tried,
-        )
+        if found is None and key not in self._tables_tried:
+            self._tables_tried.add(key)
+            if can_be_made(recording, topic, self.tables):
+                self.repairs.noted_tables.add(key)
+        return found
 
     def reject_table(self, recording: RecordingEntry, topic: str) -> None:
-        """Drop a table that turned out to be damaged; the next question makes it again."""
+        """Drop a table that turned out to be damaged; `mend` makes it again."""
         self.tables.reject(recording, topic)
-        self._tables_tried.discard((recording.id, topic))
+        self.repairs.noted_tables.add((recording.id, topic))
+
+    def mend(self, seconds: float = math.inf) -> None:
+        """Repair what questions met: recordings after a crash, missing and damaged tables.
+
+        Args:
+            seconds: What takes longer stays in `repairs.noted` and `repairs.noted_tables`.
+
+        Raises:
+            DiskFullError: There is no room.
+        """
+        repairs, until = self.repairs, time.monotonic() + seconds
+        if not (repairs.noted or repairs.noted_tables) or not self.directory.is_writable:
+            return
+        with self._mending:
+            self._mend(until)
+
+    def _mend(self, until: float) -> None:
+        from hybridlog.maintenance.tables import make_noted
+
+        repairs = self.repairs
+        mended = mend(self.directory, self.catalog, repairs, until)
+        if mended:
+            with self._following:
+                for recording in mended:
+                    self._running.pop(recording, None)
+                self.catch_up(*mended)
+        by_recording: dict[str, set[str]] = {}
+        for recording, topic in [*repairs.noted_tables]:
+            by_recording.setdefault(recording, set()).add(topic)
+        snapshot = self.snapshot()
+        for recording, topics in by_recording.items():
+            place = snapshot.by_id.get(recording)
+            entry = None if place is None else self._entry_of(snapshot.summaries[place])
+            if entry is None or make_noted(
+                self.directory, entry, topics, self.tables, repairs, until=until
+            ):
+                repairs.noted_tables -= {(recording, topic) for topic in topics}
 
     def _forget_tables(self, recording: RecordingEntry) -> None:
         """Look for the tables of a recording again, now that it has ended."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import os
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, Self, TypeAlias, TypeVar, cast
 
 from hybridlog.entries import text
 from hybridlog.index import consent, field_indexes
@@ -34,6 +36,7 @@ from hybridlog_storage.errors import (
     DatabaseError,
     HeldError,
     HybridlogError,
+    ResourceError,
     StoreError,
     TopicError,
     UsageError,
@@ -73,6 +76,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
+MENDING_S: Final = 2.0
+"""Longest time that a command repairs what it met, after its answer."""
 _CLIENTS_WAIT_S = 600.0
 """Seconds for which a published MongoDB waits for clients."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
@@ -203,9 +208,11 @@ class Store:
         """Return this store."""
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Close; an interruption repairs nothing."""
+        if kind is None or issubclass(kind, Exception):
+            self.mend()
+        self._close()
 
     def __repr__(self) -> str:
         return f"<Store {self.directory.path}>"
@@ -287,11 +294,47 @@ class Store:
         """
         return self.session.at_one_moment()
 
+    def mend(self, seconds: float = MENDING_S) -> None:
+        """Repair what questions met: recordings after a crash, missing and damaged tables.
+
+        Questions repair nothing: they answer from what is whole. `close` calls this.
+
+        Args:
+            seconds: What takes longer is left; `repairs` names it. `repair` does all.
+        """
+        with suppress(StoreError, ResourceError):
+            self.session.mend(seconds)
+
     def close(self) -> None:
-        """Close files and connections. May be called more than once."""
+        """Repair what questions met, and close files and connections. May be called again."""
+        self.mend()
+        self._close()
+
+    def _close(self) -> None:
         if self._sql is not None:
             self._sql.close()
         self.session.close()
+
+    @contextmanager
+    def mended_meanwhile(self, every: float = MENDING_S) -> Iterator[None]:
+        """A block during which another thread calls `mend` again and again.
+
+        Args:
+            every: Seconds between two calls.
+        """
+        ended = threading.Event()
+
+        def mend() -> None:
+            while not ended.wait(every):
+                self.mend(math.inf)
+
+        thread = threading.Thread(target=mend, name="hybridlog-mend", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
     # Recordings and topics.
 
@@ -1147,6 +1190,7 @@ class Store:
         """
         from hybridlog.maintenance.repair import repair, repair_index
 
+        self.session.mend()
         self.refresh()
         chosen = [] if recordings is None else self.select(recordings)
         entries = None if recordings is None else chosen

@@ -678,9 +678,21 @@ MAINTENANCE = [
         "hybridlog/maintenance/opening.py",
         (
             "what-an-index-has-is-compared-with-entries-that-go",
-            "    catalog.drop_damaged()  # before",
-            "    # before",
+            "        catalog.drop_damaged()\n",
+            "        pass\n",
             "tests/test_catalog_by_hand.py::test_a_line_that_was_lost_is_made_again",
+        ),
+        (
+            "a-question-recovers-what-died",
+            "    if mends and not catalog.is_in_memory:\n        try:",
+            "    if not catalog.is_in_memory:\n        try:",
+            "tests/test_mending.py::test_a_question_about_a_recorder_that_died_writes_nothing",
+        ),
+        (
+            "what-died-is-not-noted",
+            "        report.noted.add(label)\n",
+            "        pass\n",
+            "tests/test_mending.py::test_a_store_that_stays_open_is_repaired_meanwhile",
         ),
         (
             "lost-lines-about-columns-stay-lost",

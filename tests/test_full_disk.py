@@ -13,7 +13,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog import session
-from hybridlog.maintenance.opening import repair_on_open
+from hybridlog.maintenance.opening import look_at_all
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DiskFullError
@@ -72,12 +72,12 @@ def test_nothing_is_said_to_have_crashed_on_a_full_disk(
         with store.start("whole") as recording:
             recording.write(Channel("/a", "json", None, {}), b'{"n": 1}')
 
-    def full(directory: Any, catalog: Any, report: Any) -> Any:
+    def full(directory: Any, catalog: Any, report: Any, *, mends: bool = False) -> Any:
         if not catalog.is_in_memory:
             raise DiskFullError("No space left while writing the catalog.")
-        return repair_on_open(directory, catalog, report)
+        return look_at_all(directory, catalog, report, mends=mends)
 
-    monkeypatch.setattr(session, "repair_on_open", full)
+    monkeypatch.setattr(session, "look_at_all", full)
     done = answer("fetch", "-t", "/a", "--count", store=tmp_path / "store")
     assert done.out == "1\n"
     assert "The disk of the store is full, so nothing in it is repaired or noted." in done.err

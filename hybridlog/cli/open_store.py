@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,7 +63,10 @@ def opened_store(
         )
     finally:
         bar.close()
-    with store, nullcontext() if is_lasting else store.at_one_moment():
+    during: AbstractContextManager[None] = store.at_one_moment()
+    if is_lasting:
+        during = store.mended_meanwhile() if recover else nullcontext()
+    with store, during:
         doing = "so the files answer"
         if records:
             target = store.session.index_to_record("Recording")
@@ -74,6 +77,8 @@ def opened_store(
             _print_rebuilt(store, doing)
         try:
             yield store
+            store.mend()
+            _print_left(store)
         finally:
             _print_rebuilt(store, "" if records else doing)
 
@@ -143,6 +148,15 @@ def _print_rebuilt(store: Store, doing: str) -> None:
         note(f"MongoDB is unavailable, {doing}: {reason}")
     for done in (repairs.damage, repairs.tables, repairs.indexed, repairs.removed):
         done.clear()
+
+
+def _print_left(store: Store) -> None:
+    """Name what was met and takes longer to repair."""
+    repairs = store.repairs
+    found = {"recording": len(repairs.noted), "table": len(repairs.noted_tables)}
+    left = " and ".join(counted(number, what) for what, number in found.items() if number)
+    if left and store.directory.is_writable:
+        note(f"Left to repair: {left}. `hybridlog repair` does it.")
 
 
 def _print_recovered(recording: str, segments: list[Recovered]) -> None:

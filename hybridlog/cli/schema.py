@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,6 +129,7 @@ def tables_command(
         ended = [one for one in channels if one.recording.status not in UNFINISHED]
         for one in ended:  # made again where they are missing
             opened.session.table(one.recording, one.channel.topic)
+        opened.mend(math.inf)
         opened.session.write_recordings_file()
         found = _found(opened, ended)
         others = len({one.recording.id for one in channels}) - len(

@@ -55,6 +55,8 @@ _LEFT_OVER = re.compile(r"\.(journal(\.old)?|\d{6}\.mcap)\.([0-9a-f]{16}|rebuilt
 """Names of files that were being written, and were to get another name when they were whole."""
 _MOVING = re.compile(r"(?P<before>\d{6}\.mcap)\.moving-(?P<number>\d{6})")
 _TRIES = 10
+_RECOVERED_BYTES_PER_S = 200e6
+"""Size of the open segments that are recovered in a second, about."""
 
 
 def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catalog:
@@ -68,8 +70,10 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
     return Catalog(directory.path, store_id, in_memory=in_memory or not directory.is_writable)
 
 
-def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairReport) -> Snapshot:
-    """Repair files and catalog; return all recordings.
+def look_at_all(
+    directory: StoreDirectory, catalog: Catalog, report: RepairReport, *, mends: bool = False
+) -> Snapshot:
+    """All recordings.
 
     The files of a recording are read if it is new, or looks different from outside. All
     others are compared with their files before they first answer, see `current_entry`.
@@ -78,23 +82,26 @@ def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairRe
         directory: The store.
         catalog: Its catalog.
         report: Collects problems and repairs.
+        mends: Repair what a crash has left, as when a store is opened; otherwise it is noted.
     """
     from hybridlog.maintenance import tables
 
+    mends = mends and not catalog.is_in_memory
     # A recording has its directory before it has tables.
-    gone = set() if catalog.is_in_memory else tables.unfinished(directory)
-    if report.may_recover and not catalog.is_in_memory:
+    gone = tables.unfinished(directory) if mends else set()
+    if mends:
         for name in directory.names():
             if name.startswith(REMOVED):
                 directory.sweep(name)
     rows = catalog.summaries()
-    catalog.drop_damaged()  # before the index is compared with entries, which may be lost then
+    if mends:  # before the index is compared with entries, which may be lost then
+        catalog.drop_damaged()
     known = {summary.label: summary for summary in rows}
     for _ in range(_TRIES):
         names = directory.names()
         looks = directory.looks(names)
         report.unreadable.clear()
-        found = _find(directory, catalog, looks, known, report)
+        found = _find(directory, catalog, looks, known, report, mends=mends)
         # A recording that was renamed meanwhile must not be missed. If it has exchanged its label
         # with another one, that one may have been seen twice.
         is_twice = any(len(copies) > 1 for copies in found.values())
@@ -104,13 +111,13 @@ def repair_on_open(directory: StoreDirectory, catalog: Catalog, report: RepairRe
     for recording, copies in found.items():
         if len(copies) > 1:
             found[recording] = [_one_of(directory, catalog, copies, known, report)]
-    for summary in rows:
+    for summary in rows if mends or catalog.is_in_memory else ():
         # The row of a recording that is unreadable now may be valid again later.
         if summary.id not in found and summary.label not in report.unreadable:
             catalog.remove(summary.id)
             gone.add(summary.id)
     snapshot = snapshot_of(catalog, [summary for (summary,) in found.values()])
-    if gone and not (catalog.is_in_memory or report.unreadable):
+    if gone and mends and not report.unreadable:
         tables.remove_unfinished(directory, snapshot)
         tables.remove_all(directory, gone - found.keys())
     return snapshot
@@ -123,7 +130,7 @@ def catch_up(
     labels: AbstractSet[str],
     report: RepairReport,
 ) -> Snapshot | None:
-    """All recordings after changes of some of them, as of `repair_on_open`.
+    """All recordings after changes of some of them, as of `look_at_all`.
 
     Args:
         directory: The store.
@@ -133,7 +140,7 @@ def catch_up(
         report: Collects problems and repairs.
 
     Returns:
-        All recordings; None if only `repair_on_open` can tell.
+        All recordings; None if only `look_at_all` can tell.
     """
     if report.copies or report.unreadable:
         return None
@@ -148,9 +155,6 @@ def catch_up(
         elsewhere = found.keys() & snapshot.by_id.keys() - old
         if is_twice or elsewhere or report.unreadable:
             return None
-        for summary in rows.values():
-            if summary.id not in found:
-                catalog.remove(summary.id)
         changed = [summary for (summary,) in found.values()]
         topics = {summary.topics: catalog.topics(summary.topics) for summary in changed}
     except StoreError:
@@ -174,8 +178,10 @@ def _find(
     looks: Mapping[str, str],
     known: Mapping[str, RecordingSummary],
     report: RepairReport,
+    *,
+    mends: bool = False,
 ) -> dict[str, list[RecordingSummary]]:
-    """Recover recordings; return their summaries by id.
+    """Summaries of recordings by id.
 
     Args:
         directory: The store.
@@ -183,6 +189,7 @@ def _find(
         looks: The look of each directory, by label.
         known: Summaries in the catalog, by label.
         report: Collects problems and repairs.
+        mends: Repair what a crash has left; otherwise it is noted.
     """
     found: dict[str, list[RecordingSummary]] = {}
     unchanged: list[RecordingSummary] = []
@@ -191,7 +198,7 @@ def _find(
         if summary is None or summary.look != look or summary.status in UNFINISHED:
             try:
                 before = summary
-                summary = _look_again(directory, catalog, label, summary, report)
+                summary = _look_again(directory, catalog, label, summary, report, mends=mends)
             except DiskFullError:
                 raise
             except StoreError as error:
@@ -202,7 +209,8 @@ def _find(
                 unchanged.append(summary)
         if summary is not None:
             found.setdefault(summary.id, []).append(summary)
-    catalog.put_looks(unchanged)
+    if mends or catalog.is_in_memory:
+        catalog.put_looks(unchanged)
     return found
 
 
@@ -212,6 +220,8 @@ def _look_again(
     label: str,
     summary: RecordingSummary | None,
     report: RepairReport,
+    *,
+    mends: bool,
 ) -> RecordingSummary | None:
     """The summary of a recording as its files are now; None if it is gone."""
     if summary is not None:
@@ -219,7 +229,7 @@ def _look_again(
         row = catalog.recording(summary.id)
         if row is not None and _is_current(directory, row[1], row[0], listing):
             return summary._replace(look=listing.look)
-    described = _refresh(directory, catalog, label, report)
+    described = _refresh(directory, catalog, label, report, mends=mends)
     return described.summary if described is not None else None
 
 
@@ -271,16 +281,24 @@ def _refresh(
     catalog: Catalog,
     label: str,
     report: RepairReport,
+    *,
+    mends: bool = False,
 ) -> Described | None:
-    """Recover a recording after a crash and update its catalog row; None if it is gone."""
-    may_write = report.may_recover and not catalog.is_in_memory
+    """Read a recording, and update its catalog row; None if it is gone.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        label: The recording.
+        report: Collects problems and repairs.
+        mends: Recover it first after a crash; otherwise it is noted, and answers from what is
+            whole.
+    """
     listing = directory.listing(label)
     is_empty = not (listing.journal or listing.sealed or listing.open)
     if is_empty and not _OURS.issuperset(listing.others):
         raise StoreError("it has neither a journal nor a segment, but other files")
-    if is_empty and not may_write:
-        return None
-    if may_write:
+    if mends and not catalog.is_in_memory:
         try:
             with directory.writing(label):
                 if is_empty and directory.is_beginning(label):
@@ -292,7 +310,59 @@ def _refresh(
                 return None  # a process is about to begin it
         except TopicError:
             return None
-    return put_described(directory, catalog, label, is_open=directory.is_recorded(label))
+    elif is_empty:
+        return None
+    is_open = directory.is_recorded(label)
+    described = describe_now(directory, catalog, label, is_open=is_open)
+    if not (mends or is_open or catalog.is_in_memory):
+        report.noted.add(label)
+    catalog.keep(described)
+    return described
+
+
+def mend(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    report: RepairReport,
+    until: float,
+) -> set[str]:
+    """Recover the recordings that were noted, and update their catalog rows.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        report: Has what was noted; what would take too long stays.
+        until: When this should end, by `time.monotonic`.
+
+    Returns:
+        Ids of the recordings.
+    """
+    mended = set()
+    for label in sorted([*report.noted]):  # other threads note more
+        if _open_bytes(directory, label) > (until - time.monotonic()) * _RECOVERED_BYTES_PER_S:
+            continue
+        report.noted.discard(label)
+        report.unreadable.pop(label, None)
+        try:
+            described = _refresh(directory, catalog, label, report, mends=True)
+        except DiskFullError:
+            raise
+        except StoreError as error:
+            if directory.has(label):
+                report.unreadable[label] = str(error)
+            continue
+        if described is not None:
+            mended.add(described.entry.id)
+    return mended
+
+
+def _open_bytes(directory: StoreDirectory, label: str) -> int:
+    """Size of the segments of a recording that are not sealed."""
+    path, found = directory.recording(label), 0
+    for name in directory.listing(label).open.values():
+        with suppress(OSError):
+            found += files.status(path / name).st_size
+    return found
 
 
 def _one_of(
@@ -323,7 +393,9 @@ def _one_of(
     for other in others:
         report.copies[other.label] = chosen.label
     # The row may be that of the copy.
-    return put_described(directory, catalog, chosen.label).summary
+    described = describe_now(directory, catalog, chosen.label)
+    catalog.keep(described)
+    return described.summary
 
 
 def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
@@ -544,13 +616,14 @@ def put_described(
     return described
 
 
-def put_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
+def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
     """Read the files of a recording again, after one of them was not what its entry says.
 
     Raises:
         StoreError: They cannot be read, or have changed.
     """
-    put_entry(directory, catalog, entry.label, is_open=directory.is_recorded(entry.label))
+    is_open = directory.is_recorded(entry.label)
+    catalog.keep(describe_now(directory, catalog, entry.label, is_open=is_open))
     for number, _, _ in entry.spans:
         try:
             catalog.table(entry, number)

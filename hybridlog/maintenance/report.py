@@ -1,4 +1,4 @@
-"""The report of a store's opening."""
+"""What is repaired in a store, and what is to be."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ def reporter(progress: Progress | None, label: str, total: int) -> Callable[[int
 
 @dataclass(slots=True)
 class RepairReport:
-    """Repairs at the opening of a store; recordings by label.
+    """Repairs of a store; recordings by label.
 
     Attributes:
-        may_recover: False to leave what a crash has cut to another opening.
         recovered: Segments that a crash left open.
         indexed: Recordings whose index was behind, and the number of missing chunks.
         removed: Recordings whose removal was finished, or whose files are gone.
@@ -36,9 +35,10 @@ class RepairReport:
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
         tables: Recording and topic of tables that were missing or damaged, and made again.
         disk_full: The error if the disk had no room for repairs, else None.
+        noted: Recordings that a question met after a crash; they are yet to be repaired.
+        noted_tables: Recording's id and topic of tables that a question met missing or damaged.
     """
 
-    may_recover: bool = True
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)
     indexed: dict[str, int] = field(default_factory=dict)
     removed: list[str] = field(default_factory=list)
@@ -49,6 +49,8 @@ class RepairReport:
     damage: list[str] = field(default_factory=list)
     tables: list[tuple[str, str]] = field(default_factory=list)
     disk_full: DiskFullError | None = None
+    noted: set[str] = field(default_factory=set)
+    noted_tables: set[tuple[str, str]] = field(default_factory=set)
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from hybridlog.columns.layout import type_prefix
-from hybridlog.maintenance.opening import put_again
+from hybridlog.maintenance.opening import read_again
 from hybridlog_storage.errors import CatalogError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
@@ -168,7 +168,7 @@ def _segment_bytes(
         try:
             table = catalog.table(entry, number)
         except CatalogError:
-            put_again(directory, catalog, entry)
+            read_again(directory, catalog, entry)
             table = catalog.table(entry, number)
         found = _chunk_shares(table)
         by_channel[: len(found)] += found[: len(by_channel)]

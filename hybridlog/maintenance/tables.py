@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import replace
@@ -16,7 +18,6 @@ from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 if TYPE_CHECKING:
     from hybridlog.columns.parquet_file import ParquetFileReader
     from hybridlog.columns.tables import Tables
-    from hybridlog.columns.topic_table import TopicTable
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
@@ -50,7 +51,11 @@ def missing(
 
 
 def make(
-    directory: StoreDirectory, entry: RecordingEntry, topics: Collection[str] | None = None
+    directory: StoreDirectory,
+    entry: RecordingEntry,
+    topics: Collection[str] | None = None,
+    *,
+    until: float = math.inf,
 ) -> bool:
     """Create tables of a recording again from its segments.
 
@@ -58,10 +63,14 @@ def make(
         directory: The store.
         entry: The recording's entry in the catalog.
         topics: Topics of the tables; None for those that are missing.
+        until: When this is given up, by `time.monotonic`.
 
     Returns:
         True if tables were created; False if the recording is being written, or the store is
             read-only.
+
+    Raises:
+        TimeoutError: It was given up.
     """
     if entry.status == "open" or not directory.is_writable:
         return False
@@ -79,6 +88,8 @@ def make(
                 numbers = [number for number, _, _ in entry.spans]
                 for segment in walk(directory.recording(label), numbers):
                     for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
+                        if time.monotonic() > until:
+                            raise TimeoutError
                         if not isinstance(chunk, SegmentError):
                             writer.add(chunk, segment.summary.channels)
                     writer.cut(segment.number, entry.digests[str(segment.number)])
@@ -90,50 +101,54 @@ def make(
     return not writer.has_failed
 
 
-def made_for(
+def can_be_made(entry: RecordingEntry, topic: str, tables: Tables) -> bool:
+    """True if the missing table of a topic can be created again."""
+    return tables.can_have(entry, topic) or bool(tables.lacking(entry, [topic]))
+
+
+def make_noted(
     directory: StoreDirectory,
     entry: RecordingEntry,
-    topic: str,
+    topics: Collection[str],
     tables: Tables,
     report: RepairReport,
     *,
-    tried: set[tuple[str, str]],
-) -> TopicTable | None:
-    """The table of a topic for a question, created again if it is missing or damaged.
+    until: float,
+) -> bool:
+    """Create tables of a recording that a question met missing or damaged.
 
-    Missing tables of topics that share chunks with it are created with it, so that no chunk is
-    read for each of them.
+    Missing tables of topics that share chunks with them are created with them, so that no
+    chunk is read for each of them.
 
     Args:
         directory: The store.
         entry: The recording's entry in the catalog.
-        topic: Full name.
+        topics: Full names.
         tables: Finds the tables.
         report: Collects the tables that were created.
-        tried: Recordings and topics for which this was tried; it grows.
+        until: When this is given up, by `time.monotonic`.
+
+    Returns:
+        False if time was short.
     """
-    tried.add((entry.id, topic))
-    found = tables.of(entry, topic)
-    if found is not None or entry.status == "open" or not directory.is_writable:
-        return found
-    if not tables.can_have(entry, topic) and not tables.lacking(entry, [topic]):
-        return None
     try:
-        others = {one for one in _sharing(directory, entry, topic) if (entry.id, one) not in tried}
+        shared = _sharing(directory, entry, topics)
     except StoreError:
-        return None
-    wanted = {topic, *missing(directory, entry, tables, others)}
-    tried.update((entry.id, one) for one in wanted)
-    if not make(directory, entry, wanted):
-        return None
-    tables.forget(entry, wanted)
-    made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
-    report.tables += [(entry.label, one) for one in made]
-    return tables.of(entry, topic)
+        return True
+    wanted = {*topics, *missing(directory, entry, tables, shared)}
+    try:
+        is_made = make(directory, entry, wanted, until=until)
+    except TimeoutError:
+        return False
+    if is_made:
+        tables.forget(entry, wanted)
+        made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
+        report.tables += [(entry.label, one) for one in made]
+    return True
 
 
-def _sharing(directory: StoreDirectory, entry: RecordingEntry, topic: str) -> set[str]:
-    """Topics that share chunks with a topic, or with another one of them."""
+def _sharing(directory: StoreDirectory, entry: RecordingEntry, asked: Collection[str]) -> set[str]:
+    """Topics that share chunks with some topics, or with another one of them."""
     topics = {channel.id: channel.topic for channel in entry.channels}
     numbers = [number for number, _, _ in entry.spans]
     together = {
@@ -141,7 +156,7 @@ def _sharing(directory: StoreDirectory, entry: RecordingEntry, topic: str) -> se
         for segment in walk(directory.recording(entry.label), numbers)
         for place in segment.summary.chunks
     }
-    found, before = {topic}, 0
+    found, before = {*asked}, 0
     while len(found) > before:
         before = len(found)
         found.update(*(some for some in together if not found.isdisjoint(some)))

@@ -578,6 +578,7 @@ class Catalog:
         self._by_fingerprint: dict[str, list[str]] | None = None
         self._odd: set[str] = set()  # names of files that are not ours, or left over
         self._damaged: set[int] = set()  # numbers of parts
+        self._kept: dict[str, Described] = {}  # by recording; written when this is closed
         # Bounds and the content that they are of, by kind and recording.
         self._noted: dict[str, dict[str, tuple[str, Ends]]] = defaultdict(dict)
         self._tables = Cache(_MAX_TABLES)
@@ -601,8 +602,12 @@ class Catalog:
         return not isinstance(self._folder, DiskFolder)
 
     def close(self) -> None:
-        """Drop what was read, and remove what was found to be damaged."""
+        """Write what was kept and noted, drop the rest, and remove what is damaged."""
         with self._lock:
+            with suppress(StoreError, ResourceError):
+                for described in [*self._kept.values()]:
+                    self.put(described)
+            self._kept.clear()
             self._keep_noted()
             self._forget()
             self.drop_damaged()
@@ -808,6 +813,16 @@ class Catalog:
 
     # Changes.
 
+    def keep(self, described: Described) -> None:
+        """Insert or replace a recording; it is written when this is closed."""
+        if self.is_in_memory:
+            self.put(described)
+            return
+        with self._lock:
+            self._forget(described.entry.id)
+            self._by_fingerprint = None
+            self._kept[described.entry.id] = described
+
     def put(self, described: Described) -> None:
         """Insert or replace a recording."""
         entry = described.entry
@@ -825,6 +840,7 @@ class Catalog:
             row[SUMMARY] = f"- {described.summary.to_json()}"
 
         with self._lock:
+            self._kept.pop(entry.id, None)
             self._forget(entry.id)
         self._put_schemas({c.schema for c in described.channels.values() if c.schema is not None})
         self._change(entry.id, change, topics_to_json(described.topics))
@@ -878,6 +894,7 @@ class Catalog:
             row.clear()
 
         with self._lock:
+            self._kept.pop(recording, None)
             self._forget(recording)
         self._change(recording, clear)
 
@@ -912,6 +929,7 @@ class Catalog:
         """
         with self._lock:
             self.was_damaged |= not self.is_in_memory
+            self._kept.clear()
             self._forget()
             with self._changing():
                 self._remove_recordings_file()
@@ -967,9 +985,18 @@ class Catalog:
         """
         with self._lock:
             self._follow()
-            wanted = self._places if recordings is None else self._places.keys() & {*recordings}
-            found = [self._parts[self._places[one]].summaries[one] for one in wanted]
-        return [summary for summary in found if summary is not None]
+            wanted = self._places.keys()
+            if recordings is not None:
+                wanted &= {*recordings}
+            found = [
+                self._parts[self._places[one]].summaries[one] for one in wanted - self._kept.keys()
+            ]
+            kept = [
+                one.summary
+                for recording, one in self._kept.items()
+                if recordings is None or recording in recordings
+            ]
+        return [summary for summary in found if summary is not None] + kept
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
         """A set of topics and their types, by its hash.
@@ -978,6 +1005,9 @@ class Catalog:
             CatalogError: The catalog has lost it.
         """
         with self._lock:
+            for one in self._kept.values():
+                if one.summary.topics == digest:
+                    return one.topics
             key = TOPICS, digest
             found = next((p.shared[key] for p in self._parts.values() if key in p.shared), "")
         if hash_of(found) != digest:
@@ -1001,6 +1031,9 @@ class Catalog:
 
     def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
         """State of the files and entry of a recording; None if it is missing or damaged."""
+        kept = self._kept.get(recording)
+        if kept is not None:
+            return kept.files, kept.entry
         row = self._row(recording)
         with suppress(KeyError, TypeError, ValueError):
             looks, document = json.loads(row[ENTRY])
@@ -1122,6 +1155,11 @@ class Catalog:
                 schema = Schema(name, encoding, text)
                 if schema_hash(schema) == digest:
                     found[digest] = schema
+        if len(found) < len(hashes):
+            for one in [*self._kept.values()]:
+                own = (channel.schema for channel in one.channels.values())
+                known = {schema_hash(schema): schema for schema in own if schema is not None}
+                found |= {digest: known[digest] for digest in known.keys() & {*hashes}}
         return found
 
     # Chunks.

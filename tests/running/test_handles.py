@@ -32,17 +32,17 @@ def test_a_recording_that_comes_while_another_thread_looks_is_seen(
         record(writer, "old", START)
         with hl.open(tmp_path / "store", mongo=NO_MONGODB) as store:
             store.refresh()
-            look = session_module.repair_on_open
+            look = session_module.look_at_all
             has_looked, may_end = threading.Event(), threading.Event()
 
-            def slow(*args: object) -> object:
-                found = look(*args)  # type: ignore[arg-type]
+            def slow(*args: object, **options: object) -> object:
+                found = look(*args, **options)  # type: ignore[arg-type]
                 if threading.current_thread().name == "slow":
                     has_looked.set()
                     may_end.wait(30)
                 return found
 
-            monkeypatch.setattr(session_module, "repair_on_open", slow)
+            monkeypatch.setattr(session_module, "look_at_all", slow)
             first = threading.Thread(target=lambda: store.topic("said").count(), name="slow")
             first.start()
             assert has_looked.wait(30)

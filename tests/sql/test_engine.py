@@ -224,11 +224,13 @@ def test_missing_and_damaged_tables_are_made_again(
     with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
         assert again.sql("select * from large").to_arrow().num_rows == wanted[0][0]
         assert again.sql(query).rows() == wanted
+        again.mend()
         assert [topic for _, topic in again.repairs.tables] == ["/large"]
     ParquetFileReader(large_file(own)).check()
     shutil.rmtree(own.directory.path / "tables")
     with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
         assert again.sql(query).rows() == wanted
+        again.mend()
         assert again.repairs.tables
 
 

@@ -1,0 +1,140 @@
+"""Questions repair nothing: what they meet is noted, and repaired after the answer."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.cli.open_store import _print_left
+from tests.running.methods import LABEL, rows, sent
+from tests.running.running import NO_MONGODB, Running, begun
+from tests.running.sequence import Known
+from tests.running.stores import copy_of, folder
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with begun(tmp_path_factory.mktemp("mending") / "store", "many", 60) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def known(running: Running) -> Known:
+    return running.flushed()
+
+
+@pytest.fixture
+def died(running: Running, known: Known, tmp_path: Path) -> Iterator[hl.Store]:
+    """A store that was opened and asked before its recorder died."""
+    path = copy_of(running, tmp_path / "copy")
+    fd = os.open(folder(path) / "writer.lock", os.O_RDWR)
+    fcntl.flock(fd, fcntl.LOCK_EX)
+    with hl.open(path, mongo=NO_MONGODB) as store:
+        assert store.entry(LABEL).status == "open"
+        check(store, known)
+        os.close(fd)
+        yield store
+
+
+def check(store: hl.Store, known: Known) -> None:
+    """Everything is there, by messages, columns and SQL."""
+    for topic in known.counts:
+        assert rows(store.topic(topic)) == sent(known.of(topic))
+        if topic != "/opaque":
+            assert store.topic(topic).to_arrow().num_rows == len(known.of(topic))
+    assert store.all_topics().count() == len(known.sent)
+
+
+def files_in(store: hl.Store) -> dict[str, tuple[int, int, int]]:
+    """Number, size and time of everything in a store but locks."""
+    found = {}
+    for place, folders, names in os.walk(store.directory.path):
+        for name in [*folders, *names]:
+            about = (Path(place) / name).lstat()
+            if not name.endswith("lock"):
+                found[f"{place}/{name}"] = about.st_ino, about.st_size, about.st_mtime_ns
+    return found
+
+
+def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, known: Known) -> None:
+    before = files_in(died)
+    assert any(name.endswith(".mcap.open") for name in before)
+    died.refresh()
+    check(died, known)
+    assert died.entry(LABEL).status == "unfinished"
+    assert died.repairs.noted == {LABEL}
+    assert files_in(died) == before
+    died.mend(0)
+    assert (died.repairs.noted, files_in(died)) == ({LABEL}, before)
+    died.mend()
+    assert not died.repairs.noted
+    assert died.repairs.recovered.keys() == {LABEL}
+    assert died.entry(LABEL).status == "recovered"
+    assert not any(name.endswith(".mcap.open") for name in files_in(died))
+    check(died, known)
+    died.mend()
+    check(died, known)
+
+
+def test_a_store_that_stays_open_is_repaired_meanwhile(died: hl.Store, known: Known) -> None:
+    with died.mended_meanwhile(0.05):
+        deadline = time.monotonic() + 60
+        while died.entry(LABEL).status != "recovered":
+            assert time.monotonic() < deadline
+            check(died, known)
+        check(died, known)
+    assert not any(name.endswith(".mcap.open") for name in files_in(died))
+
+
+def test_one_moment_outlasts_the_repair(died: hl.Store, known: Known) -> None:
+    with died.at_one_moment():
+        check(died, known)
+        with hl.open(died.directory.path, mongo=NO_MONGODB) as other:
+            assert other.entry(LABEL).status == "recovered"
+        check(died, known)
+    check(died, known)
+
+
+def test_a_question_that_misses_tables_writes_none(
+    died: hl.Store, known: Known, capsys: pytest.CaptureFixture[str]
+) -> None:
+    died.refresh()
+    died.entry(LABEL)
+    died.mend()
+    for file in (died.directory.path / "tables").rglob("*.parquet"):
+        data = bytearray(file.read_bytes())
+        data[len(data) // 2] ^= 1
+        file.write_bytes(data)
+    died.refresh()
+    before = files_in(died)
+    where = died.topic("arm").where("n > 3")
+    count = where.count()
+    assert count == len(rows(where)) > 0
+    assert files_in(died) == before
+    died.mend(0)
+    assert died.repairs.noted_tables
+    assert files_in(died) == before
+    _print_left(died)
+    number = len(died.repairs.noted_tables)
+    assert f"Left to repair: {number} table" in capsys.readouterr().err
+    died.mend()
+    assert not died.repairs.noted_tables
+    assert (LABEL, "/arm") in died.repairs.tables
+    assert where.count() == count
+    assert not died.repairs.noted_tables
+
+
+def test_closing_repairs_and_an_interruption_does_not(died: hl.Store, known: Known) -> None:
+    died.refresh()
+    died.entry(LABEL)
+    with pytest.raises(KeyboardInterrupt), died:
+        raise KeyboardInterrupt
+    assert any(name.endswith(".mcap.open") for name in files_in(died))
+    died.close()
+    assert not any(name.endswith(".mcap.open") for name in files_in(died))
