@@ -1195,16 +1195,16 @@ class Session:
         Raises:
             DiskFullError: There is no room.
         """
-        repairs, until = self.repairs, time.monotonic() + seconds
-        if not (repairs.noted or repairs.noted_tables) or not self.directory.is_writable:
-            return
-        with self._mending:
-            self._mend(until)
+        if self.directory.is_writable:
+            with self._mending:
+                self._mend(time.monotonic() + seconds)
 
     def _mend(self, until: float) -> None:
         from hybridlog.maintenance.tables import make_noted
 
         repairs = self.repairs
+        self.catalog.write_kept()
+        self.catalog.drop_damaged()
         mended = mend(self.directory, self.catalog, repairs, until)
         if mended:
             with self._following:

@@ -590,6 +590,7 @@ def test_a_catalog_damaged_while_the_store_is_open(store: Path, way: str) -> Non
         opened.refresh()
         assert len(opened.recordings()) == 2
         assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
+        opened.mend()
         assert opened.catalog.is_sound()
 
 

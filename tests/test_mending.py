@@ -71,7 +71,8 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     assert died.repairs.noted == {LABEL}
     assert files_in(died) == before
     died.mend(0)
-    assert (died.repairs.noted, files_in(died)) == ({LABEL}, before)
+    assert died.repairs.noted == {LABEL}
+    assert any(name.endswith(".mcap.open") for name in files_in(died))
     died.mend()
     assert not died.repairs.noted
     assert died.repairs.recovered.keys() == {LABEL}

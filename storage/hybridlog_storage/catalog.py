@@ -604,10 +604,7 @@ class Catalog:
     def close(self) -> None:
         """Write what was kept and noted, drop the rest, and remove what is damaged."""
         with self._lock:
-            with suppress(StoreError, ResourceError):
-                for described in [*self._kept.values()]:
-                    self.put(described)
-            self._kept.clear()
+            self.write_kept()
             self._keep_noted()
             self._forget()
             self.drop_damaged()
@@ -823,6 +820,14 @@ class Catalog:
             self._by_fingerprint = None
             self._kept[described.entry.id] = described
 
+    def write_kept(self) -> None:
+        """Write what was kept, as far as that is possible."""
+        with self._lock:
+            with suppress(StoreError, ResourceError):
+                for described in [*self._kept.values()]:
+                    self.put(described)
+            self._kept.clear()
+
     def put(self, described: Described) -> None:
         """Insert or replace a recording."""
         entry = described.entry
@@ -985,9 +990,7 @@ class Catalog:
         """
         with self._lock:
             self._follow()
-            wanted = self._places.keys()
-            if recordings is not None:
-                wanted &= {*recordings}
+            wanted = {*self._places} if recordings is None else self._places.keys() & {*recordings}
             found = [
                 self._parts[self._places[one]].summaries[one] for one in wanted - self._kept.keys()
             ]
@@ -1007,7 +1010,7 @@ class Catalog:
         with self._lock:
             for one in self._kept.values():
                 if one.summary.topics == digest:
-                    return one.topics
+                    return topics_from_json(topics_to_json(one.topics))
             key = TOPICS, digest
             found = next((p.shared[key] for p in self._parts.values() if key in p.shared), "")
         if hash_of(found) != digest:

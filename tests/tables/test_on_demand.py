@@ -1,4 +1,4 @@
-"""A question makes the tables that it needs, once, and frames come from them."""
+"""Tables that a question misses are made after it, once, and frames come from tables."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def files(store: hl.Store) -> list[str]:
 
 
 @pytest.mark.parametrize("fault", ["removed", "cut", "flipped"])
-def test_a_table_is_made_again_for_a_question(store: hl.Store, fault: str) -> None:
+def test_a_table_that_a_question_misses_is_made_again(store: hl.Store, fault: str) -> None:
     before = files(store)
     assert before
     path = store.directory.path / "tables"
@@ -65,6 +65,7 @@ def test_a_table_is_made_again_for_a_question(store: hl.Store, fault: str) -> No
     query = store.topic("/imu").where(f"n >= {2**63 + 1000}")
     assert query.count() == 500
     assert [m.log_time_ns for m in query.limit(1)] == [1000 * SECOND]
+    store.mend()
     assert set(files(store)) <= set(before)
     # Another process finds the table, and reads no chunk.
     with hl.open(store.directory.path) as other:
@@ -77,11 +78,12 @@ def test_a_topic_without_a_table_is_tried_once(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[set[str]] = []
-    monkeypatch.setattr(making, "make", lambda _, __, topics: made.append(topics) or True)
+    monkeypatch.setattr(making, "make", lambda *known, until: made.append(known[2]) or True)
     shutil.rmtree(store.directory.path / "tables")
     store.refresh()
     for _ in range(2):
         assert store.topic("/imu").where("x > 1").count() > 0
+        store.mend()
     assert made == [{"/imu", "/mixed"}]  # which share their chunks
 
 

@@ -283,6 +283,7 @@ def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables, mongo
     assert recorded.topic("/large").where("i8 > 0").count() == want
     recorded.refresh()
     assert recorded.topic("/large").where("i8 > 0").count() == want
+    recorded.mend()
     assert recorded.verify().findings == []
     assert count(recorded, tables, "/large") == want
     with hl.open(recorded.directory.path, mongo=mongo) as indexed:
