@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
@@ -30,7 +31,7 @@ from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
-from hybridlog_storage.segments.segment_format import MOVED_SIZE
+from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
@@ -118,7 +119,10 @@ class Inventory:
         for summary in self.summaries.values():
             files = (summary.compacted or {}).get("files", ())
             found.update({file.file: file for file in files})
-        return found | (self.state.payloads if self.state is not None else {})
+        if self.state is None:
+            return found
+        found = {path: file for path, file in found.items() if path not in self.state.deleted}
+        return found | self.state.payloads
 
     def stored_file(self, number: int) -> tuple[str, int]:
         """Digest and size of the file of a valid segment."""
@@ -210,7 +214,8 @@ def _is_listed(inventory: Inventory, state: JournalState, number: int) -> bool:
     """True if the journal lists a valid segment as its file is now, and what that needs."""
     files = (inventory.summaries[number].compacted or {}).get("files", ())
     is_thinned = inventory.stored.get(number) in (None, *state.thinned.get(number, ()))
-    return number in state.sealed and is_thinned and {f.file for f in files} <= {*state.payloads}
+    known = state.payloads.keys() | state.deleted
+    return number in state.sealed and is_thinned and {f.file for f in files} <= known
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -264,6 +269,7 @@ def describe(
     entry.status = _status(inventory, end, is_open=is_open, has_losses=bool(ours))
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
+    entry.stored = {str(number): digest for number, (digest, _) in inventory.stored.items()}
     entry.digests = {str(number): summary.digest for number, summary in inventory.summaries.items()}
     entry.spans = [
         (number, int(summary.table.chunks["first"].min()), int(summary.table.chunks["last"].max()))
@@ -391,9 +397,9 @@ def _losses_of_columns(inventory: Inventory) -> list[dict[str, Any]]:
     rows = []
     for file in inventory.payloads.values():
         size = inventory.listing.payloads.get(file.file)
-        if size == file.bytes:
-            continue
-        spans = [span for s in inventory.summaries.values() if (span := _moved_span(s, file.topic))]
+        if size == file.bytes or (size is None and PAYLOAD_PARTS in inventory.listing.others):
+            continue  # or it is about to get its name
+        spans = [span for s in inventory.summaries.values() if (span := _span_of(s, file))]
         if spans:
             problem = "is missing" if size is None else "has another size"
             lost = {
@@ -403,16 +409,18 @@ def _losses_of_columns(inventory: Inventory) -> list[dict[str, Any]]:
                 "last": max(last for _, last in spans),
             }
             name = f"{PAYLOADS}/{file.file}"
-            rows.append(_loss(name, f"a file of columns {problem}", lost, length=file.bytes))
+            what = "fields" if file.has_fields else "columns"
+            rows.append(_loss(name, f"a file of {what} {problem}", lost, length=file.bytes))
     return rows
 
 
-def _moved_span(summary: SegmentSummary, topic: str) -> tuple[int, int] | None:
-    """First and last log time of the messages of a topic in moved chunks; None without any."""
+def _span_of(summary: SegmentSummary, file: PayloadFile) -> tuple[int, int] | None:
+    """First and last log time of messages that need a file: moved or expired ones of its topic."""
     table = summary.table
-    is_moved = np.repeat(table.chunks["length"] == MOVED_SIZE, table.chunks["parts"])
-    channels = [number for number, channel in summary.channels.items() if channel.topic == topic]
-    parts = table.parts[is_moved & np.isin(table.parts["channel"], channels)]
+    size = EXPIRED_SIZE if file.has_fields else MOVED_SIZE
+    needs_file = np.repeat(table.chunks["length"] == size, table.chunks["parts"])
+    channels = [n for n, channel in summary.channels.items() if channel.topic == file.topic]
+    parts = table.parts[needs_file & np.isin(table.parts["channel"], channels)]
     return (int(parts["first"].min()), int(parts["last"].max())) if len(parts) else None
 
 
@@ -544,7 +552,7 @@ def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
 def sealed_line(inventory: Inventory, number: int) -> journal.Event:
     """The journal line for an existing segment."""
     summary = inventory.summaries[number]
-    channels = sealed_channels(summary.table, summary.channels)
+    channels = sealed_channels(summary.table.as_stored(), summary.channels)
     file = inventory.listing.sealed[number]
     size = summary.size
     if number in inventory.stored and summary.compacted is not None:

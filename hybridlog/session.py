@@ -1152,6 +1152,14 @@ class Session:
             return None
         return ArrayTable(channel, readers, self.tables.opened)
 
+    def expired_fields(
+        self, recording: RecordingEntry, topic: str, chunks: Collection[tuple[int, int]]
+    ) -> TopicTable:
+        """The fields of a topic in expired chunks, see `RecordingPayloads.expired_fields`."""
+        with self._lock:
+            contents = self._contents_of(self.directory.recording(recording.label))
+        return contents.expired_fields(topic, chunks, self.tables.opened)
+
     def _contents_of(self, recording: Path) -> RecordingPayloads:
         """The content of moved chunks, shared by the segments of a recording."""
         found = self._contents.get(recording)

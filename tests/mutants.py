@@ -488,8 +488,8 @@ FORMAT_2 = [
         ),
         (
             "indexes-are-believed",
-            "        if crc32(trailer) == place.trailer_crc:\n            return message_times",
-            "        if True:\n            return message_times",
+            "        if crc32(trailer) == place.trailer_crc:\n            added",
+            "        if True:\n            added",
             SEGMENTS,
         ),
         (
@@ -548,7 +548,7 @@ FORMAT_2 = [
         ),
         (
             "chunks-of-another-segment-are-believed",
-            'if summary.recording.get("id") != entry.id or summary.whole_digest != digest:',
+            "if not (is_ours and is_known):",
             "if False:",
             "tests/test_entries.py::test_chunks_of_another_segment_are_refused",
         ),
@@ -630,8 +630,8 @@ MAINTENANCE = [
         "hybridlog/maintenance/imports.py",
         (
             "copied-columns-are-not-checked",
-            "        PayloadReader(folder, file).check()\n",
-            "        PayloadReader(folder, file)\n",
+            "        open_file(folder, file).check()\n",
+            "        open_file(folder, file)\n",
             IMPORT,
         ),
         (

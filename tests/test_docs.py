@@ -985,7 +985,7 @@ def test_what_is_reserved_is_ignored_or_refused(recorded: hl.Store, tmp_path: Pa
         assert entry.messages == sum(1 for _ in second.messages())
     settings = tmp_path / "store" / "hybridlog.toml"
     text = settings.read_text()
-    for feature in ("expired", "journal-pieces"):
+    for feature in ("journal-pieces",):
         settings.write_text(text + f'requires = ["{feature}"]\n')
         with pytest.raises(HybridlogError, match=f"requires '{feature}'"):
             hl.open(tmp_path / "store")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -21,13 +21,16 @@ from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from hybridlog.columns.column_file import OpenFiles
+    from hybridlog.columns.field_files import FieldFile
     from hybridlog.columns.payload_reader import PayloadReader
-    from hybridlog_storage.journal import PayloadFile
+    from hybridlog.columns.topic_table import TopicTable
+    from hybridlog_storage.journal import JournalState, PayloadFile
     from hybridlog_storage.messages import Buffer
-    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
 THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
@@ -35,12 +38,12 @@ THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 _REBUILT_BYTES: Final = 32 << 20  # messages in memory: neighbouring chunks share a row group
 
 
-def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
-    """Give finished files their names, and remove the folder of unfinished files.
+def publish(recording: Path, state: JournalState | None) -> None:
+    """Give finished files their names, remove the folder of unfinished files, and deleted ones.
 
     Args:
         recording: The recording's directory, locked by this process.
-        listed: The files that the journal lists.
+        state: Its journal, which says what is finished and deleted; None without one.
 
     Raises:
         HybridlogError: A file cannot be renamed or removed.
@@ -48,7 +51,7 @@ def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
     parts, final = recording / PAYLOAD_PARTS, recording / PAYLOADS
     try:
         names = sorted(payload_names(recording, PAYLOAD_PARTS))
-        moved = [name for name in names if name in listed]
+        moved = [name for name in names if state is not None and name in state.payloads]
         folders = {(final / name).parent for name in moved}
         for folder in folders:
             files.make_folders(folder, depth=IN_PAYLOADS - 1)
@@ -60,6 +63,9 @@ def publish(recording: Path, listed: Mapping[str, PayloadFile]) -> None:
         for folder in folders:
             files.sync_folder(folder, depth=IN_PAYLOADS - 1)
         files.remove_tree(parts, depth=files.IN_RECORDING)
+        deleted = set() if state is None else state.deleted & payload_names(recording).keys()
+        for name in sorted(deleted):
+            files.unlink(final / name, depth=IN_PAYLOADS)
     except OSError as error:
         raise durability.explain(error, final, "moving payloads to") from error
 
@@ -113,6 +119,19 @@ def _is_listed(path: Path, number: int, listed: Sequence[tuple[str, int]]) -> bo
     return (summary.digest, summary.size) == listed[-1]
 
 
+@dataclass(frozen=True, slots=True)
+class _Files:
+    """Files with messages of a chunk.
+
+    Attributes:
+        payloads: Those of payloads.
+        fields: Those of what is left of expired messages, as the journal lists them.
+    """
+
+    payloads: list[PayloadReader] = field(default_factory=list)
+    fields: list[FieldFile] = field(default_factory=list)
+
+
 class RecordingPayloads:
     """The files of payloads of one recording. Thread safe.
 
@@ -136,8 +155,8 @@ class RecordingPayloads:
         self._given = listed
         self._folder = recording / folder
         self._cache = cache or Cache(_REBUILT_BYTES)
-        self._readers: dict[str, PayloadReader] = {}
-        self._places: dict[tuple[int, int], list[PayloadReader]] | None = None
+        self._readers: dict[str, PayloadReader | FieldFile] = {}
+        self._places: dict[tuple[int, int], _Files] | None = None
         self._problem = ""  # of a file that cannot be read
         self._lock = threading.RLock()
 
@@ -153,7 +172,7 @@ class RecordingPayloads:
         state = journal.read(self._recording)
         return [] if state is None else list(state.payloads.values())
 
-    def reader(self, listed: PayloadFile) -> PayloadReader:
+    def reader(self, listed: PayloadFile) -> PayloadReader | FieldFile:
         """The reader of a file.
 
         Raises:
@@ -162,11 +181,8 @@ class RecordingPayloads:
         with self._lock:
             found = self._readers.get(listed.file)
             if found is None:
-                from hybridlog.columns.payload_reader import PayloadReader
-
-                found = self._readers[listed.file] = PayloadReader(
-                    self._folder, listed, self._cache
-                )
+                found = open_file(self._folder, listed, self._cache)
+                self._readers[listed.file] = found
             return found
 
     def ordered(self, topic: str) -> list[PayloadReader]:
@@ -175,7 +191,10 @@ class RecordingPayloads:
         Raises:
             StoreError: A file is missing or damaged.
         """
-        readers = [self.reader(file) for file in self.listed if file.topic == topic]
+        from hybridlog.columns.payload_reader import PayloadReader
+
+        own = [self.reader(file) for file in self.listed if file.topic == topic]
+        readers = [reader for reader in own if isinstance(reader, PayloadReader)]
         return readers if all(reader.is_ordered for reader in readers) else []
 
     def __call__(self, segment: int, chunk: int, size: int) -> Buffer:
@@ -200,6 +219,46 @@ class RecordingPayloads:
         except StoreError as error:
             raise SegmentError(str(error)) from error
 
+    def expired(self, segment: int, chunk: int) -> ExpiredMessages:
+        """What is left of an expired chunk.
+
+        Raises:
+            SegmentError: It is missing or damaged.
+        """
+        from hybridlog.columns.field_files import expired_messages, newest
+
+        try:
+            found = self._having(segment, chunk).fields
+            if not found:
+                raise SegmentError(self._problem or "its fields are in no file")
+            files = newest(found, (segment, chunk))
+            return expired_messages([file.rows(segment, chunk) for file in files])
+        except SegmentError:
+            raise
+        except StoreError as error:
+            raise SegmentError(str(error)) from error
+
+    def expired_fields(
+        self, topic: str, chunks: Collection[tuple[int, int]], opened: OpenFiles
+    ) -> TopicTable:
+        """The fields of a topic in expired chunks as a table, in no order.
+
+        Args:
+            topic: Full name.
+            chunks: Segments and numbers of the chunks.
+            opened: Reads the columns.
+        """
+        from hybridlog.columns.column_file import FIRST, LAST, TablePart
+        from hybridlog.columns.field_files import newest
+        from hybridlog.columns.layout import TopicCounts
+        from hybridlog.columns.topic_table import TopicTable
+
+        parts = []
+        for key in chunks:
+            own = [file for file in self._having(*key).fields if file.listed.topic == topic]
+            parts += [TablePart(file, *file.places[key], FIRST, LAST) for file in newest(own, key)]
+        return TopicTable(topic, parts, TopicCounts(sum(part.rows for part in parts)), opened)
+
     def _content(self, segment: int, chunk: int, size: int) -> Buffer:
         readers = self.having(segment, chunk)
         content = np.empty(size, np.uint8)
@@ -223,19 +282,48 @@ class RecordingPayloads:
 
     def having(self, segment: int, chunk: int) -> list[PayloadReader]:
         """The readers of files with messages of a chunk, but for damaged or missing files."""
+        return self._having(segment, chunk).payloads
+
+    def _having(self, segment: int, chunk: int) -> _Files:
         with self._lock:
             if self._places is None:
-                places = defaultdict(list)
+                places: defaultdict[tuple[int, int], _Files] = defaultdict(_Files)
                 for listed in self.listed:
                     try:
-                        reader = self.reader(listed)
+                        self._find(listed, places)
                     except StoreError as error:
                         self._problem = str(error)
-                        continue
-                    for key in reader.places:
-                        places[key].append(reader)
                 self._places = dict(places)
-            return self._places.get((segment, chunk), [])
+            return self._places.get((segment, chunk), _Files())
+
+    def _find(self, listed: PayloadFile, places: dict[tuple[int, int], _Files]) -> None:
+        from hybridlog.columns.field_files import FieldFile
+
+        reader = self.reader(listed)
+        for key in reader.places:
+            if isinstance(reader, FieldFile):
+                places[key].fields.append(reader)
+            else:
+                places[key].payloads.append(reader)
+
+
+def open_file(
+    folder: Path, listed: PayloadFile, cache: Cache | None = None
+) -> PayloadReader | FieldFile:
+    """The reader of a file that the journal lists.
+
+    Args:
+        folder: Folder that its name counts from.
+        listed: The file.
+        cache: Keeps what was read.
+
+    Raises:
+        StoreError: It is missing, damaged, or another file.
+    """
+    from hybridlog.columns.field_files import FieldFile
+    from hybridlog.columns.payload_reader import PayloadReader
+
+    return (FieldFile if listed.has_fields else PayloadReader)(folder, listed, cache)
 
 
 def open_segment(

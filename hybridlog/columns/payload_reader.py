@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.columns.chunk_file import ChunkFile
 from hybridlog.columns.clouds import PointLayout
-from hybridlog.columns.column_file import FIRST, LAST, ColumnFile, TablePart
-from hybridlog.columns.layout import IN_PAYLOADS, TopicCounts
+from hybridlog.columns.column_file import FIRST, LAST, TablePart
+from hybridlog.columns.layout import TopicCounts
 from hybridlog.columns.parquet_file import leaves
 from hybridlog.columns.payload_rows import NEEDED, Rebuilder, rows_of
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog.columns.zones import Zone
 from hybridlog.schema.arrow_types import converted, has_empty
-from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.stopping import check_wanted
 
@@ -28,86 +28,31 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.payload_rows import Rebuilt
     from hybridlog.query.question import RecordedChannel
-    from hybridlog_storage.journal import PayloadFile
-
-_RESTORE = "Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
-class Place(NamedTuple):
-    """Rows of a chunk in a file.
+class PayloadReader(ChunkFile):
+    """One file of payloads; see `ChunkFile`.
 
     Attributes:
-        group: Row group.
-        begin: Its first row in the group.
-        rows: Number of rows.
-    """
-
-    group: int
-    begin: int
-    rows: int
-
-
-class PayloadReader(ColumnFile):
-    """One file of payloads. Thread safe.
-
-    Args:
-        folder: Folder that its name counts from.
-        listed: The file as the journal lists it.
-        cache: Keeps messages that were rebuilt.
-
-    Attributes:
-        listed: As above.
         is_ordered: True if rows are in order of time and arrival.
-        places: Rows of each chunk, by segment and number.
-
-    Raises:
-        StoreError: It is missing, damaged, or another file than the listed one.
     """
 
-    def __init__(self, folder: Path, listed: PayloadFile, cache: Cache | None = None) -> None:
-        self.listed = listed
-        self._cache = cache or Cache()
-        path = folder / listed.file
-        try:
-            super().__init__(path, depth=IN_PAYLOADS)
-        except FileNotFoundError as error:
-            raise StoreError(f"The payload file {path} is missing. {_RESTORE}") from error
-        if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
-            raise StoreError(
-                f"The payload file {path} is not the one that the journal lists. {_RESTORE}"
-            )
-        try:
-            values = self.about.payloads
-            layout = values["layout"]
-            self._order = [str(path) for path in values["order"]]
-            self._rebuilder = Rebuilder(
-                str(values["wire"]),
-                self._order,
-                None if layout is None else PointLayout.from_json(layout),
-            )
-            self.is_ordered = bool(values["is_ordered"])
-            self.places = self._read_places(values["chunks"])
-            self._zones = [
-                {str(path): Zone.from_json(zone) for path, zone in group.items()}
-                for group in values["zones"]
-            ]
-            if len(self._zones) != self.groups:
-                raise ValueError("its row groups and its zones differ")
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
-
-    def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
-        found: dict[tuple[int, int], Place] = {}
-        if len(chunks) != self.groups:
-            raise ValueError("its row groups and its chunks differ")
-        for group, inside in enumerate(chunks):
-            at = 0
-            for segment, chunk, rows in inside:
-                found[int(segment), int(chunk)] = Place(group, at, int(rows))
-                at += int(rows)
-            if at != self.about.bounds[group][0]:
-                raise ValueError("its row groups and its chunks differ")
-        return found
+    def _take(self, values: Mapping[str, Any]) -> None:
+        super()._take(values)
+        layout = values["layout"]
+        self._order = [str(path) for path in values["order"]]
+        self._rebuilder = Rebuilder(
+            str(values["wire"]),
+            self._order,
+            None if layout is None else PointLayout.from_json(layout),
+        )
+        self.is_ordered = bool(values["is_ordered"])
+        self._zones = [
+            {str(path): Zone.from_json(zone) for path, zone in group.items()}
+            for group in values["zones"]
+        ]
+        if len(self._zones) != self.groups:
+            raise ValueError("its row groups and its zones differ")
 
     @property
     def zones(self) -> Sequence[Mapping[str, Zone]]:
@@ -120,7 +65,7 @@ class PayloadReader(ColumnFile):
         Raises:
             StoreError: It is damaged.
         """
-        return self._cache.made(
+        return self.cache.made(
             "rebuilt",
             self.number,
             group,

@@ -18,7 +18,14 @@ import pyarrow as pa
 
 from hybridlog.columns.clouds import CLOUD_TYPES, DATA, PointLayout, layout_of
 from hybridlog.columns.fields import FieldShape, records_of
-from hybridlog.columns.layout import OWN, OWN_COLUMNS, PAYLOAD_RESERVED, POINTS, RECIPE
+from hybridlog.columns.layout import (
+    OWN,
+    OWN_COLUMNS,
+    PAYLOAD_RESERVED,
+    POINTS,
+    RECIPE,
+    topic_folder,
+)
 from hybridlog.columns.rows import Messages, own_columns
 from hybridlog.columns.rows import Piece as TablePiece
 from hybridlog.columns.transposer import (
@@ -57,12 +64,13 @@ class Piece:
 
     Attributes:
         table: The rows, in the order of the chunk.
-        layout: Layout of the points of clouds; None where points are not unpacked.
+        layout: Layout of the points of clouds; None where points are not unpacked. Of what is
+            left of expired messages the schema. Those of one layout share a file.
         size: About the bytes of the rows.
     """
 
     table: pa.Table
-    layout: PointLayout | None
+    layout: PointLayout | pa.Schema | None
     size: int
 
 
@@ -88,6 +96,15 @@ class TopicColumns:
         self._reader = WireReader(message_type, self._wire)
         self._is_cloud = channel.schema.name in CLOUD_TYPES
         self._shape = FieldShape(None, PAYLOAD_RESERVED)
+        self.folder = topic_folder(channel.topic)
+
+    def about(self, layout: PointLayout | None) -> dict[str, Any]:
+        """What a file needs besides."""
+        return {
+            "wire": self._wire,
+            "order": [array.path for array in self.arrays],
+            "layout": layout.to_json() if layout is not None else None,
+        }
 
     def share_of_sequences(self, batch: Batch) -> float:
         """Share of sequences of numbers in the bytes of some messages.

@@ -21,7 +21,6 @@ from hybridlog.columns.layout import (
     TopicCounts,
     payload_file,
     table_schema_of,
-    topic_folder,
 )
 from hybridlog.columns.parquet_file import DICTIONARY, ParquetFileWriter, leaves
 from hybridlog.columns.payload_rows import TopicColumns, field_of, rows_of, values_of
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.clouds import PointLayout
+    from hybridlog.columns.field_files import FieldColumns
     from hybridlog.columns.payload_rows import Piece
     from hybridlog_storage.messages import Channel
 
@@ -48,6 +48,7 @@ _SPLIT: Final = "BYTE_STREAM_SPLIT"
 _DELTA: Final = "DELTA_BINARY_PACKED"
 _TRIED = 1 << 18  # elements
 _ELEMENT = ".list.element"
+_MAX_OPEN = 8  # files of different columns: each row group of them waits in memory
 
 
 @dataclass(slots=True)
@@ -92,15 +93,15 @@ class TopicWriter:
         folder: Path,
         recording: str,
         channel: Channel,
-        columns: TopicColumns,
+        columns: TopicColumns | FieldColumns,
         number: Callable[[], int],
     ) -> None:
         self._folder = folder
         self._recording = recording
         self._channel = channel
-        self._columns = columns
+        self.columns = columns
         self._number = number
-        self._open: dict[PointLayout | None, _OpenFile] = {}
+        self._open: dict[PointLayout | pa.Schema | None, _OpenFile] = {}
         self.written: list[PayloadFile] = []
         """Complete files; they are on the disk."""
 
@@ -119,7 +120,10 @@ class TopicWriter:
         file = self._open.get(piece.layout)
         if file is None:
             schema = table_schema_of(self._channel)
-            name = payload_file(topic_folder(self._channel.topic), schema, self._number())
+            name = payload_file(self.columns.folder, schema, self._number())
+            if len(self._open) >= _MAX_OPEN:
+                first = next(iter(self._open))
+                self._finish(self._open.pop(first), first)
             file = self._open[piece.layout] = _OpenFile(name)
         file.tables.append(piece.table)
         file.waiting += piece.size
@@ -162,17 +166,15 @@ class TopicWriter:
     def _zones(self, table: pa.Table) -> dict[str, list[Any]]:
         """The zones of the arrays in a row group, but for those of bytes."""
         fields = rows_of(table)[1]
-        paths = [a.path for a in self._columns.arrays if a.dtype != np.uint8]
+        paths = [a.path for a in self.columns.arrays if a.dtype != np.uint8]
         return {path: Zone.of(*values_of(field_of(fields, path))).to_json() for path in paths}
 
-    def _finish(self, file: _OpenFile, layout: PointLayout | None) -> None:
+    def _finish(self, file: _OpenFile, layout: PointLayout | pa.Schema | None) -> None:
         if file.tables:
             self._flush(file)
         assert file.writer is not None
         payloads: dict[str, Any] = {
-            "wire": self._channel.message_encoding,
-            "order": [array.path for array in self._columns.arrays],
-            "layout": layout.to_json() if layout is not None else None,
+            **self.columns.about(layout),
             "chunks": file.chunks,
             "zones": file.zones,
             "is_ordered": file.writer.is_ordered,

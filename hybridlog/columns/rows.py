@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from hybridlog.schema.states import State
+from hybridlog_storage.messages import EXPIRED_IDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,13 +50,13 @@ class Messages(NamedTuple):
         number = np.full(len(batch), chunk.number, np.int32)
         return cls(
             batch.offset - begin,
-            batch.length.copy(),
+            batch.places[1].copy(),
             batch.channel.copy(),
             batch.log_time.copy(),
             chunk.seq.copy(),
             batch.publish_time.copy(),
             number,
-            batch.offset.copy(),
+            batch.places[0].copy(),
         )
 
     @classmethod
@@ -131,7 +132,7 @@ def own_columns(
         "seq": pa.array(messages.seq),
         "pub": pa.array(messages.publish_time, mask=no_publish),
         "stamp": _stamps(fields, len(segment)),
-        "channel": pa.array(messages.channel),
+        "channel": pa.array(messages.channel % EXPIRED_IDS),
         "state": pa.array(_STATES, pa.string()).take(pa.array(states)),
         "error": errors,
         "ref": pa.StructArray.from_arrays(

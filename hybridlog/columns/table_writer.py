@@ -313,7 +313,10 @@ class TableWriter:
             return
         with self._harmless():
             self._channels.update(channels)
-            self._collect(chunk)
+            if chunk.fields is None:
+                self._collect(chunk)
+            else:
+                self._add_expired(chunk)
             self._seen[chunk.segment] += len(chunk.batch)
             self._spill()
             self._cut_sealed()
@@ -463,6 +466,20 @@ class TableWriter:
         begin = data.ctypes.data
         columns = detached(columns, begin, begin + data.nbytes)
         piece.fields = without(columns, decoded.rows, piece.rows)
+
+    def _add_expired(self, chunk: StoredChunk) -> None:
+        """Make rows of what is left of expired messages."""
+        from hybridlog.columns.field_files import rows_of
+
+        messages = Messages.of(chunk, 0)
+        for rows, columns in chunk.fields or ():
+            own = messages.take(rows)
+            for number, at in rows_by_channel(own.channel):
+                topic, _, state = self._topic_of(number)
+                found = rows_of(columns.take(at))
+                if topic.is_wanted:
+                    topic.add(Piece(chunk.segment, own.take(at), *found, state=state))
+        self._has_grown = True
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:

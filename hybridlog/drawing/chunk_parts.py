@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_counts import Parts, part_rows
+from hybridlog_storage.messages import EXPIRED_IDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.chunk_table import ChunkTable
 
-_CHANNELS = 1 << 16  # ids of channels
+_CHANNELS = 2 * EXPIRED_IDS  # ids of channels
 
 
 class RecordedChunks:
@@ -63,6 +64,7 @@ class RecordedChunks:
         before, self._recording = self._recording, recording
         return (
             recording.status == before.status
+            and recording.stored == before.stored
             and all(
                 before.digests.get(number) in {None, recording.digests.get(number)}
                 for number in map(str, self._known)

@@ -165,7 +165,7 @@ def json_columns(schema: pa.Schema | None) -> list[str]:
 
 def _is_open(channel: RecordedChannel) -> bool:
     """True if the columns of a channel depend on the content of its messages."""
-    return channel.channel.message_encoding not in FIXED
+    return channel.encoding not in FIXED
 
 
 def _finished(builder: TableBuilder, question: Question) -> pa.Table:
@@ -209,7 +209,7 @@ class Decoder:
         none = np.empty(0, np.int64)
         batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
         for number, channel in enumerate(self.channels):
-            if not channel.is_reduced:
+            if channel.is_typed:
                 yield self.block(number, batch, none, self.decoded(number, batch))
 
     def blocks(self, run: MessageRun) -> Iterator[Block]:
@@ -269,7 +269,7 @@ def _are_single(planner: Planner) -> bool:
 def _own(planner: Planner) -> list[str]:
     """Built-in columns of a table, without the log time."""
     question, channels = planner.question, planner.examples
-    defined = {path.path for c in channels if not c.is_reduced for path in c.codec.paths()}
+    defined = {path.path for c in channels if c.is_typed for path in c.codec.paths()}
     asked = own_columns(question.fields, defined)
     unasked = []
     if len(question.topics) > 1:

@@ -28,7 +28,7 @@ def are_scans(channels: Sequence[RecordedChannel]) -> bool:
         bool(channels)
         and len({c.channel.topic for c in channels}) == 1
         and all(
-            channel.channel.message_encoding in FIXED
+            channel.encoding in FIXED
             and channel.channel.schema is not None
             and plain_type(channel.channel.schema.name) == "sensor_msgs/LaserScan"
             and channel.codec.reason is None

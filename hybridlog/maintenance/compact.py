@@ -32,7 +32,7 @@ from hybridlog_storage.journal import Journal
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -112,8 +112,8 @@ def compact(
             if chosen:
                 work.write(chosen)
                 work.prove(chosen)
-                listed = work.announce(chosen)
-                payload_files.publish(work.path, listed)
+                work.announce(chosen)
+                payload_files.publish(work.path, journal.read(work.path))
         except OSError as error:
             work.take_back()
             raise durability.explain(error, work.path, "writing columns of") from error
@@ -155,7 +155,7 @@ class _Compaction:
         """
         from hybridlog.columns.payload_rows import TopicColumns
 
-        have = {file.topic for file in self._state.payloads.values()}
+        have = {f.topic for f in self._state.payloads.values() if not f.has_fields}
         found: dict[tuple[str, str], _Topic] = {}
         refused: dict[str, CompactedTopic] = {}
         for number, channel, messages in self._channels():
@@ -278,8 +278,8 @@ class _Compaction:
             files.unlink(self.path / PAYLOAD_PARTS / file.file, depth=IN_PAYLOADS)
         topic.files = []
 
-    def announce(self, chosen: Sequence[_Topic]) -> Mapping[str, PayloadFile]:
-        """List the files in the journal; return all that it lists."""
+    def announce(self, chosen: Sequence[_Topic]) -> None:
+        """List the files in the journal."""
         made = [file for topic in chosen for file in topic.files]
         if made:
             # Names have to be on the disk before the journal refers to them.
@@ -289,7 +289,6 @@ class _Compaction:
             files.sync_folder(self.path)
             line = journal.event(journal.COMPACTED, files=[asdict(file) for file in made])
             Journal(self.path).append(line)
-        return {**self._state.payloads, **{file.file: file for file in made}}
 
     def take_back(self) -> None:
         """Remove unfinished files, unless the journal lists them: then the next opening goes on."""

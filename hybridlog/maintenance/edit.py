@@ -21,7 +21,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import StoreError, TimeError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.messages import EXPIRED_IDS, Batch, Channel
 from hybridlog_storage.segments.chunk import pack
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
@@ -149,7 +149,8 @@ def _channel(inventory: Inventory) -> tuple[Channel, int, int]:
                 return channel, channel_id, summary.schema_ids[channel_id]
     # Ids of a lost segment are not reused either.
     lost = (int(c["id"]) for sealed in inventory.lost for c in sealed.channels)
-    return wanted, max([*known, *lost], default=-1) + 1, schemas + 1
+    ids = [number % EXPIRED_IDS for number in known]
+    return wanted, max([*ids, *lost], default=-1) + 1, schemas + 1
 
 
 def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> int:

@@ -1,18 +1,59 @@
-"""Deletes payloads of a recording to make room; fields, counts and times stay."""
+"""Deletes payloads of a recording to make room; fields, counts and times stay.
+
+First the rows of what goes are written to files of their own: the fields as in tables, the
+index documents, times, sizes and hashes (`columns/field_files.py`). They are forced to the
+disk, and read and compared; then the journal lists them. From then on they are the truth.
+Then each segment is written again with short records in place of the chunks that go
+(`thinning.py`), the journal announces the new one, and it takes the place of the old one. A
+segment that loses all of its payloads keeps its definitions, times, arrival numbers, metadata
+and attachments in a small file.
+
+A crash before the first line leaves files that the next opening removes. After it, fields of
+chunks that are still there do no harm: readers use them for expired chunks alone, and the
+next expiry writes them anew.
+
+Columns of payloads belong to a whole recording. A file of them is deleted when the last of its
+messages expires; until then it keeps the others, and room is freed in segments only.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import count
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.errors import StoreError
+import numpy as np
+
+from hybridlog.columns import payload_files
+from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of
+from hybridlog.columns.payload_files import RecordingPayloads, walk
+from hybridlog.maintenance.report import reporter
+from hybridlog.maintenance.thinning import replace_chunks
+from hybridlog_storage import journal
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.journal import Journal
+from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, expired_record
+from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection, Iterator
+    from pathlib import Path
 
+    from hybridlog.columns.payload_files import WalkedSegment
+    from hybridlog.columns.payload_writer import TopicWriter
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.journal import Journal
+    from hybridlog_storage.journal import JournalState, PayloadFile
+    from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
+
+_Key = tuple[str, str, bool]
+"""A topic, a hash of its definition, and whether its messages are reduced."""
 
 
 @dataclass(slots=True)
@@ -28,8 +69,8 @@ class Expired:
     """
 
     label: str
-    segments: list[int]
-    messages: dict[str, int]
+    segments: list[int] = field(default_factory=list)
+    messages: dict[str, int] = field(default_factory=dict)
     freed: int = 0
     field_bytes: int = 0
 
@@ -60,4 +101,214 @@ def expire(
         StoreError: Files cannot be read or written; what was not announced is as before.
         DiskFullError: There is no room for the fields; nothing is deleted.
     """
-    raise StoreError("Payloads cannot expire yet.")
+    path = directory.recording(label)
+    work = _Expiry(path, sorted(segments), topics, log or Journal(path))
+    return work.run(directory, label, progress)
+
+
+class _Expiry:
+    """The steps for one recording."""
+
+    def __init__(
+        self, path: Path, segments: list[int], topics: Collection[str] | None, log: Journal
+    ) -> None:
+        self._path = path
+        self._topics = topics
+        self._log = log
+        self._state = self._journal()
+        self._chosen: dict[int, set[int]] = {}  # numbers of chunks by segment
+        self._summaries: dict[int, SegmentSummary] = {}
+        self._writers: dict[_Key, TopicWriter] = {}
+        self._written: dict[tuple[int, int], list[int]] = {}  # checksums by segment and chunk
+        self._made: list[PayloadFile] = []
+        self._numbers = count(sum(file.has_fields for file in self._state.payloads.values()))
+        for segment in walk(path, segments):
+            self._choose(segment)
+
+    def _journal(self) -> JournalState:
+        state = journal.read(self._path)
+        if state is None:
+            raise StoreError(f"{self._path} has no journal: run `hybridlog repair` first.")
+        return state
+
+    def _choose(self, segment: WalkedSegment) -> None:
+        """Note the chunks of a segment that go."""
+        number, summary = segment.number, segment.summary
+        sealed = self._state.sealed.get(number)
+        if sealed is None or summary.whole_digest != sealed.digest:
+            raise StoreError(
+                f"{segment.reader.path} is not the segment that the journal lists; nothing was "
+                "deleted. Run `hybridlog repair` first."
+            )
+        chosen = {place.number for place in summary.chunks if self._goes(place, summary)}
+        if chosen:
+            self._chosen[number], self._summaries[number] = chosen, summary
+
+    def _goes(self, place: ChunkPlace, summary: SegmentSummary) -> bool:
+        if place.length == EXPIRED_SIZE:
+            return False
+        names = {summary.channels[number].topic for number in place.channels}
+        return self._topics is None or names <= {*self._topics}
+
+    def run(self, directory: StoreDirectory, label: str, progress: Progress | None) -> Expired:
+        done = Expired(label)
+        sizes = sum(summary.size for summary in self._summaries.values())
+        report = reporter(progress, label, sizes)
+        try:
+            made = self._write(report)
+            if not self._chosen:
+                return done
+            directory.require(EXPIRED)
+            self._announce(made)
+        except BaseException as error:
+            self._take_back()
+            if isinstance(error, OSError):
+                raise durability.explain(error, self._path, "writing fields of") from error
+            raise
+        self._state = self._journal()
+        payload_files.publish(self._path, self._state)
+        done.field_bytes = sum(file.bytes for file in made)
+        done.freed = -done.field_bytes
+        for segment in walk(self._path, self._chosen, known=self._summaries):
+            done.freed += self._replace(segment)
+            done.segments.append(segment.number)
+            for place in self._places(segment.number):
+                self._count(place, segment.summary, done)
+        done.freed += self._delete_columns()
+        return done
+
+    def _places(self, number: int) -> Iterator[ChunkPlace]:
+        chosen = self._chosen[number]
+        return (one for one in self._summaries[number].chunks if one.number in chosen)
+
+    def _count(self, place: ChunkPlace, summary: SegmentSummary, done: Expired) -> None:
+        bounds = summary.table.part_bounds()
+        parts = summary.table.parts[bounds[place.number] : bounds[place.number + 1]]
+        for part in parts:
+            topic = summary.channels[int(part["channel"])].topic
+            done.messages[topic] = done.messages.get(topic, 0) + int(part["messages"])
+
+    def _write(self, report: Callable[[int], None]) -> list[PayloadFile]:
+        """Write what is left of the chosen messages, and compare it with them."""
+        folder = self._path / PAYLOAD_PARTS
+        files.remove_tree(folder, depth=files.IN_RECORDING)
+        for segment, chunk in self._chunks(report):
+            self._add(chunk, segment.summary)
+        self._chosen = {number: chosen for number, chosen in self._chosen.items() if chosen}
+        for writer in self._writers.values():
+            writer.close()
+        made = [file for writer in self._writers.values() for file in writer.written]
+        left = RecordingPayloads(self._path, made, PAYLOAD_PARTS)
+        self._made = made
+        for (segment_number, number), known in self._written.items():
+            if _checksums(left.expired(segment_number, number).batch) != known:
+                raise StoreError(f"What was written of {self._path} does not come back.")
+        return made
+
+    def _chunks(self, report: Callable[[int], None]) -> Iterator[tuple[WalkedSegment, StoredChunk]]:
+        known = self._summaries
+        for segment in walk(self._path, known, report=report, known=known):
+            chosen = self._chosen[segment.number]
+            wanted = {*chosen}
+
+            def is_wanted(place: ChunkPlace, wanted: set[int] = wanted) -> bool:
+                return place.number in wanted
+
+            for place, chunk in segment.chunks(is_wanted):
+                if isinstance(chunk, SegmentError):
+                    # What cannot be read stays: its loss is known, and a copy may mend it.
+                    chosen.discard(place.number)
+                else:
+                    yield segment, chunk
+
+    def _add(self, chunk: StoredChunk, summary: SegmentSummary) -> None:
+        """Write what is left of the messages of a chunk, and note what is to come back."""
+        by_topic: dict[_Key, list[int]] = {}
+        for number in np.unique(chunk.batch.channel).tolist():
+            channel = summary.channels[number]
+            by_topic.setdefault(_key_of(channel), []).append(number)
+        for key, numbers in by_topic.items():
+            channel = summary.channels[numbers[0]]
+            has_publish_time = {n: summary.channels[n].has_publish_time for n in numbers}
+            rows = np.flatnonzero(np.isin(chunk.batch.channel, numbers))
+            writer = self._writer(key, channel)
+            piece = writer.columns.piece(chunk, rows, has_publish_time)
+            assert piece is not None
+            writer.add(piece, chunk.segment, chunk.number, summary.whole_digest)
+        self._written[chunk.segment, chunk.number] = _checksums(chunk.batch)
+
+    def _writer(self, key: _Key, channel: Channel) -> TopicWriter:
+        found = self._writers.get(key)
+        if found is None:
+            from hybridlog.columns.field_files import FieldColumns
+            from hybridlog.columns.payload_writer import TopicWriter
+
+            columns, number = FieldColumns(channel), partial(next, self._numbers)
+            folder = self._path / PAYLOAD_PARTS
+            found = TopicWriter(folder, self._state.id, channel, columns, number)
+            self._writers[key] = found
+        return found
+
+    def _announce(self, made: list[PayloadFile]) -> None:
+        """List the files in the journal."""
+        folder = self._path / PAYLOAD_PARTS
+        for inside in {(folder / file.file).parent for file in made}:
+            files.sync_folder(inside, depth=IN_PAYLOADS - 1)
+        files.sync_folder(folder, depth=files.IN_RECORDING)
+        files.sync_folder(self._path)
+        self._log.append(journal.event(journal.EXPIRED, files=[asdict(file) for file in made]))
+
+    def _take_back(self) -> None:
+        """Remove unfinished files, unless the journal lists them: then the next opening goes on."""
+        with suppress(StoreError, OSError):
+            if self._journal().payloads.keys() == self._state.payloads.keys():
+                files.remove_tree(self._path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
+
+    def _replace(self, segment: WalkedSegment) -> int:
+        chosen = self._chosen[segment.number]
+        return replace_chunks(
+            self._path,
+            self._state,
+            segment.reader,
+            segment.summary,
+            dict.fromkeys(chosen, expired_record),
+            files=self._state.payloads.values(),
+            event=journal.EXPIRED,
+            log=self._log,
+            contents=RecordingPayloads(self._path, [*self._columns(), *self._made]),
+        )
+
+    def _columns(self) -> list[PayloadFile]:
+        return [file for file in self._state.payloads.values() if not file.has_fields]
+
+    def _delete_columns(self) -> int:
+        """Delete files of payloads of which every message has expired; returns their bytes."""
+        columns = self._columns()
+        if not columns:
+            return 0
+        gone = {
+            (segment.number, place.number)
+            for segment in walk(self._path, sorted(self._state.sealed))
+            for place in segment.summary.chunks
+            if place.length == EXPIRED_SIZE
+        }
+        payloads = RecordingPayloads(self._path, columns)
+        expired = [file for file in columns if payloads.reader(file).places.keys() <= gone]
+        if expired:
+            line = journal.event(journal.EXPIRED, deleted=[file.file for file in expired])
+            self._log.append(line)
+            payload_files.publish(self._path, self._journal())
+        return sum(file.bytes for file in expired)
+
+
+def _key_of(channel: Channel) -> _Key:
+    from hybridlog.schema.states import State, state_of
+
+    is_reduced = state_of(channel.message_encoding) is State.REDUCED
+    return channel.topic, table_schema_of(channel), is_reduced
+
+
+def _checksums(batch: Batch) -> list[int]:
+    """Checksums of what an expiry keeps of messages besides their fields."""
+    kept = (batch.log_time, batch.publish_time, batch.sequence, *batch.places)
+    return [crc32(np.ascontiguousarray(column).tobytes()) for column in kept]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import IN_PAYLOADS
+from hybridlog.columns.payload_files import open_file
 from hybridlog.entries import Inventory, take_inventory
 from hybridlog.maintenance.opening import clear_away
 from hybridlog_storage import journal
@@ -19,6 +20,7 @@ from hybridlog_storage.disk.directory import IMPORTING, LOCK_WAIT_S, PAYLOADS, p
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL, Journal
 from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
@@ -166,6 +168,8 @@ def _copy_recording(
                 if number not in inventory.summaries:
                     files.unlink(path / name)
             _copy_segments(source, path, inventory, report, progress)
+            if any(file.has_fields for file in inventory.payloads.values()):
+                target.require(EXPIRED)
             _copy_payloads(source.recording(label), path, inventory, report)
             lines = _journal(source, inventory)
         except StoreError:
@@ -277,10 +281,8 @@ def _is_segment(path: Path, digest: str, size: int) -> bool:
 
 def _is_payload_file(folder: Path, file: PayloadFile) -> bool:
     """True if a copy of a file of columns is complete, byte for byte."""
-    from hybridlog.columns.payload_reader import PayloadReader
-
     try:
-        PayloadReader(folder, file).check()
+        open_file(folder, file).check()
     except StoreError:
         return False
     return True

@@ -418,8 +418,8 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         return ""
     if state is not None and state.torn:
         Journal(path).append()
-    if PAYLOAD_PARTS in listing.others:
-        payload_files.publish(path, state.payloads if state is not None else {})
+    if PAYLOAD_PARTS in listing.others or (state is not None and state.deleted):
+        payload_files.publish(path, state)
     thinned = state.thinned if state is not None else {}
     payload_files.replace_segments(path, listing.others, thinned)
     recovered = _recover_segments(directory, label, listing, state)

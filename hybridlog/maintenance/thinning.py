@@ -24,18 +24,22 @@ from hybridlog.maintenance.report import CompactedTopic, reporter
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.journal import Journal
+from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.segment_check import SegmentCheck
-from hybridlog_storage.segments.segment_format import MOVED_SIZE
+from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE, moved_record
 from hybridlog_storage.segments.segment_thinning import thin
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from hybridlog.columns.payload_files import WalkedSegment
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.journal import JournalState, PayloadFile
+    from hybridlog_storage.messages import Buffer
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import (
         ChunkPlace,
@@ -78,7 +82,18 @@ def drop(
         summary = segment.summary
         movable = _movable(inventory, segment, contents, topics)
         if movable:
-            _replace(inventory, path, segment.reader, summary, movable)
+            assert inventory.state is not None  # it has the columns
+            replace_chunks(
+                path,
+                inventory.state,
+                segment.reader,
+                summary,
+                dict.fromkeys(movable, moved_record),
+                files=inventory.payloads.values(),
+                event=journal.COMPACTED,
+                log=Journal(path),
+                contents=contents,
+            )
             dropped.update(_messages(summary, movable))
     found = {report.topic: report for report in reports}
     for topic, count in dropped.items():
@@ -93,13 +108,18 @@ def drop(
 
 def _left(inventory: Inventory) -> Counter[str]:
     """Messages in segments of topics that have columns."""
-    in_columns = {file.topic for file in inventory.payloads.values()}
+    in_columns = _topics(inventory)
     found: Counter[str] = Counter()
     for summary in inventory.summaries.values():
-        there = {chunk.number for chunk in summary.chunks if chunk.length != MOVED_SIZE}
+        there = {chunk.number for chunk in summary.chunks} - _without_content(summary)
         counts = _messages(summary, there)
         found.update({topic: n for topic, n in counts.items() if topic in in_columns})
     return found
+
+
+def _topics(inventory: Inventory) -> set[str]:
+    """Topics that have columns of payloads."""
+    return {file.topic for file in inventory.payloads.values() if not file.has_fields}
 
 
 def _messages(summary: SegmentSummary, chunks: Collection[int]) -> Counter[str]:
@@ -119,14 +139,14 @@ def _movable(
     topics: Collection[str] | None,
 ) -> set[int]:
     """Numbers of the chunks whose content comes back from columns, byte for byte."""
-    in_columns = {file.topic for file in inventory.payloads.values()}
+    in_columns = _topics(inventory)
     if topics is not None:
         in_columns &= set(topics)
-    channels = segment.summary.channels
+    channels, gone = segment.summary.channels, _without_content(segment.summary)
 
     def is_wanted(place: ChunkPlace) -> bool:
         names = {channels[number].topic for number in place.channels if number in channels}
-        return place.length != MOVED_SIZE and names <= in_columns
+        return place.number not in gone and names <= in_columns
 
     found: set[int] = set()
     for place, chunk in segment.chunks(is_wanted):
@@ -142,41 +162,71 @@ def _movable(
     return found
 
 
-def _replace(
-    inventory: Inventory,
+def replace_chunks(
     path: Path,
+    state: JournalState,
     reader: SegmentReader,
     summary: SegmentSummary,
-    movable: set[int],
-) -> None:
-    """Write a segment without some chunks, prove it, and put it in place."""
-    name = inventory.listing.sealed[reader.number]
+    records: Mapping[int, Callable[[Buffer], bytes]],
+    *,
+    files: Iterable[PayloadFile],
+    event: str,
+    log: Journal,
+    contents: RecordingPayloads,
+) -> int:
+    """Write a segment without the content of some chunks, prove it, and put it in place.
+
+    Args:
+        path: The recording's directory, locked by this process.
+        state: Its journal.
+        reader: The segment.
+        summary: Its footer.
+        records: As for `thin`.
+        files: The files that the content or what is left of it lies in.
+        event: Name of the event that announces the new segment.
+        log: The journal.
+        contents: Has the content of the chunks, or what is left of it.
+
+    Returns:
+        Bytes that became free.
+
+    Raises:
+        SegmentError: The new segment is not what it should be.
+        DiskFullError: There is no room.
+    """
+    name = sealed_name(reader.number)
     target = path / thinned_name(name)
-    state = inventory.state
-    sealed = state.sealed.get(reader.number) if state is not None else None
+    sealed = state.sealed.get(reader.number)
     about = {
-        "digest": summary.digest,
+        "digest": summary.whole_digest,
         "bytes": sealed.bytes if sealed is not None else summary.size,
-        "files": [asdict(file) for file in inventory.payloads.values()],
+        "files": [asdict(file) for file in files],
     }
     listed = False
     try:
-        written = thin(reader, target, movable, about)
-        _prove(target, reader, summary, movable)
+        written = thin(reader, target, records, about)
+        _prove(target, reader, summary, records, contents)
         line = {"segment": reader.number, "bytes": written.bytes, "digest": written.digest}
-        Journal(path).append(journal.event(journal.COMPACTED, segments=[line]))
+        log.append(journal.event(event, segments=[line]))
         listed = True
         thinned = {reader.number: [(written.digest, written.bytes)]}
         if payload_files.replace_segments(path, [target.name], thinned) != [name]:
             raise SegmentError(f"{target} changed while it was to replace {name}")
     except BaseException:
         if not listed:
-            state = journal.read(path)
-            payload_files.replace_segments(path, [target.name], state.thinned if state else {})
+            now = journal.read(path)
+            payload_files.replace_segments(path, [target.name], now.thinned if now else {})
         raise
+    return reader.size - written.bytes
 
 
-def _prove(target: Path, reader: SegmentReader, summary: SegmentSummary, movable: set[int]) -> None:
+def _prove(
+    target: Path,
+    reader: SegmentReader,
+    summary: SegmentSummary,
+    changed: Collection[int],
+    contents: RecordingPayloads,
+) -> None:
     """Compare a new segment with the old one: every byte, every message.
 
     Raises:
@@ -184,22 +234,23 @@ def _prove(target: Path, reader: SegmentReader, summary: SegmentSummary, movable
     """
     with SegmentCheck(target) as check:
         problems = [problem for _, problem in check.problems()]
-    with open_segment(target, reader.number) as new:
+    with open_segment(target, reader.number, contents) as new:
         found = new.summary()
         is_same = (
             not problems
             and (found.recording, found.end, found.losses)
             == (summary.recording, summary.end, summary.losses)
             and _channels(found) == _channels(summary)
-            and found.counts == summary.counts
+            and np.array_equal(found.table.as_stored().parts, summary.table.as_stored().parts)
             and len(found.chunks) == len(summary.chunks)
-            and {c.number for c in found.chunks if c.length == MOVED_SIZE}
-            == movable | {c.number for c in summary.chunks if c.length == MOVED_SIZE}
+            and _without_content(found) == {*changed} | _without_content(summary)
             and _stretches(found)[: len(summary.table.others) - 1] == _stretches(summary)[:-1]
             and [len(part) for part in new.indexes()[1:]]
             == [len(part) for part in reader.indexes()[1:]]
             and all(
-                _is_same(new.read_chunk(there), reader.read_chunk(here))
+                there.crc == here.crc
+                if here.length == EXPIRED_SIZE
+                else _is_same(new.read_chunk(there), reader.read_chunk(here))
                 for there, here in zip(found.chunks, summary.chunks, strict=True)
             )
         )
@@ -207,8 +258,14 @@ def _prove(target: Path, reader: SegmentReader, summary: SegmentSummary, movable
         raise SegmentError(f"{target} is not what it should be: {problems or 'a chunk differs'}")
 
 
+def _without_content(summary: SegmentSummary) -> set[int]:
+    """Numbers of moved and expired chunks."""
+    sizes = {MOVED_SIZE, EXPIRED_SIZE}
+    return {chunk.number for chunk in summary.chunks if chunk.length in sizes}
+
+
 def _channels(summary: SegmentSummary) -> dict[int, dict[str, Any]]:
-    return {number: asdict(channel) for number, channel in summary.channels.items()}
+    return {number: asdict(summary.channels[number]) for number in summary.schema_ids}
 
 
 def _stretches(summary: SegmentSummary) -> list[tuple[int, int]]:
@@ -217,10 +274,14 @@ def _stretches(summary: SegmentSummary) -> list[tuple[int, int]]:
 
 
 def _is_same(one: StoredChunk, other: StoredChunk) -> bool:
+    """True if a chunk has the same messages; of expired ones the payloads are not there."""
     a, b = one.batch, other.batch
-    columns = ("offset", "length", "channel", "log_time", "publish_time", "sequence")
+    columns = ("log_time", "publish_time", "sequence")
+    is_there = one.fields is None
     return (
-        memoryview(a.buffer).cast("B") == memoryview(b.buffer).cast("B")
+        not (is_there and memoryview(a.buffer).cast("B") != memoryview(b.buffer).cast("B"))
         and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in columns)
+        and np.array_equal(a.channel % EXPIRED_IDS, b.channel % EXPIRED_IDS)
+        and all(map(np.array_equal, a.places, b.places))
         and np.array_equal(one.seq, other.seq)
     )

@@ -20,6 +20,7 @@ import numpy as np
 
 from hybridlog.query.counters import Counters
 from hybridlog_storage.disk.copying import interleave, joined
+from hybridlog_storage.errors import StoreError
 from hybridlog_storage.ordering import distinct, order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import inside, placed, touches
@@ -283,6 +284,11 @@ class ChunkScan:
         for channel_id, index in task.scan.channels.items():
             if channel_id < len(table):
                 table[channel_id] = index
+        if chunk.fields is not None and not {*task.chunk.place.channels} & {*task.scan.channels}:
+            raise StoreError(
+                f"Payloads of recording {task.scan.recording.label!r} were deleted while it was "
+                "read. Ask again."
+            )
         channel = table[batch.channel]
         mask = channel >= 0
         if selection is not None:
@@ -392,8 +398,9 @@ def _is_selected(
     mask = np.isin(channel, list(selection.unindexed))
     offsets = selection.offsets.get(key)
     if offsets is not None and len(offsets):
-        at = np.minimum(np.searchsorted(offsets, batch.offset), len(offsets) - 1)
-        mask |= offsets[at] == batch.offset
+        own, _ = batch.places
+        at = np.minimum(np.searchsorted(offsets, own), len(offsets) - 1)
+        mask |= offsets[at] == own
     return mask
 
 

@@ -133,9 +133,9 @@ def _is_single(path: str, channels: Sequence[RecordedChannel]) -> bool:
     types = [
         {field.path: field.type for field in channel.codec.paths()}
         for channel in channels
-        if not channel.is_reduced
+        if channel.is_typed
     ]
-    if any(channel.channel.message_encoding == "json" for channel in channels):
+    if any(channel.encoding == "json" for channel in channels):
         return False  # values may have other types than their schema says
     return bool(types) and all(_SINGLE.fullmatch(known.get(path, "")) for known in types)
 

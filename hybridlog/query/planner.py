@@ -515,7 +515,7 @@ class Planner:
         raise failure
 
     def _check_clock(self, channel: RecordedChannel) -> None:
-        if self.question.bounds is None or channel.is_reduced:
+        if self.question.bounds is None or not channel.is_typed:
             return
         topic, clock = channel.channel.topic, self.question.clock
         if clock == "header" and not any(p.path == STAMP for p in channel.codec.paths()):
@@ -528,7 +528,7 @@ class Planner:
 
 def _has_no_fields(channel: RecordedChannel) -> bool:
     """True if the messages of a channel are not decoded, for example without a definition."""
-    return not channel.is_reduced and not channel.codec.indexed
+    return channel.is_typed and not channel.codec.indexed
 
 
 def _last_key(item: MatchColumns | Values) -> _Key | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hybridlog.query.times import TimeLike
-from hybridlog.schema.states import State, state_of
+from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.times import END, span_of
 
@@ -115,6 +115,16 @@ class RecordedChannel:
     def is_reduced(self) -> bool:
         """True if its messages have their fields but not their payloads."""
         return self.state is not State.WHOLE
+
+    @property
+    def is_typed(self) -> bool:
+        """True if it tells the types of fields; those of reduced messages other channels tell."""
+        return self.state is not State.REDUCED
+
+    @property
+    def encoding(self) -> str:
+        """The encoding of its payloads, which may be gone."""
+        return encoding_of(self.channel.message_encoding, self.channel.metadata)
 
     @property
     def state(self) -> State:
@@ -246,7 +256,7 @@ def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:
     """Types of the fields of some channels, by path; None where no definition fixes them."""
     types: dict[str, str] = {}
     for channel in channels:
-        if channel.is_reduced:
+        if not channel.is_typed:
             continue  # its fields are those of complete messages
         paths = channel.codec.paths()
         if not paths:

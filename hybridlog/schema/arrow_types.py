@@ -23,7 +23,7 @@ from hybridlog.schema.column import Scalars
 from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -461,3 +461,33 @@ def _summarised(array: Array) -> Summary | None:
         bounds = np.concatenate(([0], np.cumsum(there, dtype=np.int64)))[bounds]
         values = values.drop_null()
     return summarise(Scalars(values.to_numpy(zero_copy_only=False)), bounds)
+
+
+# Documents, where long arrays are summaries.
+
+
+def without_summaries(fields: Mapping[str, Any], kind: pa.DataType) -> dict[str, Any]:
+    """Fields of a document that a struct type has, but for arrays with summaries in them."""
+    found: dict[str, Any] = {}
+    for inner in kind:
+        value = fields.get(inner.name)
+        if isinstance(value, dict) and _types.is_struct(inner.type):
+            found[inner.name] = without_summaries(value, inner.type)
+        elif not _lacks(value, inner.type):
+            found[inner.name] = value
+    return found
+
+
+def lacks_arrays(fields: Mapping[str, Any], kind: pa.DataType) -> bool:
+    """True if a document has a summary for an array of a struct type, or in one."""
+    return any(_lacks(fields.get(inner.name), inner.type) for inner in kind)
+
+
+def _lacks(value: Any, kind: pa.DataType) -> bool:
+    if _types.is_struct(kind):
+        return isinstance(value, dict) and lacks_arrays(value, kind)
+    if not is_array(kind):
+        return False
+    if isinstance(value, dict):
+        return True
+    return is_list(kind) and any(_lacks(one, kind.value_type) for one in value or ())

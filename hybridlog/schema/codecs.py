@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from hybridlog.schema.codec import Codec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.definition_text import canonical
-from hybridlog.schema.states import State, state_of
+from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError
 
 if TYPE_CHECKING:
@@ -25,6 +26,11 @@ def codec_for(channel: Channel) -> Codec:
         channel: The channel; its message encoding and schema determine the codec.
     """
     schema = channel.schema
+    if state_of(channel.message_encoding) is State.EXPIRED:
+        from hybridlog.schema.reduced_codec import ExpiredCodec
+
+        encoding = encoding_of(channel.message_encoding, channel.metadata)
+        return ExpiredCodec(codec_for(replace(channel, message_encoding=encoding)))
     if schema is not None and has_hidden_fields(channel):
         return OpaqueCodec(
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "

@@ -64,13 +64,22 @@ def index_bodies(
         if len(offset):
             yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
         return
-    decoded = codec.columns(buffer, offset, length)
+    yield from decoded_bodies(codec.columns(buffer, offset, length), array_limit=array_limit)
+
+
+def decoded_bodies(decoded: Decoded, *, array_limit: int = ARRAY_LIMIT) -> Iterator[BodyGroup]:
+    """Make index bodies of decoded messages; see `index_bodies`."""
+    surplus = decoded.surplus
     if isinstance(decoded.records, Records):
         yield from _of_columns(decoded, decoded.records, array_limit)
     else:
         for made, own in decoded.records.bodies(array_limit, MAX_BYTES):
             rows = decoded.rows[own]
-            yield _error(rows, made) if isinstance(made, str) else BodyGroup(rows, made, None)
+            left = np.intersect1d(rows, surplus) if len(surplus) else NO_ROWS
+            if isinstance(made, str):
+                yield _error(rows, made)
+            else:
+                yield BodyGroup(rows, made, None, surplus=left)
     for bad in decoded.unreadable:
         yield _error(bad.rows, bad.reason)
 

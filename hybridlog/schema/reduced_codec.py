@@ -1,4 +1,4 @@
-"""Reduced messages, whose payload was dropped: size, hash, and the indexed fields.
+"""Reduced and expired messages, without payload: size, hash, and the indexed fields.
 
 Under pressure a recorder stores only the small parts of a large message. A reduced message
 is stored in the segment like any message, on a separate channel with the encoding
@@ -6,6 +6,9 @@ is stored in the segment like any message, on a separate channel with the encodi
 
 Its payload begins with 40 bytes: the size (u64, little-endian) and the SHA-256 of the
 dropped payload. The BSON elements of the index document without `_meta` follow.
+
+Of an expired message, whose payload was deleted to make room, a byte and the same elements
+follow, or the reason why its payload could not be read. Files of fields hold this.
 """
 
 from __future__ import annotations
@@ -19,25 +22,27 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from bson.errors import BSONError
 
-from hybridlog.schema.codec import decode_each
-from hybridlog.schema.index_bodies import document_of, index_bodies
+from hybridlog.schema.codec import NO_ROWS, decode_each
+from hybridlog.schema.column import Records
+from hybridlog.schema.index_bodies import decoded_bodies, document_of, index_bodies
 from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED, Channel
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
+    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec, Decoded
     from hybridlog.schema.definition import FieldPath
-    from hybridlog_storage.messages import Buffer
+    from hybridlog_storage.messages import Batch, Buffer
 
 
 _HEAD = struct.Struct("<Q32s")
-_GIVEN_UP = f"its payload was {CAUSES[State.REDUCED]}; only its fields are stored"
+_READ, _SURPLUS, _UNREADABLE = range(3)  # the byte behind the head of an expired message
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +101,7 @@ class ReducedCodec:
 
     indexed = True
     reason: str | None = None
+    state = State.REDUCED
 
     def paths(self) -> list[FieldPath]:
         """No fields of its own: the fields are those of complete messages."""
@@ -118,12 +124,135 @@ class ReducedCodec:
             PayloadError: always.
         """
         remains = remains_of(payload)
-        raise PayloadError(f"{_GIVEN_UP} ({remains.size} bytes, SHA-256 {remains.sha256.hex()})")
+        raise PayloadError(
+            f"its payload was {CAUSES[self.state]}; only its fields are stored "
+            f"({remains.size} bytes, SHA-256 {remains.sha256.hex()})"
+        )
 
 
-def _fields_in(payload: memoryview) -> dict[str, object]:
+def _fields_in(payload: memoryview, head: int = _HEAD.size) -> dict[str, object]:
     try:
         remains_of(payload)
-        return document_of(bytes(payload[_HEAD.size :]))
+        return document_of(bytes(payload[head:]))
     except (BSONError, PayloadError) as error:
         raise PayloadError(f"the payload is not a reduced message: {error}") from error
+
+
+def expired_payloads(batch: Batch, decoded: Decoded | None) -> list[bytes]:
+    """What is left of messages whose payloads are deleted.
+
+    Args:
+        batch: The messages.
+        decoded: Their fields; None if they cannot be decoded.
+    """
+    rest = [bytes([_READ])] * len(batch)
+    for group in () if decoded is None else decoded_bodies(decoded):
+        surplus = set(group.surplus.tolist())
+        for row, body in zip(group.rows.tolist(), group.body, strict=True):
+            kind = _SURPLUS if row in surplus else _READ
+            if group.error is not None:
+                rest[row] = bytes([_UNREADABLE]) + group.error.encode()
+            else:
+                rest[row] = bytes([kind]) + body.tobytes()
+    payloads = (batch.payload(row) for row in range(len(batch)))
+    heads = (_HEAD.pack(len(one), hashlib.sha256(one).digest()) for one in payloads)
+    return [head + tail for head, tail in zip(heads, rest, strict=True)]
+
+
+class ExpiredCodec(ReducedCodec):
+    """Codec of what is left of expired messages.
+
+    Args:
+        original: The codec of their payloads.
+    """
+
+    state = State.EXPIRED
+
+    def __init__(self, original: Codec) -> None:
+        self._original = original
+        self.indexed = original.indexed
+        self.reason = original.reason
+
+    def paths(self) -> list[FieldPath]:
+        """The fields of the messages."""
+        return self._original.paths()
+
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None = None,
+    ) -> Decoded:
+        """Decode the stored fields; see `Codec.columns`."""
+        none = np.empty(0, np.int64)
+        empty = self._original.columns(b"", none, none, fields)
+        form = partial(ExpiredFields, fields=fields, empty=empty)
+        decoded = decode_each(_left_in, form, buffer, offset, length)
+        assert isinstance(decoded.records, ExpiredFields)
+        left = decoded.records.values
+        decoded.surplus = decoded.rows[[one.has_surplus for one in left]] if left else NO_ROWS
+        return decoded
+
+
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """What is left of an expired message that was readable."""
+
+    body: bytes
+    has_surplus: bool
+
+
+def _left_in(payload: memoryview) -> _Left:
+    remains_of(payload)
+    kind, rest = payload[_HEAD.size], bytes(payload[_HEAD.size + 1 :])
+    if kind == _UNREADABLE:
+        raise PayloadError(rest.decode())
+    return _Left(rest, kind == _SURPLUS)
+
+
+@dataclass(slots=True)
+class ExpiredFields(Objects):
+    """Fields of expired messages, in the types of their payloads where a definition fixes them.
+
+    Attributes:
+        empty: No messages, as the codec of the payloads decodes them.
+    """
+
+    empty: Decoded | None = None
+
+    def plain(self, *, whole: bool) -> list[dict[str, object]]:
+        """The messages as plain values; see `Decoded.plain`."""
+        return [document_of(one.body) for one in self.values]
+
+    def bodies(
+        self, array_limit: int, max_bytes: int
+    ) -> Iterator[tuple[NDArray[np.uint8] | str, NDArray[np.intp]]]:
+        """The bodies of the index documents, as they were when the payloads were there."""
+        width = np.array([len(one.body) for one in self.values], np.intp)
+        for size in np.unique(width).tolist():
+            rows = np.flatnonzero(width == size)
+            data = b"".join(self.values[row].body for row in rows.tolist())
+            yield np.frombuffer(data, np.uint8).reshape(len(rows), size), rows
+
+    def arrow(self) -> pa.StructArray:
+        """The messages as an Arrow array; arrays of which only a summary is left are null."""
+        from hybridlog.schema.arrow_objects import objects_array
+        from hybridlog.schema.arrow_types import converted, without_summaries
+
+        assert self.empty is not None
+        if not isinstance(self.empty.records, Records):
+            return objects_array(self.plain(whole=True), self.wanted())
+        kind = self.empty.arrow().type
+        found = [without_summaries(one, kind) for one in self.plain(whole=True)]
+        return converted(objects_array(found, self.wanted()), kind)
+
+    def lacking(self) -> NDArray[np.bool_]:
+        """bool[n], True for messages of which a wanted array is only a summary."""
+        assert self.empty is not None
+        if not isinstance(self.empty.records, Records):
+            return np.zeros(len(self), np.bool_)
+        from hybridlog.schema.arrow_types import lacks_arrays
+
+        kind = self.empty.arrow().type
+        return np.array([lacks_arrays(one, kind) for one in self.plain(whole=True)], np.bool_)

@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Final
 
 from hybridlog.wording import counted, unfit
-from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED
+from hybridlog_storage.messages import EXPIRED, ORIGINAL_ENCODING, REDUCED
 
 
 class State(StrEnum):
@@ -27,7 +27,7 @@ class State(StrEnum):
     """With a payload that does not fit its definition."""
 
     EXPIRED = "expired"
-    """Without its payload, which was deleted to make room; reserved."""
+    """Without its payload, which was deleted to make room; its fields are stored."""
 
 
 CAUSES: Final = {
@@ -35,11 +35,12 @@ CAUSES: Final = {
     State.EXPIRED: "deleted to make room",
 }
 """Reasons why messages have no payload."""
+_STATES: Final = {REDUCED: State.REDUCED, EXPIRED: State.EXPIRED}
 
 
 def state_of(encoding: str) -> State:
     """The state of the messages of a channel, by its encoding; some may still be unreadable."""
-    return State.REDUCED if encoding == REDUCED else State.WHOLE
+    return _STATES.get(encoding, State.WHOLE)
 
 
 def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:
@@ -63,4 +64,5 @@ def without_fields(messages: int, state: State) -> str:
     if state is State.UNREADABLE:
         return f"{unfit(messages)}; the fields are null, and error says why"
     have, its = ("has", "its payload was") if messages == 1 else ("have", "their payloads were")
-    return f"{counted(messages, 'message')} {have} no fields: {its} {CAUSES[state]}"
+    what = "fields" if state is State.REDUCED else "long arrays"
+    return f"{counted(messages, 'message')} {have} no {what}: {its} {CAUSES[state]}"

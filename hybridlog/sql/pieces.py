@@ -14,18 +14,24 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.columns.fields import without
 from hybridlog.columns.rows import Messages, Piece, own_columns
+from hybridlog.query.engines.base import places_of
 from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
+from hybridlog.schema.states import State
 from hybridlog.sql.columns import whole_message
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.segments.segment_format import EXPIRED_SIZE
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from hybridlog.columns.column_file import TablePart
     from hybridlog.columns.payload_reader import ArrayTable
@@ -152,7 +158,7 @@ class TopicOfRecording:
     def is_fixed(self) -> bool:
         """True if definitions fix the fields of all messages."""
         return all(
-            channel.is_reduced or channel.codec.reason is not None or _is_fixed(channel)
+            not channel.is_typed or channel.codec.reason is not None or _is_fixed(channel)
             for channel in self.channels.values()
         )
 
@@ -168,7 +174,7 @@ class TopicOfRecording:
         return [
             channel.arrow_type()
             for channel in self.channels.values()
-            if not channel.is_reduced and channel.codec.indexed
+            if channel.is_typed and channel.codec.indexed
         ]
 
     @lazy
@@ -194,11 +200,16 @@ class TopicOfRecording:
             if made is not None:
                 table, covered = made
                 found += [_TableRows(self, table, part) for part in table.parts]
+        left = [chunk for chunk in chunks if chunk.segment not in covered]
         found += [
             _ChunkRows(self, chunk.segment, chunk.place, (chunk.first, chunk.last))
-            for chunk in chunks
-            if chunk.segment not in covered
+            for chunk in left
+            if chunk.place.length != EXPIRED_SIZE
         ]
+        gone = {(c.segment, c.number) for c in left if c.place.length == EXPIRED_SIZE}
+        if gone:
+            fields = self.session.expired_fields(self.entry, self.topic, gone)
+            found += [_TableRows(self, fields, part) for part in fields.parts]
         return sorted(found, key=lambda one: (one.first is not None, one.first or 0))
 
     def reader(self, segment: int) -> SegmentReader:
@@ -210,6 +221,13 @@ class TopicOfRecording:
         """Positions of its chunks, by segment and number."""
         chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
         return {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
+
+    @lazy
+    def expired(self) -> NDArray[np.int64]:
+        """Keys of its expired chunks, see `_keys`."""
+        chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
+        gone = [(c.segment, c.number) for c in chunks if c.place.length == EXPIRED_SIZE]
+        return _keys(*np.array(gone, np.int64).reshape(-1, 2).T)
 
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
         """A chunk; those read last are at hand.
@@ -229,9 +247,22 @@ class TopicOfRecording:
         return found
 
 
+def _keys(segment: NDArray[np.int64], chunk: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A number for each chunk."""
+    return (segment << 32) | chunk
+
+
+def _with_expired(states: Any, ref: Any, expired: NDArray[np.int64]) -> Any:
+    """States of rows: tables that were made before payloads expired do not say so."""
+    places = places_of(ref)
+    is_gone = pa.array(np.isin(_keys(places[:, 0], places[:, 1]), expired))
+    is_gone = pc.and_(is_gone, pc.equal(states, State.WHOLE.value))
+    return pc.if_else(is_gone, State.EXPIRED.value, states)
+
+
 def _is_fixed(channel: RecordedChannel) -> bool:
     """True if the definition of a channel fixes the fields of its messages."""
-    encoding = channel.channel.message_encoding
+    encoding = channel.encoding
     # The keys of a map of protobuf are fields, which no definition knows.
     return encoding in _FIXED or (encoding == "protobuf" and not has_empty(channel.arrow_type()))
 
@@ -257,12 +288,17 @@ class _TableRows:
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.add_group(self._part.file.path, self._part.group)
-        is_whole = not (self._table.unreadable or self._table.reduced)
+        expired = self._source.expired
+        is_whole = not (self._table.unreadable or self._table.reduced or len(expired))
         wanted = own if is_whole else {*own, "state"}
         try:
-            ours, records = self._table.read(self._part, paths, wanted)
+            ours, records = self._table.read(
+                self._part, paths, {*wanted, "ref"} if len(expired) else wanted
+            )
         except StoreError as error:
             raise DamagedTableError(self._source, str(error)) from error
+        if len(expired):
+            ours["state"] = _with_expired(ours["state"], ours["ref"], expired)
         yield Rows(ours, records, self._part.rows)
 
 

@@ -86,7 +86,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
             for channel in channels:
                 total.add(channel.stats)
             types = dict.fromkeys(c.channel.schema.name for c in channels if c.channel.schema)
-            encodings = dict.fromkeys(c.channel.message_encoding for c in channels)
+            encodings = dict.fromkeys(c.encoding for c in channels)
             problems = dict.fromkeys(c.codec.reason for c in channels if c.codec.reason)
             yield {
                 "topic": topic,

@@ -137,7 +137,7 @@ class TopicView:
         remarks.recordings[recording.entry.id] = recording.entry
         remarks.topics.add(self.topic)
         for channel in recording.channels.values():
-            if channel.codec.reason is not None and not channel.is_reduced:
+            if channel.codec.reason is not None and channel.is_typed:
                 remarks.undefined[self.topic] = channel.codec.reason
 
 
@@ -268,7 +268,7 @@ class _Plan:
         held = [leaf for key, leaf in self._leaves.items() if key not in absent]
         own = self._own | ({"ref", "channel"} if absent else set())
         for rows in source.read(_paths(held), own, self._reading.counts):
-            self._remark(recording.topic, rows)
+            self._remark(recording.topic, rows, lacks_arrays=bool(absent))
             if absent:
                 yield from self._with_payloads(recording, rows, absent)
             else:
@@ -348,13 +348,13 @@ class _Plan:
                 arrays.append(_constant(name, recording.entry, rows.size))
         return pa.RecordBatch.from_arrays(arrays, schema=schema)
 
-    def _remark(self, topic: str, rows: Rows) -> None:
+    def _remark(self, topic: str, rows: Rows, *, lacks_arrays: bool) -> None:
         states = rows.own.get("state")
         if states is None:
             return  # all are whole
         for found in pc.value_counts(states).to_pylist():
-            if found["values"] != State.WHOLE:
-                state = State(found["values"])
+            state = State(found["values"])
+            if state is not State.WHOLE and (state is not State.EXPIRED or lacks_arrays):
                 self._reading.remarks.absent[topic, state] += found["counts"]
 
 

@@ -198,6 +198,7 @@ class RecordingEntry:
         pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
         digests: Digest of each valid segment, by its number as text.
+        stored: Digest of the files of those with moved or expired chunks.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
         payloads: Files with columns of payloads: `file`, `bytes`, `digest`, `topic`, `messages`.
@@ -224,6 +225,7 @@ class RecordingEntry:
     pins: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[int, int, int]] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
+    stored: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
     payloads: list[dict[str, Any]] = field(default_factory=list)
     flushed: dict[int, Flushed] = field(default_factory=dict)
@@ -1190,7 +1192,7 @@ class Catalog:
             "table",
             entry.id,
             number,
-            digest,
+            entry.stored.get(str(number), digest),
             make=lambda: self._read_table(entry, number, digest),
             size_of=lambda found: _size(found[0]),
         )
@@ -1204,7 +1206,11 @@ class Catalog:
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
-        if summary.recording.get("id") != entry.id or summary.whole_digest != digest:
+        # Expired messages are on other channels than before.
+        is_expired = bool(summary.table.is_expired.any())
+        is_known = summary.digest == entry.stored.get(str(number), digest) or not is_expired
+        is_ours = summary.recording.get("id") == entry.id and summary.whole_digest == digest
+        if not (is_ours and is_known):
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
         return summary.table, self.stamps(entry, number, summary.table)
 

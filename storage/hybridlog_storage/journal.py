@@ -46,10 +46,14 @@ ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
 COMPACTED: Final = "compacted"
+EXPIRED: Final = "expired"
 PINNED: Final = "pinned"
 UNPINNED: Final = "unpinned"
-RESERVED: Final = ("expired", "signature")
+RESERVED: Final = ("signature",)
 """Events of later versions; this version preserves and ignores them."""
+
+FIELDS: Final = "fields="
+"""Beginning of the paths of files with what is left of expired messages."""
 
 Event = Mapping[str, Any]
 """The content of a line: `event`, `at` (ns since the epoch), and values of the event."""
@@ -111,7 +115,7 @@ class SealedSegment:
 
 @dataclass(frozen=True, slots=True)
 class PayloadFile:
-    """A file with payloads of a topic as columns.
+    """A file with payloads of a topic as columns, or with the fields of expired ones.
 
     Attributes:
         file: Its path below the recording's `payloads`.
@@ -126,6 +130,11 @@ class PayloadFile:
     digest: str
     topic: str
     messages: int
+
+    @property
+    def has_fields(self) -> bool:
+        """True if it has what is left of expired messages."""
+        return self.file.startswith(FIELDS)
 
 
 @dataclass(slots=True)
@@ -143,9 +152,10 @@ class JournalState:
         pins: Pins by id: `id`, `from` and `to` (log times, ns), `topics`, `reason`; None for all.
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
-        payloads: Files of payloads, by path.
-        thinned: Digest and size of each segment without moved chunks, by its number; a later
-            one follows an earlier one.
+        payloads: Files of payloads, and of fields of expired ones, by path.
+        deleted: Files of payloads that have expired, too.
+        thinned: Digest and size of each segment without moved or expired chunks, by its number;
+            a later one follows an earlier one.
         end: The end of the recording; None while it is running.
         moving: Old and new label of a rename that is not finished, else None.
         removing: Whether a removal began.
@@ -167,6 +177,7 @@ class JournalState:
     sealed: dict[int, SealedSegment] = field(default_factory=dict)
     replaced: list[tuple[SealedSegment, SealedSegment]] = field(default_factory=list)
     payloads: dict[str, PayloadFile] = field(default_factory=dict)
+    deleted: set[str] = field(default_factory=set)
     thinned: dict[int, list[tuple[str, int]]] = field(default_factory=dict)
     end: dict[str, Any] | None = None
     moving: tuple[str, str] | None = None
@@ -199,7 +210,7 @@ class JournalState:
             self._rename(line)
         elif name == ADOPTED:
             self.store = _text(line["store"])
-        elif name == COMPACTED:
+        elif name in {COMPACTED, EXPIRED}:
             self._compact(line)
         elif name in {REMOVING, REBUILT}:
             self.removing |= name == REMOVING
@@ -263,9 +274,13 @@ class JournalState:
     def _compact(self, line: Event) -> None:
         found = payload_files(line.get("files", ()))
         segments = [_values(value, _THINNED) for value in line.get("segments", ())]
+        deleted = {_text(path) for path in line.get("deleted", ())}
         self.payloads.update({file.file: file for file in found})
         for one in segments:
             self.thinned.setdefault(one["segment"], []).append((one["digest"], one["bytes"]))
+        self.deleted |= self.payloads.keys() & deleted
+        for path in deleted:
+            self.payloads.pop(path, None)
 
 
 def _written(line: Event) -> int:

@@ -8,8 +8,8 @@ into a chunk.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +30,10 @@ ORIGINAL_ENCODING = "hybridlog.message_encoding"
 """Metadata key of a reduced channel: the encoding of the dropped payloads."""
 REDUCED = "hybridlog.reduced"
 """Message encoding of a channel with reduced messages, whose payload was dropped."""
+EXPIRED = "hybridlog.expired"
+"""Message encoding of a channel with expired messages, whose payload was deleted."""
+EXPIRED_IDS = 1 << 16
+"""Added to the id of a channel: the channel of its expired messages. No file has such ids."""
 
 
 SUPPLIED = "hybridlog.definition"
@@ -83,6 +87,23 @@ class Channel:
     is_indexed: bool = True
 
 
+def expired_channel(channel: Channel) -> Channel:
+    """The channel of a channel's expired messages; a reduced one has no payload to expire."""
+    if channel.message_encoding == REDUCED:
+        return channel
+    metadata = {**channel.metadata, ORIGINAL_ENCODING: channel.message_encoding}
+    return replace(channel, message_encoding=EXPIRED, metadata=metadata)
+
+
+def with_expired(channels: Mapping[int, Channel], ids: Iterable[int]) -> dict[int, Channel]:
+    """Channels by id, with those of expired messages among some ids."""
+    found = dict(channels)
+    for number in ids:
+        if number >= EXPIRED_IDS and number - EXPIRED_IDS in found:
+            found.setdefault(number, expired_channel(found[number - EXPIRED_IDS]))
+    return found
+
+
 @dataclass(slots=True)
 class Batch:
     """Messages whose payloads lie in one buffer. All columns have the same length n.
@@ -97,6 +118,8 @@ class Batch:
         log_time: int64[n], nanoseconds since the epoch.
         publish_time: int64[n], nanoseconds since the epoch.
         sequence: uint32[n], the sender's sequence number, 0 without one.
+        place: int64[n, 2], offset and bytes of each payload in its chunk, where `buffer` holds
+            what is left of expired messages; None where it holds the payloads.
     """
 
     buffer: Buffer
@@ -106,10 +129,18 @@ class Batch:
     log_time: NDArray[np.int64]
     publish_time: NDArray[np.int64]
     sequence: NDArray[np.uint32]
+    place: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         """Number of messages."""
         return len(self.offset)
+
+    @property
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Offset and bytes of each payload in its chunk, whether it is still there or not."""
+        if self.place is None:
+            return self.offset, self.length
+        return self.place[:, 0], self.place[:, 1]
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Batch:
         """Select rows, over the same buffer."""
@@ -121,6 +152,7 @@ class Batch:
             self.log_time[rows],
             self.publish_time[rows],
             self.sequence[rows],
+            None if self.place is None else self.place[rows],
         )
 
     def payload(self, row: int) -> memoryview:
@@ -131,7 +163,7 @@ class Batch:
     @property
     def payload_bytes(self) -> int:
         """Sum of all payload lengths."""
-        return int(self.length.sum())
+        return int(self.places[1].sum())
 
 
 @dataclass(slots=True)

@@ -28,7 +28,9 @@ EMBEDDED: Final = "embedded"
 """In place of a URI: the MongoDB that comes with hybridlog."""
 NONE: Final = "none"
 """In place of a URI: no MongoDB."""
-FEATURES: Final[frozenset[str]] = frozenset()
+EXPIRED: Final = "expired"
+"""Feature of a store with messages whose payloads were deleted."""
+FEATURES: Final[frozenset[str]] = frozenset({EXPIRED})
 """Features that a store may require of its reader."""
 
 MIN_CACHE_MB: Final = 256

@@ -19,6 +19,7 @@ from hybridlog.maintenance import thinning
 from hybridlog_storage import journal
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, SegmentError
+from hybridlog_storage.segments.segment_format import moved_record
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from tests.payloads.logs import (
     BASE,
@@ -344,18 +345,20 @@ def test_the_proof_sees_every_difference(copy: Path) -> None:
 
 def _try_proof(reader: Any, summary: Any, scans: set[int], others: set[int]) -> None:
     target = reader.path.with_name(f"{reader.path.name}.thinned")
-    thinning.thin(reader, target, scans, {"digest": "x"})
-    thinning._prove(target, reader, summary, scans)
+    contents = RecordingPayloads(target.parent)
+    thinning.thin(reader, target, dict.fromkeys(scans, moved_record), {"digest": "x"})
+    thinning._prove(target, reader, summary, scans, contents)
     with pytest.raises(SegmentError, match="not what it should be"):
-        thinning._prove(target, reader, summary, scans | others)
+        thinning._prove(target, reader, summary, scans | others, contents)
     whole = target.read_bytes()
     target.write_bytes(whole[:300] + bytes([whole[300] ^ 1]) + whole[301:])
     with pytest.raises(SegmentError):
-        thinning._prove(target, reader, summary, scans)
+        thinning._prove(target, reader, summary, scans, contents)
     target.unlink()
-    thinning.thin(reader, target, others, {"digest": "x"})  # they are in no columns
+    moved = dict.fromkeys(others, moved_record)
+    thinning.thin(reader, target, moved, {"digest": "x"})  # they are in no columns
     with pytest.raises(SegmentError):
-        thinning._prove(target, reader, summary, others)
+        thinning._prove(target, reader, summary, others, contents)
     target.unlink()
 
 

@@ -173,7 +173,7 @@ def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
         types = parts[0].field_types or {}
         fields = _single_numbers(types)
         if not fields or not all(
-            part.field_types == types and not any(channel.is_reduced for channel in part.channels)
+            part.field_types == types and all(channel.is_typed for channel in part.channels)
             for part in parts
         ):
             continue

@@ -76,7 +76,7 @@ def _about_stamps(session: Session, question: Question) -> Iterator[str]:
     missing = 0
     for channel in _channels(session, question):
         stats = channel.stats
-        if channel.recording.is_decoded and not channel.is_reduced:
+        if channel.recording.is_decoded and channel.is_typed:
             missing += stats.messages - stats.stamped
         first, last = stats.first_stamp, stats.last_stamp
         if is_told or first is None or last is None or stats.first is None or stats.last is None:

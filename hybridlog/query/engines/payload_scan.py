@@ -41,7 +41,7 @@ class PayloadScan:
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float:
         """By chunks, bytes and messages."""
         size = sum(stats.payload_bytes for stats in part.stats)
-        encodings = {channel.channel.message_encoding for channel in part.channels}
+        encodings = {channel.encoding for channel in part.channels}
         message_s = _ROW_S if encodings <= _BY_COLUMNS else _OBJECT_S
         each = _BYTE_S * size + message_s * part.messages
         return _START_S + _CHUNK_S * part.chunks + part.share * each

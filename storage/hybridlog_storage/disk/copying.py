@@ -83,7 +83,15 @@ def joined(batches: Sequence[Batch]) -> Batch:
         np.concatenate([b.log_time for b in batches]),
         np.concatenate([b.publish_time for b in batches]),
         np.concatenate([b.sequence for b in batches]),
+        _places(batches),
     )
+
+
+def _places(batches: Sequence[Batch]) -> NDArray[np.int64] | None:
+    """Where the payloads were, if some have expired."""
+    if all(batch.place is None for batch in batches):
+        return None
+    return np.concatenate([np.stack(batch.places, axis=1) for batch in batches])
 
 
 def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
@@ -103,6 +111,7 @@ def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
     for batch in batches:
         copy_payloads(batch, target, place[at : at + len(batch)])
         at += len(batch)
+    places = _places(batches)
     return Batch(
         target,
         offset,
@@ -111,4 +120,5 @@ def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
         np.concatenate([b.log_time for b in batches])[order],
         np.concatenate([b.publish_time for b in batches])[order],
         np.concatenate([b.sequence for b in batches])[order],
+        None if places is None else places[order],
     )

@@ -24,7 +24,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Final
@@ -178,6 +178,24 @@ class StoreDirectory:
                 f"The store {self.path} is read-only. Check its owner and mount, or choose "
                 "another with --store."
             )
+
+    def require(self, feature: str) -> None:
+        """Note in the settings that only readers that know a feature may read the store.
+
+        Raises:
+            StoreError: They cannot be written.
+        """
+        if feature in self.settings.requires:
+            return
+        with self.alone():
+            settings = read_settings(self.path)
+            if feature not in settings.requires:
+                settings = replace(settings, requires=(*settings.requires, feature))
+                try:
+                    write_settings(self.path, settings)
+                except OSError as error:
+                    raise durability.explain(error, self.path, "writing settings of") from error
+            self.settings = settings
 
     @property
     def recordings(self) -> Path:

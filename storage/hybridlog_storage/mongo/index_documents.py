@@ -103,6 +103,7 @@ class Placed(NamedTuple):
         segment: int32[n], segment of that chunk.
         chunk: int64[n], number of the chunk in the segment.
         offset: int64[n], position of the payload in the chunk's content.
+        length: int64[n], its bytes.
     """
 
     batch: Batch
@@ -111,6 +112,7 @@ class Placed(NamedTuple):
     segment: NDArray[np.int32]
     chunk: NDArray[np.int64]
     offset: NDArray[np.int64]
+    length: NDArray[np.int64]
 
     @classmethod
     def of(cls, chunks: Sequence[StoredChunk]) -> Self:
@@ -123,7 +125,7 @@ class Placed(NamedTuple):
             number,
             np.array([chunk.segment for chunk in chunks], np.int32)[number],
             np.array([chunk.number for chunk in chunks], np.int64)[number],
-            np.concatenate([batch.offset for batch in batches]),
+            *map(np.concatenate, zip(*(batch.places for batch in batches), strict=True)),
         )
 
 
@@ -179,7 +181,7 @@ class DocumentAssembler:
         _column(out, start + at["seg"], "<i4")[:] = placed.segment[rows]
         _column(out, start + at["chunk"], "<i8")[:] = placed.chunk[rows]
         _column(out, start + at["off"], "<i8")[:] = placed.offset[rows]
-        _column(out, start + at["len"], "<i8")[:] = batch.length[rows]
+        _column(out, start + at["len"], "<i8")[:] = placed.length[rows]
         return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hybridlog_storage.checksum import crc32, crc32_combine
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
@@ -16,6 +16,8 @@ from hybridlog_storage.segments.segment_format import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -108,6 +110,19 @@ def pack(
     )
 
 
+class ExpiredMessages(NamedTuple):
+    """What is left of the messages of an expired chunk.
+
+    Attributes:
+        batch: The messages; `channel` holds ids of channels of expired messages.
+        fields: Rows of the batch, and the columns of their table that fields have, an Arrow
+            struct each; a pair for each topic.
+    """
+
+    batch: Batch
+    fields: Sequence[tuple[NDArray[np.intp], Any]]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredChunk:
     """A chunk stored in a segment, with its content in memory.
@@ -123,6 +138,7 @@ class StoredChunk:
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
         compressed_size: Bytes of compressed content.
+        fields: Of an expired chunk, see `ExpiredMessages`; None of others.
     """
 
     segment: int
@@ -135,3 +151,4 @@ class StoredChunk:
     batch: Batch
     seq: NDArray[np.int64]
     compressed_size: int
+    fields: Sequence[tuple[NDArray[np.intp], Any]] | None = None

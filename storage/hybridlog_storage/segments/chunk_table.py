@@ -9,16 +9,17 @@ only checked bytes.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from hybridlog_storage.checksum import crc32, crc32_combine
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.compression import decompress
-from hybridlog_storage.segments.segment_format import checked_frame
+from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, checked_frame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -107,6 +108,26 @@ class ChunkTable:
         bounds = np.zeros(len(self.chunks) + 1, np.int64)
         np.cumsum(self.chunks["parts"], out=bounds[1:])
         return bounds
+
+    @property
+    def is_expired(self) -> NDArray[np.bool_]:
+        """bool[n], True for chunks whose payloads were deleted."""
+        return np.asarray(self.chunks["length"] == EXPIRED_SIZE)
+
+    def with_expired(self) -> ChunkTable:
+        """The table with the messages of expired chunks on channels of their own."""
+        rows = np.repeat(self.is_expired, self.chunks["parts"])
+        if not rows.any():
+            return self
+        parts = self.parts.copy()
+        parts["channel"][rows] += EXPIRED_IDS
+        return replace(self, parts=parts)
+
+    def as_stored(self) -> ChunkTable:
+        """The table as the file has it: expired messages on the channel that they came on."""
+        parts = self.parts.copy()
+        parts["channel"] %= EXPIRED_IDS
+        return replace(self, parts=parts)
 
     def by_channel(self) -> NDArray[np.void]:
         """Totals of each channel.

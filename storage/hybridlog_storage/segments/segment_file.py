@@ -33,6 +33,7 @@ from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
     CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
+    EXPIRED_OPCODE,
     FORMAT_VERSION,
     INDEX_HEAD,
     LIBRARY,
@@ -372,7 +373,7 @@ class SegmentFile:
         self.table.stretch(length, crc)
 
     def append_copy(self, record: Buffer, trailer: Buffer, parts: NDArray[np.void]) -> None:
-        """Append a chunk of another segment, or the record of a moved one.
+        """Append a chunk of another segment, or the record of a moved or expired one.
 
         Args:
             record: Its record.
@@ -391,7 +392,7 @@ class SegmentFile:
         _, _, first, last, size, _ = CHUNK_HEAD.unpack_from(record)
         self._append([record, own])
         checksums = {"crc": proof.record, "trailer_crc": crc32(own)}
-        if record[0] == MOVED_OPCODE:
+        if record[0] in {MOVED_OPCODE, EXPIRED_OPCODE}:
             self.table.chunk(
                 offset=offset,
                 length=len(record),

@@ -64,13 +64,19 @@ CHUNK_TABLE_OPCODE: Final = 0x92
 
 MOVED_OPCODE: Final = 0x93
 """Record in place of a chunk whose content lies in columns of payloads."""
+EXPIRED_OPCODE: Final = 0x94
+"""Record in place of a chunk whose payloads were deleted; what is left lies in files of fields."""
 COMPACTED_METADATA: Final = "hybridlog.compacted"
-"""Metadata record of a segment with moved chunks."""
+"""Metadata record of a segment with moved or expired chunks."""
 DATA_END_SIZE: Final = 13
 """Bytes of the record of the end of the data."""
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
 MOVED_SIZE: Final = CHUNK_HEAD.size
 """Bytes of the record of a moved chunk; every chunk record has more."""
+_EXPIRED_TAIL = struct.Struct("<Q")  # bytes of the chunk record that was there
+EXPIRED_SIZE: Final = MOVED_SIZE + _EXPIRED_TAIL.size
+"""Bytes of the record of an expired chunk; every chunk record has more."""
+_CONTENT_ELSEWHERE: Final = {MOVED_OPCODE: MOVED_SIZE, EXPIRED_OPCODE: EXPIRED_SIZE}
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 PROOF: Final = struct.Struct("<QQIIIII")
 """Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
@@ -229,13 +235,13 @@ def compression_of(record: Buffer) -> tuple[str, int]:
 
 
 def head_length(record: Buffer) -> int:
-    """Bytes of a chunk record before its content; all of the record of a moved chunk.
+    """Bytes of a chunk record before its content; all of that of a moved or expired chunk.
 
     Args:
         record: The record, or its beginning.
     """
-    if record[0] == MOVED_OPCODE:
-        return MOVED_SIZE
+    if record[0] in _CONTENT_ELSEWHERE:
+        return _CONTENT_ELSEWHERE[record[0]]
     (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
     return int(CHUNK_HEAD.size + 4 + name + 8)
 
@@ -248,6 +254,18 @@ def moved_record(chunk: Buffer) -> bytes:
     """
     _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
     return CHUNK_HEAD.pack(MOVED_OPCODE, MOVED_SIZE - RECORD_HEAD.size, first, last, size, crc)
+
+
+def expired_record(chunk: Buffer) -> bytes:
+    """The record in place of a chunk record whose payloads are deleted.
+
+    Args:
+        chunk: The chunk record, or that of a moved chunk.
+    """
+    _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
+    length = EXPIRED_SIZE - RECORD_HEAD.size
+    head = CHUNK_HEAD.pack(EXPIRED_OPCODE, length, first, last, size, crc)
+    return head + _EXPIRED_TAIL.pack(len(chunk))
 
 
 def padding_record(size: int) -> bytes:

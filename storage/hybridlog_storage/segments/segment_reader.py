@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, Self, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -33,7 +33,7 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_content,
     read_record,
 )
-from hybridlog_storage.messages import Buffer, Channel
+from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, with_expired
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import (
     MAX_HEAD,
@@ -41,7 +41,7 @@ from hybridlog_storage.segments.attachments import (
     FileHandle,
     parse_attachment,
 )
-from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_file import digest_of
@@ -50,6 +50,8 @@ from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     COMPACTED_METADATA,
     END_METADATA,
+    EXPIRED_OPCODE,
+    EXPIRED_SIZE,
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
@@ -116,14 +118,14 @@ class SegmentSummary:
     Attributes:
         recording: Catalog entry of the recording at the start of the segment.
         end: The end of the recording; None except in its last segment.
-        channels: Channels by id.
+        channels: Channels by id, and those of expired messages, see `EXPIRED_IDS`.
         schema_ids: Id of each channel's schema, 0 without one, by channel id.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
-        compacted: `digest` and `bytes` of a segment before chunks were moved, and the `files` of
-            columns that it needs; None in others.
+        compacted: `digest` and `bytes` of a segment before chunks were moved or expired, and the
+            `files` of columns that it needs; None in others.
         table: The chunk table.
         digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
@@ -165,10 +167,22 @@ class _Records:
     table: Buffer | None
 
 
-Contents = Callable[[int, int, int], Buffer]
-"""Returns the content of a moved chunk, by numbers of segment and chunk, and its size.
+class Contents(Protocol):
+    """Where the content of chunks lies that is not in the segment. The caller checks it."""
 
-It raises SegmentError when the content is missing or damaged. The caller checks it."""
+    def __call__(self, segment: int, chunk: int, size: int) -> Buffer:
+        """The content of a moved chunk.
+
+        Raises:
+            SegmentError: It is missing or damaged.
+        """
+
+    def expired(self, segment: int, chunk: int) -> ExpiredMessages:
+        """What is left of an expired chunk.
+
+        Raises:
+            SegmentError: It is missing or damaged.
+        """
 
 
 class SegmentReader:
@@ -179,7 +193,7 @@ class SegmentReader:
         number: Its number in the recording.
         direct: Read past the page cache, if the file system allows it: for data that was
             just written that way and will not be read again soon.
-        contents: Returns the content of moved chunks.
+        contents: Has the content of moved chunks, and what is left of expired ones.
 
     Raises:
             SegmentError: The file is missing or cannot be opened.
@@ -275,7 +289,7 @@ class SegmentReader:
         """
         with self._explained():
             start, tail = self._tail()
-            return self._table(_records(tail[: len(tail) - _TAIL]), start)
+            return self._table(_records(tail[: len(tail) - _TAIL]), start).with_expired()
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -342,16 +356,18 @@ class SegmentReader:
                 losses += loss_rows(json_of(self.metadata(table, index)))
         if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
-        totals = table.by_channel()
-        counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
         stated = records.statistics.channel_message_counts if records.statistics else {}
-        is_known = counts.keys() <= records.channels.keys()
+        is_known = {*table.parts["channel"].tolist()} <= records.channels.keys()
         if _listed_counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
             raise _NoSummaryError("its statistics and its chunk table differ")
+        table = table.with_expired()
+        totals = table.by_channel()
+        counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
+        channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
         return SegmentSummary(
             recording=found[RECORDING_METADATA],
             end=found.get(END_METADATA),
-            channels={i: channel_of(r, records.schemas) for i, r in records.channels.items()},
+            channels=with_expired(channels, counts),
             schema_ids={i: r.schema_id for i, r in records.channels.items()},
             counts=counts,
             losses=losses,
@@ -435,17 +451,16 @@ class SegmentReader:
         try:
             if crc32(record) != place.crc:
                 raise SegmentError("its checksum differs")
-            if len(record) == MOVED_SIZE:
-                content, compressed = self._moved_content(place, record), 0
+            compressed, fields = 0, None
+            if len(record) == EXPIRED_SIZE:
+                left = self._expired(place, record)
+                batch, fields = left.batch, left.fields
             else:
-                content, compressed = open_chunk(record)
-            if crc32(trailer) != place.trailer_crc:
-                batch = parse_content(content).batch
-            else:
-                found = messages_at(content, message_starts(trailer))
-                if found is None:
-                    raise SegmentError("its message indexes do not fit its messages")
-                batch = found
+                if len(record) == MOVED_SIZE:
+                    content = self._moved_content(place, record)
+                else:
+                    content, compressed = open_chunk(record)
+                batch = self._messages(place, content, trailer)
             seq = check_arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
@@ -460,7 +475,36 @@ class SegmentReader:
             batch=batch,
             seq=seq,
             compressed_size=compressed,
+            fields=fields,
         )
+
+    def _messages(self, place: ChunkPlace, content: Buffer, trailer: memoryview) -> Batch:
+        """The messages of a chunk; damaged message indexes are ignored."""
+        if crc32(trailer) != place.trailer_crc:
+            return parse_content(content).batch
+        found = messages_at(content, message_starts(trailer))
+        if found is None:
+            raise SegmentError("its message indexes do not fit its messages")
+        return found
+
+    def _expired(self, place: ChunkPlace, record: memoryview) -> ExpiredMessages:
+        """What is left of an expired chunk: as many messages as it has, of its channels."""
+        opcode, length, *_ = CHUNK_HEAD.unpack_from(record)
+        if opcode != EXPIRED_OPCODE or length + RECORD_HEAD.size != len(record):
+            raise SegmentError("no chunk record is there")
+        if self._contents is None:
+            raise SegmentError("its fields lie in files of fields")
+        left = self._contents.expired(self.number, place.number)
+        batch = left.batch
+        times = (place.first, place.last)
+        is_all = (
+            len(batch)
+            and {*distinct(batch.channel).tolist()} == {*place.channels}
+            and (int(batch.log_time.min()), int(batch.log_time.max())) == times
+        )
+        if not is_all:
+            raise SegmentError("its messages are not those in the files of fields")
+        return left
 
     def _moved_content(self, place: ChunkPlace, record: memoryview) -> Buffer:
         """The content of a moved chunk, checked."""
@@ -513,7 +557,8 @@ class SegmentReader:
     def _read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         trailer = self.read(place.offset + place.length, place.trailer)
         if crc32(trailer) == place.trailer_crc:
-            return message_times(trailer)
+            added = EXPIRED_IDS if place.length == EXPIRED_SIZE else 0
+            return {number + added: times for number, times in message_times(trailer).items()}
         batch = self.read_chunk(place).batch
         channels = distinct(batch.channel).tolist()
         return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
@@ -629,8 +674,9 @@ _WANTED = frozenset(
 
 
 def _listed_counts(table: ChunkTable) -> dict[int, int]:
-    """Messages of each channel in chunks that were not moved."""
-    rows = np.repeat(table.chunks["length"] != MOVED_SIZE, table.chunks["parts"])
+    """Messages of each channel in chunks with their content."""
+    is_here = ~np.isin(table.chunks["length"], [MOVED_SIZE, EXPIRED_SIZE])
+    rows = np.repeat(is_here, table.chunks["parts"])
     totals = replace(table, parts=table.parts[rows]).by_channel()
     return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
 

@@ -1,14 +1,15 @@
-"""Writes a segment again without the content of chunks that lies elsewhere.
+"""Writes a segment again without the content of some chunks.
 
-Such a *moved* chunk keeps its number, its times, its message indexes and its arrival
-numbers. In place of the chunk record stands a short record with the size and the checksum of
-the content, by which a reader checks what it gets from elsewhere.
+The content of a *moved* chunk lies elsewhere, that of an *expired* one was deleted. Such a
+chunk keeps its number, its times, its message indexes and its arrival numbers. In place of the
+chunk record stands a short record with the size and the checksum of the content, by which a
+reader checks what it gets from elsewhere.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hybridlog_storage.checksum import crc32
@@ -20,7 +21,6 @@ from hybridlog_storage.segments.segment_format import (
     COMPACTED_METADATA,
     DATA_END_SIZE,
     json_metadata,
-    moved_record,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
@@ -53,7 +53,7 @@ class _Piece(NamedTuple):
 def thin(
     reader: SegmentReader,
     target: Path,
-    moved: Collection[int],
+    records: Mapping[int, Callable[[Buffer], bytes]],
     about: Mapping[str, Any],
     progress: Callable[[], None] | None = None,
 ) -> Sealed:
@@ -62,7 +62,8 @@ def thin(
     Args:
         reader: The segment.
         target: The new file; it must not exist.
-        moved: Numbers of the chunks that lie elsewhere.
+        records: What makes the record in place of that of a chunk, by the chunk's number:
+            `moved_record` or `expired_record`.
         about: Content of the metadata record that says so.
         progress: Called after each chunk.
 
@@ -81,7 +82,7 @@ def thin(
         raise durability.explain(error, target, "creating") from error
     segment = SegmentFile(target, reader.number, file)
     try:
-        _copy(reader, summary, segment, moved, progress)
+        _copy(reader, summary, segment, records, progress)
         segment.add_metadata(json_metadata(COMPACTED_METADATA, about))
         sealed = segment.complete()
         segment.finish()
@@ -95,11 +96,12 @@ def _copy(
     reader: SegmentReader,
     summary: SegmentSummary,
     segment: SegmentFile,
-    moved: Collection[int],
+    records: Mapping[int, Callable[[Buffer], bytes]],
     progress: Callable[[], None] | None,
 ) -> None:
     ids = summary.schema_ids
-    channels = ((number, ids[number], channel) for number, channel in summary.channels.items())
+    stored = summary.table.as_stored()
+    channels = ((number, ids[number], summary.channels[number]) for number in ids)
     segment.define(channels, write=False)
     bounds = summary.table.part_bounds().tolist()
     places = summary.chunks
@@ -115,9 +117,9 @@ def _copy(
         place = places[piece.chunk]
         record: Buffer = _checked(reader, place.offset, place.length, piece.crc)
         trailer = _checked(reader, place.offset + place.length, place.trailer, place.trailer_crc)
-        if piece.chunk in moved:
-            record = moved_record(record)
-        parts = summary.table.parts[bounds[piece.chunk] : bounds[piece.chunk + 1]]
+        if piece.chunk in records:
+            record = records[piece.chunk](record)
+        parts = stored.parts[bounds[piece.chunk] : bounds[piece.chunk + 1]]
         segment.append_copy(record, trailer, parts)
         if progress is not None:
             progress()

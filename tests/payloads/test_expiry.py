@@ -1,0 +1,114 @@
+"""Payloads expire; fields, counts and times stay, in every state of a recording."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance import expiry
+from hybridlog.maintenance.expiry import Expired
+from hybridlog.maintenance.opening import put_entry
+from hybridlog_storage import journal
+from hybridlog_storage.errors import PayloadError
+from tests.payloads.logs import COUNT
+
+TOPICS = ["/cloud", "/image", "/number", "/scan"]
+
+
+def expire(
+    store: Path, segments: Collection[int], topics: Collection[str] | None = None
+) -> Expired:
+    """Delete payloads of the only recording of a store."""
+    with hl.open(store) as opened:
+        (entry,) = opened.recordings()
+        with opened.directory.writing(entry.label, entry.id) as label:
+            found = expiry.expire(opened.directory, label, segments, topics)
+            put_entry(opened.directory, opened.catalog, label)
+    return found
+
+
+def answers(path: Path) -> dict[str, Any]:
+    """What must not change when payloads expire."""
+    found: dict[str, Any] = {}
+    with hl.open(path, mongo="none") as store:
+        found["status"] = [(r.status, r.messages, r.span) for r in store.recordings()]
+        for topic in TOPICS:
+            query = store.topic(topic)
+            found[f"{topic} count"] = query.count()
+            found[f"{topic} between"] = query.between("+1s", "+3s").count()
+            found[f"{topic} fields"] = [
+                (m.log_time_ns, m.publish_time_ns, m.sequence, m.seq, m.fields) for m in query
+            ]
+            found[f"{topic} documents"] = [*query.documents()]
+        scans = store.topic("/scan")
+        found["where"] = scans.where("ranges.min < 1.3").count()
+        found["intervals"] = [*scans.where("ranges.max > 2.8").intervals()]
+        found["table"] = scans.fields("angle_min", "header.stamp").to_arrow().to_pylist()
+        text = "select t, seq, angle_min, ranges_summary.max from scan order by seq"
+        found["sql"] = store.sql(text).rows()
+    return found
+
+
+def recording_of(store: Path) -> Path:
+    return store / "recordings" / "log"
+
+
+def payloads(path: Path, topic: str) -> list[bytes | str]:
+    """The payloads of a topic; of those that are gone the reason."""
+    found: list[bytes | str] = []
+    with hl.open(path, mongo="none") as store:
+        for message in store.topic(topic):
+            try:
+                found.append(message.raw)
+            except PayloadError as error:
+                found.append(str(error))
+    return found
+
+
+STEPS: dict[str, list[tuple[list[int], list[str] | None]]] = {
+    "a segment": [([0], None)],
+    "a topic": [([0, 1], ["/cloud"])],
+    "a topic, then a segment": [([0], ["/cloud"]), ([0], None)],
+    "all, one after the other": [([0], None), ([1], ["/scan"]), ([0, 1], None)],
+}
+
+
+@pytest.mark.parametrize("steps", STEPS.values(), ids=STEPS)
+@pytest.mark.parametrize("dropped", [False, True], ids=["whole", "dropped"])
+def test_answers_stay_when_payloads_go(
+    copy: Path, steps: list[tuple[list[int], list[str] | None]], *, dropped: bool
+) -> None:
+    if dropped:
+        with hl.open(copy, mongo="none") as store:
+            store.compact(drop_mcap=True)
+    before, raw = answers(copy), {topic: payloads(copy, topic) for topic in TOPICS}
+    gone = dict.fromkeys(TOPICS, 0)
+    for segments, topics in steps:
+        done = expire(copy, segments, topics)
+        for topic, count in done.messages.items():
+            gone[topic] += count
+        assert expire(copy, segments, topics).segments == []
+    assert answers(copy) == before
+    shutil.rmtree(copy / "tables")
+    assert answers(copy) == before
+    for topic in TOPICS:
+        left = payloads(copy, topic)
+        reasons = [one for one in left if isinstance(one, str)]
+        assert len(reasons) == gone[topic]
+        assert all("deleted to make room" in reason for reason in reasons)
+        assert all(a == b for a, b in zip(raw[topic], left, strict=True) if isinstance(b, bytes))
+    with hl.open(copy, mongo="none") as store:
+        assert store.verify().findings == []
+    if dropped and all(count == COUNT for count in gone.values()):
+        listed = journal.read(recording_of(copy))
+        assert listed is not None
+        assert all(file.has_fields for file in listed.payloads.values())
+
+
+def _die(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
