@@ -111,6 +111,7 @@ def look_at_all(
     for recording, copies in found.items():
         if len(copies) > 1:
             found[recording] = [_one_of(directory, catalog, copies, known, report)]
+    report.noted.difference_update(report.copies)
     for summary in rows if mends or catalog.is_in_memory else ():
         # The row of a recording that is unreadable now may be valid again later.
         if summary.id not in found and summary.label not in report.unreadable:
