@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from hybridlog.arrays import is_video_type
 from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
@@ -470,7 +471,9 @@ def _print_one(path: Path, report: RecordReport) -> None:
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
     left_out = f" ({report.skipped} left out)" if report.skipped else ""
     if report.latched:
-        left_out += f"; {report.latched} of them latched, from before the time range"
+        videos = any(is_video_type(one.type) for one in entry.channels)
+        what = "latched or frames of video" if videos else "latched"
+        left_out += f"; {report.latched} of them {what}, from before the time range"
     output.print_table(
         [("recording", "left"), (entry.label, "left")],
         [

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import NamedTuple
 
-from hybridlog.query.latching import depth_of, publisher_of
+from hybridlog.query.latching import KEEP_ALL, depth_of, is_key_frame, is_video, publisher_of
 from hybridlog_storage.messages import Channel
 
 _MAX_LATCHED = 32 << 20  # payload bytes of one publisher; its last message always stays
@@ -41,6 +41,10 @@ class _Latched:
     messages: deque[BufferedMessage] = field(default_factory=deque)
     size: int = 0
 
+    def clear(self) -> None:
+        self.messages.clear()
+        self.size = 0
+
     def add(self, message: BufferedMessage, depth: int) -> None:
         self.messages.append(message)
         self.size += len(message.payload)
@@ -49,17 +53,30 @@ class _Latched:
 
 
 def _latch(latched: dict[Hashable, _Latched], message: BufferedMessage) -> None:
-    """Hold a message if its channel latches; the depth bounds how many stay."""
-    depth = depth_of(message.channel)
-    if depth:
-        latched.setdefault(publisher_of(message.channel), _Latched()).add(message, depth)
+    """Hold a message if its channel latches; the depth bounds how many stay.
+
+    Of video, the frames from the last key frame on are held, if they are not too many.
+    """
+    channel = message.channel
+    depth = KEEP_ALL if is_video(channel) else depth_of(channel)
+    if not depth:
+        return
+    held = latched.setdefault(publisher_of(channel), _Latched())
+    if is_video(channel):
+        if is_key_frame(channel, message.payload):
+            held.clear()
+        elif not held.messages or held.size + len(message.payload) > _MAX_LATCHED:
+            held.clear()
+            return
+    held.add(message, depth)
 
 
 class Ring:
     """Holds the messages of a time span, or as many as fit.
 
-    Latched messages that leave it are held until newer ones that leave it replace them: later
-    messages cannot be understood without them.
+    Latched messages that leave it are held until newer ones that leave it replace them, and
+    frames of video from a key frame on until the next one: later messages cannot be understood
+    without them.
 
     Args:
         span_ns: The span, by the messages' steady times.

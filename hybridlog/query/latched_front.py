@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.query.latching import KEEP_ALL, depth_of, publisher_of
+from hybridlog.query.latching import KEEP_ALL, depth_of, is_key_frame, is_video, publisher_of
 from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
@@ -41,6 +41,9 @@ class LatchedFront:
     log time becomes that of the slice's beginning. Messages of their channels with that very
     log time are held, too: of equal log times, the one that arrived last is current.
 
+    Of video, the frames from the last key frame before the slice on are held, to which its first
+    frames refer; none without such a key frame.
+
     Args:
         begin: Log time of the beginning, ns.
         original_times: The messages keep their log time.
@@ -54,6 +57,8 @@ class LatchedFront:
         self._begin = begin
         self._original_times = original_times
         self._depths: list[int] = []
+        self._channels: list[Channel] = []
+        self._keys: dict[Hashable, _Held] = {}
         self._publishers: list[Hashable] = []
         self._has_publish_time: list[bool] = []
         self._last: dict[Hashable, list[_Held]] = defaultdict(list)
@@ -78,7 +83,8 @@ class LatchedFront:
             from before the slice of publishers that keep all of theirs.
         """
         for channel in channels[len(self._depths) :]:
-            self._depths.append(depth_of(channel))
+            self._depths.append(KEEP_ALL - 1 if is_video(channel) else depth_of(channel))
+            self._channels.append(channel)
             self._publishers.append(publisher_of(channel))
             self._has_publish_time.append(channel.has_publish_time)
         depth = np.array(self._depths, np.int64)[batch.channel]
@@ -112,19 +118,38 @@ class LatchedFront:
             self._size += len(held.payload)
             self._at_begin.append(held)
             return True
-        last = self._last[self._publishers[channel]]
+        publisher = self._publishers[channel]
+        last = self._last[publisher]
         heappush(last, held)
         self._size += len(held.payload)
+        if is_video(self._channels[channel]):
+            self._cut_to_key(publisher, held)
         if len(last) > self._depths[channel]:
             self._size -= len(heappop(last).payload)
         while self._size > MAX_HELD and len(last) > 1:
             self._size -= len(heappop(last).payload)
             self.left_out += 1
+            key = self._keys.get(publisher)
+            if key is not None and key < last[0]:
+                del self._keys[publisher]  # the rest refers to what is gone
         return True
+
+    def _cut_to_key(self, publisher: Hashable, held: _Held) -> None:
+        """Drop the frames before the last key frame, if the frame just held is one or before it."""
+        key, last = self._keys.get(publisher), self._last[publisher]
+        if is_key_frame(self._channels[held.channel], held.payload):
+            key = self._keys[publisher] = max(key or held, held)
+        while key is not None and last[0] < key:
+            self._size -= len(heappop(last).payload)
 
     def batches(self) -> Iterator[Batch]:
         """The held messages, in order; `channel` indexes the log's channels."""
-        front = sorted(held for last in self._last.values() for held in last)
+        front = sorted(
+            held
+            for publisher, last in self._last.items()
+            for held in last
+            if publisher in self._keys or not is_video(self._channels[held.channel])
+        )
         self.messages += len(front)
         group: list[_Held] = []
         size = 0

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.arrays import is_video_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
+from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Buffer, Channel
 
 KEEP_ALL: Final = 1 << 62
 """Depth of a publisher that keeps all of its messages."""
@@ -36,6 +37,18 @@ def depth_of(channel: Channel) -> int:
 def is_video(channel: Channel) -> bool:
     """True if a channel's messages are frames of video."""
     return channel.schema is not None and is_video_type(channel.schema.name)
+
+
+def is_key_frame(channel: Channel, payload: Buffer) -> bool:
+    """True if a message of a video channel is a key frame."""
+    from hybridlog.arrays import bitstream
+    from hybridlog.schema.codecs import codec_for
+
+    try:
+        form, data = bitstream.frame_of(codec_for(channel).decode(memoryview(payload)))
+    except (PayloadError, DefinitionError):
+        return False
+    return bitstream.is_key_frame(form, data)
 
 
 def publisher_of(channel: Channel) -> Hashable:

@@ -7,7 +7,7 @@ import json
 import random
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,10 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog.arrays.bitstream import FrameOrder, frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder
+from hybridlog.live.ring import BufferedMessage, Ring
+from hybridlog.view.playback.played import PlayedLog
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, TopicError
+from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer
 
 av = pytest.importorskip("av")
@@ -135,14 +138,19 @@ def register(writer: Writer, topic: str, encoding: str) -> int:
     return writer.register_channel(topic, encoding, schema)
 
 
-def write(path: Path, topics: dict[str, tuple[str, list[bytes | None]]], form: str) -> None:
+def write(
+    path: Path,
+    topics: dict[str, tuple[str, list[bytes | None]]],
+    form: str,
+    order: Callable[[list[tuple[int, bytes | None]]], Iterable[tuple[int, bytes | None]]] = iter,
+) -> None:
     """A log with a chunk a message; frames that are None are left out."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=1)
         writer.start()
         for topic, (encoding, frames) in topics.items():
             channel = register(writer, topic, encoding)
-            for n, data in enumerate(frames):
+            for n, data in order([*enumerate(frames)]):
                 if data is not None:
                     time = BASE + n * STEP
                     writer.add_message(channel, time, payload(encoding, form, data), time)
@@ -228,6 +236,56 @@ def test_a_slice_begins_with_the_key_frame(videos: hl.Store, form: str, tmp_path
     asked = ("--between", begin, BASE + 9 * STEP, "-r", form, "--no-latched")
     done = answer("export", out, *asked, store=videos.directory.path)
     assert "in front" not in done.err
+
+
+@pytest.mark.parametrize("form", ENCODERS)
+def test_a_recorded_slice_begins_with_the_key_frame(form: str, tmp_path: Path) -> None:
+    """Also of a log that is out of order, and not without the key frame."""
+    frames, right, begin = encoded(form), decoded(form), BASE + 7 * STEP
+    topics: dict[str, tuple[str, list[bytes | None]]] = {one: (one, [*frames]) for one in ENCODINGS}
+    topics["late"] = ("json", [None, *frames[1:4], *[None] * 2, *frames[6:]])
+    write(tmp_path / "log.mcap", topics, form)
+    write(tmp_path / "mixed.mcap", {"json": ("json", [*frames])}, form, order=reversed)
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        cut = {"between": (begin, BASE + 9 * STEP), "again": True}
+        report = store.record(tmp_path / "log.mcap", name="slice", **cut)
+        assert report.latched == 2 * len(ENCODINGS)
+        for encoding in ENCODINGS:
+            found = list(store.query([encoding], ["slice"]))
+            assert [m.raw for m in found] == [payload(encoding, form, data) for data in frames[5:9]]
+            assert [m.log_time_ns - begin for m in found] == [0, 0, 0, STEP]
+            assert np.array_equal([m.to_numpy() for m in found], right[5:9])
+        assert store.query(["late"], ["slice"]).count() == 2
+        store.record(tmp_path / "mixed.mcap", name="mixed", original_times=True, **cut)
+        times = [m.log_time_ns for m in store.query(["json"], ["mixed"])]
+        assert times == [BASE + n * STEP for n in (5, 6, 7, 8)]
+    answered = answer(
+        "record", tmp_path / "log.mcap", "--between", begin, BASE + 9 * STEP, "--mongo", "none",
+        store=tmp_path / "other",
+    )  # fmt: skip
+    assert "8 of them latched or frames of video, from before the time range" in answered.out
+
+
+def test_a_snapshot_of_a_ring_begins_with_the_key_frame() -> None:
+    frames = encoded("h264")
+    schema = Schema("foxglove.CompressedVideo", "jsonschema", JSON)
+    channel = Channel("/cam", "json", schema, {})
+    ring = Ring(span_ns=3 * STEP, max_bytes=1 << 30)
+    for n, data in enumerate(frames[2:10], 2):
+        sent = payload("json", "h264", data)
+        ring.add(BufferedMessage(channel, sent, BASE + n * STEP, None, n))
+    assert [m.sequence for m in ring.since(BASE + 8 * STEP)] == [5, 6, 7, 8, 9]
+    assert [m.sequence for m in ring.since(BASE + 6 * STEP)] == [5, 6, 7, 8, 9]
+    ring.add(BufferedMessage(channel, b"no video", BASE + 20 * STEP, None, 20))
+    assert [m.sequence for m in ring.since(BASE + 20 * STEP)] == [5, 6, 7, 8, 9, 20]
+
+
+def test_a_playback_goes_on_from_the_key_frame(videos: hl.Store) -> None:
+    played = PlayedLog(videos.query(["/json", "/gap"], ["h264"]))
+    for n, wanted in ((7, [5, 6, 7]), (5, [5]), (COUNT - 1, [10, 11]), (COUNT + 5, [10, 11])):
+        blocks = played.current(["/json"], BASE + n * STEP)
+        times = [time for one in blocks for time in one.batch.log_time.tolist()]
+        assert times == [BASE + number * STEP for number in wanted]
 
 
 def refusal(store: hl.Store, topic: str, n: int) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.counters import Counters
-from hybridlog.query.latching import depth_of, is_video, publisher_of
+from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 
@@ -160,12 +160,10 @@ class _LatchedScan:
 
     def _last_key_frame(self, group: Sequence[RecordedChannel]) -> _Key | None:
         """The last key frame of some channels of video; None if there is none."""
-        from hybridlog.query.answers.video import has_key_frame
-
         plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
         for run in ChunkScan(plan, self._session.segment, ahead=False).runs():
             for row, index in enumerate(run.batch.channel.tolist()):
-                if has_key_frame(run.channels[index], run.batch.payload(row)):
+                if is_key_frame(run.channels[index].channel, run.batch.payload(row)):
                     return int(run.batch.log_time[row]), int(run.seq[row])
         return None
 

@@ -26,22 +26,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.message import Message, PictureOf
-    from hybridlog.query.question import RecordedChannel
     from hybridlog.session import Session
-    from hybridlog_storage.messages import Buffer
 
 _MAX_OPEN = 4
 _MAX_BYTES = 256 << 20  # between two key frames
 _MAX_LOOKED = 600
 _SIZE = 16 << 20  # of the pictures of some topics, about
-
-
-def has_key_frame(channel: RecordedChannel, payload: Buffer) -> bool:
-    """True if a message of a video topic is a key frame."""
-    try:
-        return is_key_frame(*frame_of(channel.codec.decode(memoryview(payload))))
-    except (PayloadError, DefinitionError):
-        return False
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.latching import depth_of
+from hybridlog.query.latching import depth_of, is_video
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import TimeError, TopicError
 
@@ -112,7 +112,7 @@ class PlayedLog:
             if not each.is_reduced:
                 own = each.channel
                 alike.setdefault((own.topic, own.message_encoding, own.schema), []).append(each)
-                if depth_of(own):
+                if depth_of(own) or is_video(own):
                     self._latching.add(own.topic)
         merged = []
         for number, group in enumerate(alike.values(), 1):
@@ -133,16 +133,18 @@ class PlayedLog:
     def current(self, topics: Collection[str], position: int) -> Iterator[Block]:
         """The messages of some topics that are current at a log time, ns.
 
-        They are the latched ones that a subscriber receives which joins then, and the last
-        message of every other topic. Messages from before the played range are not current,
-        unless they are latched.
+        They are the latched ones that a subscriber receives which joins then, the frames of
+        video from the last key frame on, and the last message of every other topic. Messages
+        from before the played range are not current, unless they are of the former two.
         """
         if not topics:
             return
-        if self._latching.intersection(topics) and position < self.end:
-            latched = self._whole.with_topic(*self._latching.intersection(topics))
-            for batch, channels in latched.between(position + 1, None).latched(original_times=True):
+        if found := self._latching.intersection(topics):
+            latched = self._whole.with_topic(*found).between(min(position + 1, self.end), None)
+            for batch, channels in latched.latched(original_times=True):
                 yield self._block(batch, channels)
+            if position >= self.end:
+                yield from self.after(found, self.end - 1)
         if position >= self.begin:
             for topic in topics:
                 if topic not in self._latching:
