@@ -115,14 +115,14 @@ def export_command(
             folder = is_directory(form, target) if form in _LOGS else None
             parts = pieces(opened, query, split, target, force=force, is_directory=folder)
         for path, one in parts:
+            to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
             if form in _LOGS:
                 extras = one.extras()
                 if no_attachments:
                     extras = extras._replace(attachments=[], left_out=0)
-                to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
-                _write_file(one, to, front, extras)
+                _write_file(one, to, path, front, extras)
             else:
-                _write_directory(one, form, path, front, force=force, quiet=quiet)
+                _write_directory(one, to, path, front)
             if not quiet:
                 print_remarks(one, topic, is_empty=None if form in _LOGS else False)
 
@@ -137,8 +137,7 @@ def _form(target: Path) -> str:
     return suffixes[target.suffix.lower()]
 
 
-def _write_file(query: Query, to: Destination, front: Front, extras: Extras) -> None:
-    assert to.path is not None
+def _write_file(query: Query, to: Destination, path: Path, front: Front, extras: Extras) -> None:
     with to.opened() as target:
         write_answer(
             query,
@@ -152,7 +151,7 @@ def _write_file(query: Query, to: Destination, front: Front, extras: Extras) -> 
     has_extras = to.form == "mcap" or (to.form, to.settings.get("storage")) == ("rosbag2", "mcap")
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
     beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
-    _print_written(to.path, query, 0, beside if has_extras else "", quiet=to.quiet)
+    _print_written(path, query, 0, beside if has_extras else "", quiet=to.quiet)
     if beside and not has_extras:
         output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
     if extras.left_out and has_extras:
@@ -160,19 +159,22 @@ def _write_file(query: Query, to: Destination, front: Front, extras: Extras) -> 
         output.note(f"{left_out} from behind the time range: left out.")
 
 
-def _write_directory(
-    query: Query, form: str, directory: Path, front: Front, *, force: bool, quiet: bool
-) -> None:
+def _write_directory(query: Query, to: Destination, directory: Path, front: Front) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
     from hybridlog.query.ranges import RangeResolver
 
     RangeResolver(query.session, query.question).resolve()  # refuses a range without any message
-    if directory.exists():
-        _write_files(query, form, directory, front, force=force, quiet=quiet)
+    if directory.is_dir():
+        _write_files(query, to, directory, front)
         return
+    if directory.exists():
+        raise UsageError(f"{directory} is a file; name another path for the directory.")
     with undone(partial(_remove_empty, directory)):
-        _make(directory)
-        _write_files(query, form, directory, front, force=force, quiet=quiet)
+        try:
+            directory.mkdir(parents=True)
+        except OSError as error:
+            raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
+        _write_files(query, to, directory, front)
 
 
 def _remove_empty(directory: Path) -> None:
@@ -180,27 +182,25 @@ def _remove_empty(directory: Path) -> None:
         directory.rmdir()
 
 
-def _write_files(
-    query: Query, form: str, directory: Path, front: Front, *, force: bool, quiet: bool
-) -> None:
-    suffix, topics = OUTPUTS[form].suffixes[0], [*query.topics]
-    if OUTPUTS[form].content == "video":
+def _write_files(query: Query, to: Destination, directory: Path, front: Front) -> None:
+    suffix, topics = OUTPUTS[to.form].suffixes[0], [*query.topics]
+    if OUTPUTS[to.form].content == "video":
         topics = _image_topics(query)
     paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
     for path in paths.values():
-        check_room(path, force=force)
+        check_room(path, force=to.force)
     left_out: list[HybridlogError] = []
     for topic, path in paths.items():
         one = query.with_topic(topic)
         try:
             with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
-                missing = write_answer(one, form, path, front=front, quiet=quiet)
-        except (DefinitionError, PayloadError, TimeError) as error:
-            what = "" if isinstance(error, DefinitionError) else f"{topic}: "
-            output.note(f"{what}{error}")
+                missing = write_answer(one, to.form, path, front=front, quiet=to.quiet)
+        except (DefinitionError, PayloadError, TimeError, UsageError) as error:
+            is_named = isinstance(error, DefinitionError) or topic in str(error)
+            output.note(f"{'' if is_named else f'{topic}: '}{error}")
             left_out.append(error)
             continue
-        _print_written(path, one, missing, quiet=quiet)
+        _print_written(path, one, missing, quiet=to.quiet)
         query.counters.reduced += one.counters.reduced
     if len(left_out) == len(paths):
         raise left_out[0]
@@ -219,18 +219,6 @@ def _image_topics(query: Query) -> list[str]:
     if not found.intersection(query.topics):
         raise UsageError("There is no topic of images or of video.")
     return [topic for topic in query.topics if topic in found]
-
-
-def _make(directory: Path) -> None:
-    """Make a directory for tables, if it is not there."""
-    if directory.is_dir():
-        return
-    if directory.exists():
-        raise UsageError(f"{directory} is a file; tables go into a directory: name another path.")
-    try:
-        directory.mkdir(parents=True)
-    except OSError as error:
-        raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
 
 
 def _print_written(

@@ -135,7 +135,7 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
     "geojson": OutputFormat(
         "table", "hybridlog.formats.places:GeoJsonWriter", (".geojson",), is_text=True
     ),
-    "ply": OutputFormat("payloads", "hybridlog.formats.ply:open_ply_writer", ()),
+    "ply": OutputFormat("payloads", "hybridlog.formats.ply:PlyWriter", ()),
     "raw": OutputFormat("payloads", "hybridlog.formats.raw:open_raw_writer", ()),
     "png": OutputFormat("pictures", "hybridlog.formats.pictures:open_png_writer", (".png",)),
     "jpg": OutputFormat(

@@ -20,7 +20,7 @@ from hybridlog.arrays import is_video_type
 from hybridlog.arrays.bitstream import frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder, pyav
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.formats.writing import FileWriter, Sink, Target, failures
+from hybridlog.formats.writing import FileWriter, Sink, Target, failures, path_of
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
 
@@ -58,9 +58,7 @@ class Mp4Writer(FileWriter):
     def __init__(self, target: Target) -> None:
         super().__init__()
         self._av = pyav()
-        if not isinstance(target, str | os.PathLike):
-            raise UsageError("mp4 is no stream: name a file with -o.")
-        self._sink = _SeekableSink(target)
+        self._sink = _SeekableSink(path_of(target, "mp4", "a file"))
         self._file: Any = self._av.open(
             self._sink,
             "w",

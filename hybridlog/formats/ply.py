@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
@@ -12,6 +11,7 @@ import numpy as np
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.arrays.point_arrays import point_columns, positions
 from hybridlog.formats.raw import DirectoryWriter
+from hybridlog.formats.writing import path_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import UsageError
 
@@ -36,22 +36,18 @@ _TYPES: Final = {
 _NO_WORD: Final = re.compile(r"\W", re.ASCII)
 
 
-def open_ply_writer(target: Target) -> PlyWriter:
-    """Open a writer of a directory.
+class PlyWriter(DirectoryWriter):
+    """Writes a directory with a PLY file a message.
+
+    Args:
+        target: The directory.
 
     Raises:
-        UsageError: The target is a stream.
+        UsageError: The target is a stream, not empty, or cannot be written.
     """
-    if isinstance(target, str | os.PathLike):
-        return PlyWriter(target)
-    raise UsageError("ply makes a file a message: name a directory with -o.")
 
-
-class PlyWriter(DirectoryWriter):
-    """Writes a directory with a PLY file a message."""
-
-    def __init__(self, target: str | os.PathLike[str]) -> None:
-        super().__init__(target)
+    def __init__(self, target: Target) -> None:
+        super().__init__(path_of(target, "ply", "a directory"))
         self._codecs: dict[Channel, Codec] = {}
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:

@@ -282,6 +282,22 @@ class Sink:
             self._unfinished.remove()
 
 
+def path_of(target: Target, form: str, name: str) -> str | os.PathLike[str]:
+    """The path of a format that is no stream.
+
+    Args:
+        target: As given.
+        form: The format.
+        name: What is to be named.
+
+    Raises:
+        UsageError: It is a stream.
+    """
+    if isinstance(target, str | os.PathLike):
+        return target
+    raise UsageError(f"{form} is no stream: name {name} with -o.")
+
+
 def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
     """The path to write, with links resolved, and whether a rename can replace it.
 

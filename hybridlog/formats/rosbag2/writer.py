@@ -15,7 +15,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hybridlog.formats.mcap.writer import McapWriter
 from hybridlog.formats.rosbag2.directory import NAME
-from hybridlog.formats.writing import FileWriter, Target, failures, new_directory
+from hybridlog.formats.writing import FileWriter, Target, failures, new_directory, path_of
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog.schema.completion import with_nested
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
@@ -113,12 +113,11 @@ class Rosbag2Writer(FileWriter):
     def __init__(self, target: Target, *, storage: str = "mcap", max_file: int = MAX_FILE) -> None:
         super().__init__()
         self._storage = storage
-        if not isinstance(target, str | os.PathLike):
-            raise UsageError("rosbag2 makes a directory: name one with -o.")
-        self._name = os.fspath(target)
+        path = path_of(target, "rosbag2", "a directory")
+        self._name = os.fspath(path)
         self._max_file = max_file
         with failures(self._name):
-            self._final, self._unfinished = new_directory(target, "a bag of ROS 2 is a directory")
+            self._final, self._unfinished = new_directory(path, "a bag of ROS 2 is a directory")
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._known: dict[Channel, _Topic] = {}
         self._files: dict[str, _Span] = {}

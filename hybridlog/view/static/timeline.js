@@ -291,6 +291,7 @@ export function mountTimeline(parent, recording) {
     for (const mark of marks) {
       flag(context, toX(mark.at));
       context.fillRect(toX(mark.at), AXIS - 3, toX(mark.end) - toX(mark.at), 3);
+      if (mark.end > mark.at) context.fillRect(toX(mark.end) - 1, AXIS - 8, 2, 8);
     }
     context.fillStyle = paints.text;
     for (const { ticks } of overlays.all()) {
