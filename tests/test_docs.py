@@ -1148,3 +1148,52 @@ def test_the_specification_names_what_there_is() -> None:
         assert f"`{name}`" in text
     for name in (CATALOG, directory.LOCK, journal.JOURNAL, directory.REMOVED, directory.IMPORTING):
         assert name in sections(DOCS / "format.md", 2)["Directory"]
+
+
+# --- the robot ------------------------------------------------------------------------
+
+
+def test_the_unit_for_systemd_starts_a_recorder() -> None:
+    from hybridlog.cli.live_options import recorder_options
+    from hybridlog.cli.record import record_command
+    from hybridlog.cli.record_choices import RecordChoices, check_choices
+
+    (unit,) = (fence for fence in fences(DOCS / "robot.md") if fence.language == "ini")
+    settings = dict(line.split("=", 1) for line in unit.lines if "=" in line)
+    program, command, *arguments = settings["ExecStart"].split()
+    assert (Path(program).name, command) == ("hybridlog", "record")
+    with record_command.make_context("record", arguments) as context:
+        choices = RecordChoices(**context.params, live_options=())
+    check_choices(choices)
+    assert recorder_options(choices).settings.segment_span_s == 60
+    # It says that it is ready, and can be stopped while its own MongoDB still runs.
+    assert (settings["Type"], settings["KillMode"]) == ("notify", "mixed")
+    assert int(settings["WatchdogSec"]) > 10
+
+
+WITHOUT_NETWORK = """
+import sys
+from importlib import import_module
+
+def audit(event, arguments):
+    if event in {"socket.connect", "socket.getaddrinfo", "socket.gethostbyname"}:
+        if event != "socket.connect" or isinstance(arguments[1], tuple):
+            print("network:", event, arguments, file=sys.stderr)
+
+sys.addaudithook(audit)
+import_module("hybridlog.cli.main").main()
+"""
+
+
+@pytest.mark.parametrize("mongo", ["none", "embedded"])
+def test_a_recorder_needs_no_network(mongo: str, tmp_path: Path, demo_bag: Path) -> None:
+    arguments = ["--replay", demo_bag, "--speed", 60, "--reserve", 0, "--mongo", mongo]
+    program = [sys.executable, "-c", WITHOUT_NETWORK, "record", "--store", tmp_path / "store"]
+    done = subprocess.run(
+        [str(word) for word in (*program, *arguments)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "network" not in done.stderr
+    assert re.search(r"(?m)^messages +(\d+) of \1 received$", done.stdout)

@@ -18,7 +18,7 @@ from benchmarks.live.master import Master
 from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
 from benchmarks.live.talker import Data, Load
 from benchmarks.side import SideError
-from benchmarks.usage import machine, rss, with_children, working_below
+from benchmarks.usage import cpu_s, machine, rss, with_children, working_below
 
 _FLUSH_S = 1.0
 """The recorder's own interval between flushes, as it is by default."""
@@ -211,15 +211,36 @@ def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int
 
 def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     """Resident memory over a long run of what can be compressed: no disk is that large."""
-    seconds = 20.0 if quick else 600.0
-    load = Load(20, 100_000, 100, seconds, period=4096)
+    load = Load(20, 100_000, 100, 20.0 if quick else 600.0, period=4096)
+    yield _watched("memory", "hybridlog", load, work)
+
+
+def _robot(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
+    """Memory and processor time at the rate of a robot, without and with MongoDB.
+
+    The budget is that of a machine with 2 GiB of memory.
+    """
+    load = Load(20, 50_000, 50, 10.0 if quick else 60.0)
+    for mongo, recorder in (("none", "hybridlog --mongo none"), ("embedded", "hybridlog")):
+        row = _watched("robot", recorder, load, work, "--mongo", mongo, "--budget", "128MiB")
+        per_gb = row.values["cpu_s"] / (load.megabytes_per_s * load.seconds / 1000)
+        values = {**row.values, "cpu_s_per_gb": round(per_gb, 2)}
+        yield row._replace(
+            values=values, text=f"{per_gb:.1f} s of processor time a gigabyte; {row.text}"
+        )
+
+
+def _watched(case: str, name: str, load: Load, work: Path, *options: str) -> Row:
+    """A load to ours alone, and its memory meanwhile."""
+    seconds = load.seconds
     recorder: list[int] = []
     database: list[int] = []
+    servers: set[int] = set()
     with (
         _clean(work),
         Master() as master,
         _steal() as stolen,
-        closing(Ours(work / "store", master.uri)) as running,
+        closing(Ours(work / "store", master.uri, *options)) as running,
     ):
         with speech(load, master.uri) as talker:
             talker.began()
@@ -227,17 +248,19 @@ def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
             while time.monotonic() - begin < seconds - 1:
                 time.sleep(1)
                 recorder.append(rss(with_children([running.process.pid])))
-                servers = working_below(work / "store", "mongod")
-                database.append(rss(with_children(servers)))
+                servers = with_children(working_below(work / "store", "mongod"))
+                database.append(rss(servers))
             did = talker.ended()
+        database_s = cpu_s(servers)
         kept = running.stop()
-    row = _row("memory", "hybridlog", _Recorded(load, did, kept, stolen[0]))
+    row = _row(case, name, _Recorded(load, did, kept, stolen[0]))
     fifth = max(len(recorder) // 5, 1)
     early, late = (
         statistics.median(part) / 1e6 for part in (recorder[fifth : 2 * fifth], recorder[-fifth:])
     )
     values = {
         **row.values,
+        "cpu_s": round(kept.cpu_s + database_s, 1),
         "seconds": seconds,
         "rss_mb_early": round(early),
         "rss_mb_late": round(late),
@@ -248,7 +271,7 @@ def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
         f"{load.megabytes_per_s:.0f} MB/s for {seconds:.0f} s: {early:.0f} MB in the second "
         f"fifth, {late:.0f} MB in the last, {values['rss_mb_peak']} MB at most; {row.text}"
     )
-    yield Row("memory", "hybridlog", values, text, row.holds and late < 1.1 * early + 20)
+    return Row(case, name, values, text, row.holds and late < 1.1 * early + 20)
 
 
 @contextmanager
@@ -292,4 +315,5 @@ CASES: dict[str, Case] = {
     "database": Case("mongod halted, and killed", _stopped_database),
     "kills": Case("kill -9 at 50 random moments under 80 MB/s", _kills),
     "memory": Case("ten minutes at 200 MB/s", _memory),
+    "robot": Case("a minute at 50 MB/s, --budget 128MiB, without and with MongoDB", _robot),
 }

@@ -72,6 +72,7 @@ class Ours:
 
     def __init__(self, store: Path, master: str, *more: str) -> None:
         self._store = store
+        self._is_indexed = "none" not in more
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed by close()
         command = [sys.executable, "-m", "hybridlog", "record", "--ros1", "--json"]
         self.process = subprocess.Popen(
@@ -101,7 +102,7 @@ class Ours:
             recording["messages"],
             sum(causes.values()) - reduced,
             reduced,
-            recording["messages_indexed"],
+            recording["messages_indexed"] if self._is_indexed else None,
             causes,
             used,
         )

@@ -161,7 +161,7 @@ def _print(found: Sequence[TopicCheck]) -> None:
     if len({one.recording for one in found}) == 1:
         del columns[0]
         rows = [row[1:] for row in rows]
-    output.print_table(columns, rows)
+    output.print_table(*output.fitted(columns, rows, ("early", "late", "from", "jitter", "Hz")))
 
 
 def _cells(one: TopicCheck) -> list[str]:

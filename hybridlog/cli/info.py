@@ -289,7 +289,7 @@ def _print_recording(
                 ]
                 columns.insert(-1, (_OVER_TIME, "whole"))
                 break
-    output.print_table(columns, cells)
+    output.print_table(*output.fitted(columns, cells, ("log - header",)))
 
 
 def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:

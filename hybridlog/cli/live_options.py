@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
 from hybridlog.cli.options import parse_tags
-from hybridlog.cli.record_choices import RecordChoices, segment_settings
+from hybridlog.cli.record_choices import DEFAULT_CHUNK, RecordChoices, segment_settings
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.base import LiveSource
 
 _MIN_SEGMENT: Final = 1 << 20
+_MIN_CHUNK: Final = 1 << 19
 _MAX_FLUSH_S: Final = 3600.0
 _MAX_RING_S: Final = 86_400.0
 
@@ -34,8 +35,15 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher
 
+    budget_bytes = (
+        default_budget()
+        if choices.budget is None
+        else _size("--budget", choices.budget, MIN_USER_BUDGET)
+    )
+    # Each topic of large messages has an open chunk, and all of them are to fit.
+    chunk_size = min(max(budget_bytes >> 8, _MIN_CHUNK), DEFAULT_CHUNK)
     settings = replace(
-        segment_settings(choices),
+        segment_settings(choices, chunk_size),
         segment_size=_size("--split-size", choices.split_size, _MIN_SEGMENT),
         segment_span_s=_seconds(choices.split_duration),
     )
@@ -54,9 +62,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         max_messages=choices.max_messages,
         max_bytes=None if choices.max_size is None else _size("--max-size", choices.max_size, 1),
         reserve_bytes=_size("--reserve", choices.reserve),
-        budget_bytes=default_budget()
-        if choices.budget is None
-        else _size("--budget", choices.budget, MIN_USER_BUDGET),
+        budget_bytes=budget_bytes,
         flush_interval_s=flush_interval_s,
         settings=settings,
         snapshots=_snapshots(choices),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog.cli import output
@@ -29,6 +31,8 @@ _SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 class LiveTable:
     """The table; a context manager that removes it at the end.
 
+    Of a table of the same size only what has changed is drawn: the line may be slow.
+
     Args:
         error: Draw it on standard error, else on standard output.
     """
@@ -39,6 +43,8 @@ class LiveTable:
         self._live = Live(
             console=output.console(error=error), auto_refresh=False, transient=True, screen=False
         )
+        self._lines: list[str] = []
+        self._width = 0
 
     def __enter__(self) -> Self:
         """Begin to draw."""
@@ -62,9 +68,40 @@ class LiveTable:
 
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
         """Draw a state, with lines below it."""
+        from rich.console import Console
+
         console = self._live.console
-        found = drawn(state, width=console.width, height=console.height - 1, below=below)
-        self._live.update(found, refresh=True)
+        width, before = console.width, self._lines
+        found = drawn(state, width=width, height=console.height - 1, below=below)
+        text = io.StringIO()
+        system: Any = console.color_system
+        Console(file=text, force_terminal=True, color_system=system, width=width).print(found)
+        self._lines = [line.rstrip() for line in text.getvalue().splitlines()]
+        self._live.update(found)  # what others print is above it
+        if len(before) != len(self._lines) or width != self._width:
+            self._live.refresh()
+        else:
+            console.file.write(changes(before, self._lines))
+            console.file.flush()
+        self._width = width
+
+
+def changes(before: Sequence[str], after: Sequence[str]) -> str:
+    """What turns the lines of a terminal into others, for a cursor on the last of them.
+
+    Args:
+        before: The lines on the terminal.
+        after: As many others.
+    """
+    text = ""
+    for up, (old, new) in enumerate(zip(reversed(before), reversed(after), strict=True)):
+        if old == new:
+            continue
+        pairs = zip(old, new, strict=False)
+        kept = len([*takewhile(lambda pair: pair[0] == pair[1] and " " <= pair[0] <= "~", pairs)])
+        text += (f"\x1b[{up}A" if up else "") + "\r" + (f"\x1b[{kept}C" if kept else "")
+        text += f"{new[kept:]}\x1b[K" + (f"\x1b[{up}B" if up else "")
+    return text
 
 
 def drawn(
@@ -95,7 +132,7 @@ def drawn(
     shown = {topic.topic for topic in topics}
     topics = [topic for topic in state.topics if topic.topic in shown]
     columns, room = _columns(topics, width)
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = Table(box=None, pad_edge=False, header_style="")  # few bytes, over a slow line
     table.add_column("topic", no_wrap=True)
     for heading in columns:
         table.add_column(heading, justify="right", no_wrap=True)
@@ -176,12 +213,12 @@ def _cells(topic: TopicState) -> list[Text]:
     slow = topic.expected_hz is not None and topic.hz < _SLOW * topic.expected_hz
     return [
         Text(f"{topic.hz:.1f}", style="yellow" if slow else ""),
-        Text("" if topic.expected_hz is None else f"{topic.expected_hz:.1f}", style="dim"),
+        Text("" if topic.expected_hz is None else f"{topic.expected_hz:.1f}"),
         Text(f"{topic.bytes_per_s / 1e6:.2f}"),
         Text("" if topic.jitter_ms is None else f"{topic.jitter_ms:.1f}"),
         Text(str(topic.messages)),
-        Text(str(topic.thinned) if topic.thinned else "", style="dim"),
-        Text(str(topic.lost) if topic.lost else "", style="red"),
+        Text(str(topic.thinned), style="dim") if topic.thinned else Text(),
+        Text(str(topic.lost), style="red") if topic.lost else Text(),
     ]
 
 

@@ -46,13 +46,13 @@ def _print(recordings: Sequence[RecordingSummary]) -> None:
         ("recording", "left"),
         ("start", "whole"),
         ("duration", "right"),
+        ("topics", "right"),
         ("messages", "right"),
+        ("stored", "right"),
         ("note", "left"),
     ]
-    if not narrow:
-        columns.insert(3, ("topics", "right"))
-        columns.insert(5, ("stored", "right"))
-    output.print_pages(columns, [_row(entry, narrow=narrow) for entry in recordings])
+    rows = [_row(entry, narrow=narrow) for entry in recordings]
+    output.print_pages(*output.fitted(columns, rows, ("topics", "stored")))
 
 
 def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
@@ -62,17 +62,15 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
     start = output.short_time(span[0], minutes=narrow) if span else "-"
-    cells = [
+    return [
         entry.label,
         start,
         output.short_duration(span[1] - span[0]) if span else "-",
+        str(entry.topic_count),
         str(entry.messages),
+        output.size(entry.stored_bytes),
         ", ".join(notes),
     ]
-    if not narrow:
-        cells.insert(3, str(entry.topic_count))
-        cells.insert(5, output.size(entry.stored_bytes))
-    return cells
 
 
 @click.command()

@@ -133,6 +133,25 @@ def fits(names: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
     return not sys.stdout.isatty() or room(names, rows) >= 0
 
 
+def fitted(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], spare: Sequence[str]
+) -> tuple[Sequence[Column], Sequence[Sequence[str]]]:
+    """A table without its less important columns, where the terminal has no room for them.
+
+    Args:
+        columns: Headings, and the side on which the cells stand.
+        rows: Cells.
+        spare: Headings of columns that may be left out, the least important first.
+    """
+    for name in spare:
+        headings = [heading for heading, _ in columns]
+        if fits(headings, rows):
+            break
+        kept = [n for n, heading in enumerate(headings) if heading != name]
+        columns, rows = [columns[n] for n in kept], [[row[n] for n in kept] for row in rows]
+    return columns, rows
+
+
 def room(names: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     """Columns of the terminal that a table leaves.
 

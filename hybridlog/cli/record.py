@@ -98,9 +98,9 @@ def _is_file(word: str) -> bool:
 )
 @click.option(
     "--chunk-size",
-    default="2MiB",
     metavar="SIZE",
-    help="Uncompressed size of a chunk, such as 512KiB.",
+    help="Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
+    "small.",
 )
 @click.option(
     "--compression",

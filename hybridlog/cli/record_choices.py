@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from hybridlog.cli import output
 from hybridlog.cli.open_store import opened_store
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from hybridlog.store import Store
     from hybridlog_storage.segments.segment_writer import SegmentSettings
+
+DEFAULT_CHUNK: Final = 2 << 20
+"""Bytes of a chunk."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +43,7 @@ class RecordChoices:
     again: bool
     watch: bool
     settle: str
-    chunk_size: str
+    chunk_size: str | None
     compression: str
     level: int
     ros1: bool
@@ -150,8 +153,12 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def segment_settings(choices: RecordChoices) -> SegmentSettings:
+def segment_settings(choices: RecordChoices, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
     """Chunks and compression.
+
+    Args:
+        choices: The parameters.
+        chunk_size: Bytes of a chunk if the user does not say.
 
     Raises:
         UsageError: The chunk size is no size.
@@ -159,7 +166,9 @@ def segment_settings(choices: RecordChoices) -> SegmentSettings:
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     return SegmentSettings(
-        chunk_size=output.parse_size(choices.chunk_size),
+        chunk_size=chunk_size
+        if choices.chunk_size is None
+        else output.parse_size(choices.chunk_size),
         compression=cast(Any, choices.compression),
         level=choices.level,
     )

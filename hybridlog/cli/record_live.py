@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 from hybridlog.cli import output
 from hybridlog.cli.live_options import recorder_options, sources_of
 from hybridlog.cli.live_summary import LiveSummary
-from hybridlog.cli.live_table import LiveTable, in_short
+from hybridlog.cli.live_table import LiveTable, in_short, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.record_choices import opened_to_record
+from hybridlog.cli.service import notify_service
 from hybridlog.cli.signals import SIGNALS, write_note
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import Flag
@@ -66,6 +67,7 @@ def _record(choices: RecordChoices) -> None:
             recovery = _begin_recovery(choices, store)
             with display.table(), _snapshot_on_signal(recorder, options):
                 last = _watch(recorder, stop, display)
+            notify_service("STOPPING=1", "STATUS=writing what is left")
             if quiet:
                 reports = recorder.stop()
             else:
@@ -74,12 +76,12 @@ def _record(choices: RecordChoices) -> None:
                     reports = recorder.stop()
             if not stop.is_set:
                 recovery.join()
-        summary = LiveSummary(reports, recorder, sources, options)
+        ending = LiveSummary(reports, recorder, sources, options)
         if options.contract is not None:
             labels = [report.entry.label for report in reports]
             results = [one for label in labels for one in store.judge(options.contract, label)]
-            summary.add_verdict(results)
-        summary.print_and_exit(as_json=choices.as_json, quiet=quiet)
+            ending.add_verdict(results)
+        ending.print_and_exit(as_json=choices.as_json, quiet=quiet)
 
 
 def _begin_recovery(choices: RecordChoices, store: Store) -> threading.Thread:
@@ -195,7 +197,12 @@ class _Display:
             output.note(f"hybridlog: {text}")
 
     def state(self, state: RecorderState) -> None:
-        """Show the state, about once a second."""
+        """Show the state, about once a second.
+
+        The watchdog of a service hears of it while what is received is written, too.
+        """
+        told = ["READY=1", f"STATUS={output.printable(summary(state))}"]
+        notify_service(*told, *(["WATCHDOG=1"] if state.stalled_s == 0 else ()))
         if self._table is not None:
             self._table.show(state)
         elif self._as_json:

@@ -63,6 +63,7 @@ _MAX_EXPECTED = 1000  # channels that get a collection before their first messag
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0
+_SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +137,8 @@ class RecorderState:
         index_failure: The error that stopped the index; empty while it works.
         free_bytes: Free space of the disk.
         stored_bytes: Payload bytes stored so far.
+        stalled_s: Seconds for which received messages have waited for longer than the flush
+            interval, and nothing was written; 0 while writing goes on.
         snapshots: Snapshots so far; None when everything is stored.
         ring_s: Seconds that the ring holds; None when everything is stored.
         taken: Messages that are stored or will be, by topic, when the state is requested.
@@ -157,6 +160,7 @@ class RecorderState:
     index_failure: str
     free_bytes: int
     stored_bytes: int
+    stalled_s: float = 0.0
     snapshots: int | None = None
     ring_s: float | None = None
     taken: Mapping[str, int] = field(default_factory=dict)
@@ -230,7 +234,8 @@ class Recorder:
         self._refused: tuple[Cause, str] | None = None
         self._marks = mark_channel()
         self._started = time.monotonic()
-        self._looked = self._started
+        self._looked = self._written_at = self._started
+        self._written = 0
         self._lateness = Lateness(indexed_within_s(options.flush_interval_s))
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
@@ -419,6 +424,7 @@ class Recorder:
             "" if failure is None else str(failure),
             shutil.disk_usage(self._store_path).free,
             stored_bytes,
+            self._stalled_s(now),
             snapshots=None if ring is None else ring.count,
             ring_s=None if ring is None else ring.held_s,
             silent=() if self._silence is None else self._silence.silent,
@@ -429,6 +435,13 @@ class Recorder:
         self._check_limits(state)
         self._state = state
         return state
+
+    def _stalled_s(self, now: float) -> float:
+        taken, written = self._target.progress
+        if taken <= written or written != self._written:
+            self._written, self._written_at = written, now
+        waited = now - self._written_at - self._options.flush_interval_s
+        return waited if waited > _SLOW_WRITE_S else 0.0
 
     def mark(
         self,

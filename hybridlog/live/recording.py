@@ -330,6 +330,11 @@ class LiveRecording:
         return totals.messages, totals.payload_bytes
 
     @property
+    def progress(self) -> tuple[int, int]:
+        """Messages taken, and those of them that are written to the disk."""
+        return sum(self._taken), self._capture.writer.written.total()
+
+    @property
     def is_empty(self) -> bool:
         """True if it has taken no message."""
         return not any(self._taken)

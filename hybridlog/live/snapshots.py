@@ -294,6 +294,12 @@ class Snapshots:
         return self._stored[0] + messages, self._stored[1] + size
 
     @property
+    def progress(self) -> tuple[int, int]:
+        """Messages of the snapshot that are taken, and those that are written."""
+        active = self._active
+        return (0, 0) if active is None else active.progress
+
+    @property
     def lag(self) -> int:
         """Messages of the snapshot that are not indexed yet."""
         active = self._active

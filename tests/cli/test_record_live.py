@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -21,11 +22,13 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.writer import Writer
 from rich.console import Console
 
 from hybridlog.cli.app import app
-from hybridlog.cli.live_table import closing_rows, drawn, summary
+from hybridlog.cli.live_table import changes, closing_rows, drawn, summary
 from hybridlog.live.recorder import RecorderState
 from hybridlog.live.statistics import TopicState
 from hybridlog.record.recorder import RecordReport
@@ -46,7 +49,7 @@ uint32 nanosec
 
 @contextmanager
 def recorder(
-    store: Path, *arguments: object, program: Sequence[str] = COMMAND
+    store: Path, *arguments: object, program: Sequence[str] = COMMAND, **variables: str
 ) -> Iterator[subprocess.Popen[str]]:
     """A recorder that says on standard output, in JSON, how it is doing."""
     process = subprocess.Popen(
@@ -65,7 +68,7 @@ def recorder(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment(),
+        env=environment(**variables),
     )
     try:
         yield process
@@ -129,6 +132,28 @@ def test_ctrl_c_ends_it_with_everything_stored(logs: Path, tmp_path: Path) -> No
     assert recording["messages"] == report["messages_received"] > 0
     assert recording["messages_indexed"] == recording["messages"]
     assert run("verify", store=store).code == 0
+
+
+@pytest.mark.parametrize("is_abstract", [False, True])
+def test_a_service_manager_hears_of_it(logs: Path, tmp_path: Path, is_abstract: bool) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        name = f"{tmp_path.name}-notify" if is_abstract else str(tmp_path / "notify")
+        manager.bind(f"\0{name}" if is_abstract else name)
+        manager.settimeout(60)
+        variables = {"NOTIFY_SOCKET": f"@{name}" if is_abstract else name}
+        with recorder(
+            tmp_path / "store", "--replay", logs / "robot.bag", "--mongo", "none", **variables
+        ) as process:
+            heard = [manager.recv(4096).decode().splitlines() for _ in range(3)]
+            report = end(process, signal.SIGTERM)
+            while "STOPPING=1" not in heard[-1]:
+                heard.append(manager.recv(4096).decode().splitlines())
+    *running, last = heard
+    assert last == ["STOPPING=1", "STATUS=writing what is left"]
+    for ready, status, watchdog in running:
+        assert (ready, watchdog) == ("READY=1", "WATCHDOG=1")
+        assert re.fullmatch(r"STATUS=\d+ s · \d+ messages/s · .* free", status)
+    assert report["exit_code"] == 0
 
 
 def named(row: str, cell: int) -> set[str]:
@@ -490,6 +515,41 @@ def test_an_index_that_lags_says_why() -> None:
     failure = "MongoDB at localhost:1 does not answer. Is it running? See the log."
     line = summary(state_with({}, lag=238, failure=failure))
     assert "index 238 behind: MongoDB at localhost:1 does not answer ·" in line
+
+
+class Screen:
+    """A terminal that knows what the table of a recorder needs."""
+
+    def __init__(self, lines: list[str]) -> None:
+        self.lines = [[*line] for line in lines]
+        self.row, self.column = len(lines) - 1, 0
+
+    def write(self, text: str) -> None:
+        for number, move, plain in re.findall(r"\x1b\[(\d*)([ABCK])|([^\x1b])", text):
+            if move == "K":
+                del self.lines[self.row][self.column :]
+            elif move == "C":
+                self.column += int(number)
+            elif move:
+                self.row += int(number) * (1 if move == "B" else -1)
+            elif plain == "\r":
+                self.column = 0
+            else:
+                line = self.lines[self.row]
+                line[self.column : self.column + 1] = plain
+                self.column += 1
+
+
+@given(st.lists(st.tuples(*[st.text("ab é", max_size=6)] * 2), min_size=1))
+def test_only_what_has_changed_is_drawn(lines: list[tuple[str, str]]) -> None:
+    before, after = ([*one] for one in zip(*lines, strict=True))
+    screen = Screen(before)
+    screen.write(changes(before, after))
+    assert ["".join(line) for line in screen.lines] == after
+    assert screen.row == len(lines) - 1
+    assert changes(after, after) == ""
+    long = "/camera/front/image_raw" * 3
+    assert len(changes([f"{long} 10.0  3"], [f"{long} 10.0  4"])) < 12
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from .running import COMMAND, environment, open_bytes, recordings
+from .running import COMMAND, environment, open_bytes, recordings, run
 
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\x1b[()][A-Z0-9]")
 
@@ -112,7 +112,7 @@ def test_no_bar_elsewhere_or_when_quiet(logs: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 160])
 def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
-    for command in (("ls",), ("info", "odd"), ("schema", "scan")):
+    for command in (("ls",), ("info", "odd"), ("schema", "scan"), ("check", "-r", "odd")):
         code, shown = on_terminal(*command, "--store", store, width=width)
         assert code == 0
         table = plain(shown)
@@ -121,6 +121,18 @@ def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
         assert max(map(len, rows.splitlines())) <= width
         assert "\x1b[31m" not in shown
         assert "\x07" not in shown
+
+
+def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
+    topics = {one["topic"] for one in run("check", "-r", "robot", "--json", store=store).json}
+    for command in (("info", "robot"), ("check", "-r", "robot")):
+        code, shown = on_terminal(*command, "--store", store, width=80)
+        assert code == 0
+        assert {*re.findall(r"(?m)^(/\S+)  ", plain(shown))} == topics
+        assert max(map(len, plain(shown).splitlines())) <= 80
+    code, shown = on_terminal("ls", "--store", store, width=80)
+    labels = [line.split()[0] for line in plain(shown).splitlines()[1:]]
+    assert {*labels} == {"robot", "odd", "torn"}
 
 
 def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None:

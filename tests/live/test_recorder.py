@@ -406,6 +406,48 @@ def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
     robot.recorder.stop()
 
 
+@pytest.mark.parametrize("place", ["before the chunks", "before the disk"])
+def test_a_recorder_that_writes_nothing_is_stalled(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.setattr(recorder_module, "_SLOW_WRITE_S", 0.1)
+    robot = Running(store, RecorderOptions(reserve_bytes=0, flush_interval_s=0.05))
+    wait_for(lambda: not robot.recorder.look().stalled_s)
+    blocked = threading.Event()
+    owner, name = LiveRecording, "_append_batch"
+    if place == "before the disk":
+        owner, name = append_file.AppendFile, "append"
+    work = getattr(owner, name)
+
+    def slow(*arguments: object) -> object:
+        blocked.wait()
+        return work(*arguments)
+
+    monkeypatch.setattr(owner, name, slow)
+    for number in range(30):
+        robot.speaker.say(text_channel(), text(str(number)))
+    wait_for(lambda: robot.recorder.look().stalled_s)
+    blocked.set()
+    wait_for(lambda: not robot.recorder.look().stalled_s)
+    robot.recorder.stop()
+    assert store.topic("/chatter").count() == 30
+
+
+@pytest.mark.parametrize(
+    ("arguments", "size"),
+    [
+        (["--budget", "1GiB"], 2 << 20),
+        (["--budget", "256MiB"], 1 << 20),
+        (["--budget", "4MiB"], 512 << 10),
+        (["--budget", "4MiB", "--chunk-size", "4MiB"], 4 << 20),
+    ],
+)
+def test_a_small_budget_has_small_chunks(arguments: list[str], size: int) -> None:
+    with record_command.make_context("record", ["--ros2", *arguments]) as context:
+        choices = RecordChoices(**context.params, live_options=())
+    assert recorder_options(choices).settings.chunk_size == size
+
+
 def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     def fail(_: object) -> None:
         raise SourceError("no such robot")
