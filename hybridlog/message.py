@@ -10,6 +10,7 @@ import numpy as np
 from hybridlog.query.times import format_time
 from hybridlog.schema.codec import one_message
 from hybridlog.schema.column import Records
+from hybridlog.schema.states import State
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
@@ -38,12 +39,13 @@ class Message:
         sequence: The sender's sequence number, 0 if unknown.
         seq: Arrival number in its recording.
         recording: Id of its recording.
+        state: `whole`; or `reduced` or `expired`, if its payload was dropped under pressure or
+            deleted to make room.
     """
 
     __slots__ = (
         "_codec",
         "_documents",
-        "_is_reduced",
         "_picture_of",
         "_row",
         "_view",
@@ -52,6 +54,7 @@ class Message:
         "recording",
         "seq",
         "sequence",
+        "state",
         "topic",
         "type",
     )
@@ -79,7 +82,7 @@ class Message:
         self.recording = channel.recording.id
         self._view = view
         self._codec = channel.codec
-        self._is_reduced = channel.is_reduced
+        self.state = channel.state
         self._documents = documents
         self._row = row
         self._picture_of = picture_of
@@ -106,7 +109,7 @@ class Message:
         from hybridlog.drawing.pixels import thumbnail
 
         is_image = self.type.replace("/msg/", "/") in IMAGES
-        if not is_image or len(self._view) > _MAX_SHOWN or self._is_reduced:
+        if not is_image or len(self._view) > _MAX_SHOWN or self.is_reduced:
             return b""
         try:
             message = self.decode()
@@ -119,7 +122,7 @@ class Message:
         """The serialized message, byte for byte as received.
 
         Raises:
-            PayloadError: the payload was dropped under pressure.
+            PayloadError: the payload was dropped under pressure, or deleted to make room.
         """
         return bytes(self.payload)
 
@@ -132,8 +135,8 @@ class Message:
 
     @property
     def is_reduced(self) -> bool:
-        """True if the payload was dropped under pressure, and only `fields` are available."""
-        return self._is_reduced
+        """True if the payload is gone, and only `fields` are available; `state` says why."""
+        return self.state is not State.WHOLE
 
     @property
     def fields(self) -> dict[str, object]:

@@ -212,8 +212,8 @@ class Session:
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
         self._by_topic: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
-        self._segments: dict[tuple[str, int], SegmentReader] = {}
-        self._contents: dict[Path, RecordingPayloads] = {}
+        self._segments: dict[tuple[str, int, str], SegmentReader] = {}
+        self._contents: dict[tuple[Path, frozenset[tuple[str, str]]], RecordingPayloads] = {}
         self._columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._lock = threading.Lock()
@@ -1107,42 +1107,48 @@ class Session:
             SegmentError: They are missing or damaged.
         """
         place = place_of(self.chunk_table(recording, segment), chunk)
-        return self.segment(recording.id, segment).read_times(place)
+        found = self.segment(recording.id, segment).read_times(place)
+        if not found.keys() >= {*place.channels}:
+            raise StoreError(f"Payloads of {recording.label!r} were deleted meanwhile. Ask again.")
+        return found
 
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a segment of a recording, by its id. Thread safe."""
-        key = (recording, number)
         running = self._running.get(recording)
         opened = running.reader(number) if running is not None else None
         if opened is not None:
             return opened
         with self._lock:
+            # A segment with expired chunks is another file than before.
+            entry = self.entry(recording)
+            key = recording, number, entry.stored.get(str(number), "")
             reader = self._segments.get(key)
             if reader is None:
                 _make_room(self._segments)
-                label = self.entry(recording).label
+                label = entry.label
                 try:
-                    reader = self._open_segment(label, number)
+                    reader = self._open_segment(entry, label, number)
                 except SegmentError:
                     # Another process may have renamed the recording.
                     known = look_at_all(self.directory, self.catalog, self.repairs)
                     place = known.by_id.get(recording)
                     if place is None or known.summaries[place].label == label:
                         raise
-                    reader = self._open_segment(known.summaries[place].label, number)
+                    reader = self._open_segment(entry, known.summaries[place].label, number)
                 self._segments[key] = reader
             return reader
 
-    def _open_segment(self, label: str, number: int) -> SegmentReader:
+    def _open_segment(self, entry: RecordingEntry, label: str, number: int) -> SegmentReader:
         path = self.directory.recording(label)
-        return open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path))
+        return open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path, entry))
 
     def arrays(self, recording: RecordingEntry, topic: str) -> ArrayTable | None:
         """The arrays of a topic in columns; None without, or if they cannot be used."""
         from hybridlog.columns.payload_reader import ArrayTable
 
         with self._lock:
-            contents = self._contents_of(self.directory.recording(recording.label))
+            path = self.directory.recording(recording.label)
+            contents = self._contents_of(path, recording)
         try:
             readers = contents.ordered(topic)
         except StoreError:
@@ -1157,15 +1163,17 @@ class Session:
     ) -> TopicTable:
         """The fields of a topic in expired chunks, see `RecordingPayloads.expired_fields`."""
         with self._lock:
-            contents = self._contents_of(self.directory.recording(recording.label))
+            path = self.directory.recording(recording.label)
+            contents = self._contents_of(path, recording)
         return contents.expired_fields(topic, chunks, self.tables.opened)
 
-    def _contents_of(self, recording: Path) -> RecordingPayloads:
-        """The content of moved chunks, shared by the segments of a recording."""
-        found = self._contents.get(recording)
+    def _contents_of(self, path: Path, recording: RecordingEntry) -> RecordingPayloads:
+        """The content of moved chunks, shared by the segments of a recording as it is now."""
+        key = path, frozenset(recording.stored.items())
+        found = self._contents.get(key)
         if found is None:
             _make_room(self._contents)
-            found = self._contents[recording] = RecordingPayloads(recording, cache=self.cache)
+            found = self._contents[key] = RecordingPayloads(path, cache=self.cache)
         return found
 
     @lazy

@@ -475,7 +475,7 @@ def _write_pictures(
                     "is for images and compressed video, those of ROS and of Foxglove."
                 )
             if message.is_reduced:
-                query.counters.reduced += 1
+                query.counters.leave_out(1, message.state)
                 continue
             try:
                 images.write(message)

@@ -202,6 +202,7 @@ def _write_files(query: Query, to: Destination, directory: Path, front: Front) -
             continue
         _print_written(path, one, missing, quiet=to.quiet)
         query.counters.reduced += one.counters.reduced
+        query.counters.expired += one.counters.expired
     if len(left_out) == len(paths):
         raise left_out[0]
 

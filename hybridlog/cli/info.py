@@ -353,7 +353,7 @@ def _channel_row(
     video: VideoSummary | None = None,
 ) -> list[str]:
     from hybridlog.query.latching import depth_of
-    from hybridlog.schema.states import State, state_of
+    from hybridlog.schema.states import State, encoding_of, state_of
     from hybridlog_storage.messages import SUPPLIED, Channel
 
     stats = channel.stats
@@ -367,8 +367,9 @@ def _channel_row(
         notes.append(f"{stats.unreadable} unreadable")
     if stats.surplus:
         notes.append(f"{stats.surplus} with bytes left over")
-    if state_of(channel.message_encoding) is State.REDUCED:
-        notes.append("fields only")
+    state = state_of(channel.message_encoding)
+    if state is not State.WHOLE:
+        notes.append("fields only" if state is State.REDUCED else "fields only, expired")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
     if video is not None:
@@ -376,7 +377,8 @@ def _channel_row(
     skew = "-" if is_decoded else "?"
     if stats.stamped:
         skew = output.short_duration(round(stats.skew_sum / stats.stamped))
-    kind = channel.type or channel.message_encoding
+    encoding = encoding_of(channel.message_encoding, channel.metadata)
+    kind = channel.type or encoding
     cells = [
         channel.topic,
         kind.rpartition("/")[2] if short else kind,

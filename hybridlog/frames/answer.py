@@ -15,6 +15,7 @@ from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
 from hybridlog.schema.column import STAMP
+from hybridlog.schema.reduced_codec import ExpiredFields, without_lossy
 from hybridlog.schema.stamps import stamp_array
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch
@@ -216,7 +217,7 @@ class Decoder:
         """The messages of a run, by channel."""
         self.read(run.channels)
         for number, rows in rows_by_channel(run.batch.channel):
-            if self.channels[number].is_reduced and not self._takes_reduced:
+            if not self.channels[number].is_typed and not self._takes_reduced:
                 self._counters.reduced += len(rows)
             else:
                 batch = run.batch.take(rows)
@@ -227,6 +228,14 @@ class Decoder:
         where = batch.buffer, batch.offset, batch.length
         found = self.channels[number].codec.columns(*where, self._fields[number])
         self._counters.unreadable += len(batch) - len(found.rows)
+        channel, records = self.channels[number], found.records
+        if isinstance(records, ExpiredFields) and records.is_typed:
+            asked = {path.replace("[]", "") for path in self._chosen or ()}
+            summarised = {path.rpartition(".")[0] for path in asked} - asked
+            self._counters.lacking += int(records.lacking(summarised).sum())
+        elif isinstance(records, ExpiredFields):
+            found, lacking = without_lossy(found)
+            self._counters.leave_out(lacking, channel.state)
         return found
 
     def block(self, number: int, batch: Batch, seq: NDArray[np.int64], decoded: Decoded) -> Block:
@@ -242,7 +251,23 @@ class Decoder:
         own = self.own_columns(number, batch, seq, stamps)
         order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
         topic = channel.channel.topic
-        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes)
+        kept = decoded.records
+        summaries = self._summaries(kept, channel) if isinstance(kept, ExpiredFields) else {}
+        return Block(topic, batch.log_time, order, own, records, batch.payload_bytes, summaries)
+
+    def _summaries(
+        self, records: ExpiredFields, channel: RecordedChannel
+    ) -> dict[str, pa.Array[Any]]:
+        """The requested summaries of arrays of expired messages."""
+        known = {path.path: path.type for path in channel.codec.paths()}
+        asked = (path.replace("[]", "") for path in self._chosen or ())
+        found = {}
+        for path in (path for path in asked if is_summary(path, known)):
+            array, _, what = path.rpartition(".")
+            made = records.statistic(array, what)
+            if made is not None:
+                found[path] = made
+        return found
 
     def own_columns(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ class Block(NamedTuple):
         own: Built-in columns without the log time, n rows each.
         records: n rows.
         size: Bytes of their payloads.
+        summaries: Requested summaries of arrays that are not there, by path.
     """
 
     topic: str
@@ -38,6 +40,7 @@ class Block(NamedTuple):
     own: Mapping[str, pa.Array[Any]]
     records: pa.StructArray
     size: int
+    summaries: Mapping[str, pa.Array[Any]] = MappingProxyType({})
 
 
 class Named(NamedTuple):
@@ -148,7 +151,9 @@ class TableBuilder:
             topics.setdefault(block.topic, []).append(block.records)
         kinds = {topic: common_type(records) for topic, records in topics.items()}
         return [
-            with_summaries(flat(converted(block.records, kinds[block.topic])), self._fields)
+            with_summaries(
+                flat(converted(block.records, kinds[block.topic])), self._fields, block.summaries
+            )
             for block in blocks
         ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from hybridlog.schema.arrow_types import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Mapping
 
     from numpy.typing import NDArray
 
@@ -67,7 +68,9 @@ def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
 
 
 def with_summaries(
-    leaves: dict[str, pa.Array[Any]], asked: Collection[str] | None
+    leaves: dict[str, pa.Array[Any]],
+    asked: Collection[str] | None,
+    known: Mapping[str, pa.Array[Any]] = MappingProxyType({}),
 ) -> dict[str, pa.Array[Any]]:
     """The leaves with the requested summaries (`ranges.min`).
 
@@ -76,6 +79,7 @@ def with_summaries(
     Args:
         leaves: By dotted path.
         asked: Requested paths; None for all fields.
+        known: Summaries of arrays that are not there.
     """
     wanted = [path.replace("[]", "") for path in asked or ()]
     found = {}
@@ -83,7 +87,7 @@ def with_summaries(
         summary = summary_of(path)
         if summary is not None and path not in leaves:
             array = leaves.get(summary[0])
-            made = None if array is None else summary_array(array, summary[1])
+            made = None if array is None else known.get(path, summary_array(array, summary[1]))
             if made is not None:
                 found[path] = made
     if not found:

@@ -17,7 +17,6 @@ from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import below, values_array
 from hybridlog.schema.arrow_types import plain_values
-from hybridlog.schema.column import Records
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -51,12 +50,12 @@ def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[Line]
     found: list[Line | None] = [None] * len(run.batch)
     for number, rows in rows_by_channel(run.batch.channel):
         channel = decoder.channels[number]
-        if channel.is_reduced:
+        if not channel.is_typed:
             planner.counters.reduced += len(rows)
             continue
         batch, seq = run.batch.take(rows), run.seq[rows]
         decoded = decoder.decoded(number, batch)
-        if isinstance(decoded.records, Records):
+        if decoded.is_typed:
             block = decoder.block(number, batch, seq, decoded)
             made = _of_columns(block, channel.channel.topic, planner.question.fields)
         else:
@@ -73,7 +72,7 @@ def _of_columns(block: Block, topic: str, fields: Sequence[str] | None) -> Itera
     columns: dict[str, pa.Array[Any]] = {"log_time_ns": times, "topic": _repeated(topic, times)}
     own = {name: array for name, array in block.own.items() if name not in columns}
     columns |= own
-    leaves = with_summaries(flat(block.records), fields)
+    leaves = with_summaries(flat(block.records), fields, block.summaries)
     for path in _by_fields(leaves, fields):
         columns[free_name(path, columns)] = leaves[path]
     yield from json_rows(structs(columns, len(times)))

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
+from hybridlog.schema.states import State
+
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Batch
 
@@ -24,7 +26,9 @@ class Counters:
         bytes_read: Bytes read from segments and tables.
         chunks_read: Chunks read and decompressed.
         documents_read: Index documents received from MongoDB.
-        reduced: Messages left out because only their fields were recorded.
+        reduced: Messages left out because only their fields are there.
+        expired: Those of them whose payloads were deleted to make room.
+        lacking: Messages in the answer whose arrays are null, since only summaries are left.
         unreadable: Messages of the predicate's topics that do not fit their definition.
         unindexed: Messages of running recordings that the index lacks, if it has answered.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
@@ -40,6 +44,8 @@ class Counters:
     chunks_read: int = 0
     documents_read: int = 0
     reduced: int = 0
+    expired: int = 0
+    lacking: int = 0
     unreadable: int = 0
     unindexed: int = 0
     no_transform: tuple[tuple[str, int], ...] = ()
@@ -65,6 +71,12 @@ class Counters:
         """Count messages of the answer."""
         self.messages += len(batch)
         self.payload_bytes += batch.payload_bytes
+
+    def leave_out(self, messages: int, state: State) -> None:
+        """Count messages that are left out since their payloads are gone."""
+        self.reduced += messages
+        if state is State.EXPIRED:
+            self.expired += messages
 
     @contextmanager
     def timed(self) -> Iterator[None]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hybridlog.frames.names import is_summary
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.schema.codec import plain_message
+from hybridlog.schema.reduced_codec import ExpiredFields
+from hybridlog.schema.states import State
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -45,6 +49,7 @@ class MessageFilter:
         self._predicate = predicate
         self._types = types
         self._test = to_bool(predicate.root, types)
+        self._elements = _elements_of(predicate, types or {})
         self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
 
     def matches(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
@@ -55,6 +60,8 @@ class MessageFilter:
             batch: The messages.
             seq: int64[n], their arrival numbers.
         """
+        if channel.state is State.EXPIRED and channel.codec.indexed:
+            return self._of_expired(channel, batch, seq)
         if channel.is_reduced or not channel.codec.indexed:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
         from hybridlog.query.predicate.to_mask import to_mask
@@ -79,6 +86,18 @@ class MessageFilter:
             return Matches(holds, rest.unreadable)
         return Matches(holds, 0)
 
+    def _of_expired(
+        self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]
+    ) -> Matches:
+        """Decide on expired messages; not on those that lack an array that is asked for."""
+        fields = self._elements
+        decoded = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        assert isinstance(decoded.records, ExpiredFields)
+        lacking = decoded.rows[decoded.records.lacking()] if fields else decoded.rows[:0]
+        asked = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
+        found = self._one_by_one(channel, batch, seq, asked)
+        return Matches(found.holds, found.unreadable + len(lacking))
+
     def _one_by_one(
         self,
         channel: RecordedChannel,
@@ -100,6 +119,17 @@ class MessageFilter:
                 fields["_meta"] = _meta_of(channel, batch, seq, row)
             holds[row] = self._test(fields)
         return Matches(holds, unreadable)
+
+
+def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:
+    """Fields in a predicate, but for summaries of whole arrays: documents have those."""
+    found = set()
+    for condition in predicate.conditions():
+        parts = condition.field.parts
+        if not (all(isinstance(p, str) for p in parts) and is_summary(condition.field.path, types)):
+            names = takewhile(lambda part: isinstance(part, str), parts)
+            found.add(".".join(map(str, names)))
+    return found - {"_meta"}
 
 
 def _meta_of(

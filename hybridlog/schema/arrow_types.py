@@ -23,7 +23,7 @@ from hybridlog.schema.column import Scalars
 from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -478,14 +478,27 @@ def without_summaries(fields: Mapping[str, Any], kind: pa.DataType) -> dict[str,
     return found
 
 
-def lacks_arrays(fields: Mapping[str, Any], kind: pa.DataType) -> bool:
-    """True if a document has a summary for an array of a struct type, or in one."""
-    return any(_lacks(fields.get(inner.name), inner.type) for inner in kind)
+def lacks_arrays(
+    fields: Mapping[str, Any], kind: pa.DataType, but: Collection[str] = (), above: str = ""
+) -> bool:
+    """True if a document has a summary for an array of a struct type, or in one.
+
+    Args:
+        fields: The document.
+        kind: The type.
+        but: Dotted paths of arrays that may be summaries.
+        above: Path of the document, with a dot behind it.
+    """
+    return any(
+        _lacks(fields.get(inner.name), inner.type, but, f"{above}{inner.name}")
+        for inner in kind
+        if f"{above}{inner.name}" not in but
+    )
 
 
-def _lacks(value: Any, kind: pa.DataType) -> bool:
+def _lacks(value: Any, kind: pa.DataType, but: Collection[str] = (), path: str = "") -> bool:
     if _types.is_struct(kind):
-        return isinstance(value, dict) and lacks_arrays(value, kind)
+        return isinstance(value, dict) and lacks_arrays(value, kind, but, f"{path}.")
     if not is_array(kind):
         return False
     if isinstance(value, dict):

@@ -57,6 +57,11 @@ class Decoded:
     unreadable: list[Unreadable]
     surplus: NDArray[np.intp]
 
+    @property
+    def is_typed(self) -> bool:
+        """True if a definition fixes the types of the fields."""
+        return isinstance(self.records, Records) or self.records.is_typed
+
     def arrow(self) -> pa.StructArray:
         """The messages as Arrow holds them: exact values, nested as the messages are.
 

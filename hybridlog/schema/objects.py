@@ -67,6 +67,11 @@ class Objects:
         """Number of messages."""
         return len(self.values)
 
+    @property
+    def is_typed(self) -> bool:
+        """True if a definition fixes the types of the fields."""
+        return False
+
     def plain(self, *, whole: bool) -> list[dict[str, object]]:
         """The messages as plain values; see `Decoded.plain`."""
         return [cast("dict[str, object]", top(value)) for value in self.values]

@@ -15,16 +15,16 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from bson.errors import BSONError
 
-from hybridlog.schema.codec import NO_ROWS, decode_each
+from hybridlog.schema.codec import decode_each
 from hybridlog.schema.column import Records
-from hybridlog.schema.index_bodies import decoded_bodies, document_of, index_bodies
+from hybridlog.schema.index_bodies import ARRAY_LIMIT, decoded_bodies, document_of, index_bodies
 from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 _HEAD = struct.Struct("<Q32s")
-_READ, _SURPLUS, _UNREADABLE = range(3)  # the byte behind the head of an expired message
+_SURPLUS, _UNREADABLE, _LOSSY = 1, 2, 4  # flags in the byte behind the head of an expired message
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,18 +145,54 @@ def expired_payloads(batch: Batch, decoded: Decoded | None) -> list[bytes]:
         batch: The messages.
         decoded: Their fields; None if they cannot be decoded.
     """
-    rest = [bytes([_READ])] * len(batch)
-    for group in () if decoded is None else decoded_bodies(decoded):
-        surplus = set(group.surplus.tolist())
-        for row, body in zip(group.rows.tolist(), group.body, strict=True):
-            kind = _SURPLUS if row in surplus else _READ
+    flags = np.zeros(len(batch), np.uint8)
+    rest = [b""] * len(batch)
+    if decoded is not None:
+        flags[decoded.surplus] |= _SURPLUS
+        if isinstance(decoded.records, Objects):
+            lossy = [_is_lossy(one) for one in decoded.plain()]
+            flags[decoded.rows[np.array(lossy, np.bool_)]] |= _LOSSY
+        for group in decoded_bodies(decoded):
+            for row, body in zip(group.rows.tolist(), group.body, strict=True):
+                rest[row] = body.tobytes() if group.error is None else group.error.encode()
             if group.error is not None:
-                rest[row] = bytes([_UNREADABLE]) + group.error.encode()
-            else:
-                rest[row] = bytes([kind]) + body.tobytes()
+                flags[group.rows] |= _UNREADABLE
     payloads = (batch.payload(row) for row in range(len(batch)))
     heads = (_HEAD.pack(len(one), hashlib.sha256(one).digest()) for one in payloads)
-    return [head + tail for head, tail in zip(heads, rest, strict=True)]
+    parts = zip(heads, flags.tolist(), rest, strict=True)
+    return [head + bytes([flag]) + tail for head, flag, tail in parts]
+
+
+def _is_lossy(value: object) -> bool:
+    """True if a document does not hold all of a value: long arrays, bytes, large integers."""
+    if isinstance(value, dict):
+        return any(map(_is_lossy, value.values()))
+    if isinstance(value, list):
+        return len(value) > ARRAY_LIMIT or any(map(_is_lossy, value))
+    is_large = isinstance(value, int) and not -(1 << 63) <= value < 1 << 63
+    return is_large or isinstance(value, bytes)
+
+
+def _is_doubtful(value: object) -> bool:
+    """True if a value of a lossy document may stand for another one."""
+    if isinstance(value, dict):
+        return "n" in value or any(map(_is_doubtful, value.values()))
+    if isinstance(value, list):
+        return any(map(_is_doubtful, value))
+    return isinstance(value, float) and abs(value) >= 1 << 63
+
+
+def without_lossy(decoded: Decoded) -> tuple[Decoded, int]:
+    """Decoded messages but for expired ones that lack a wanted value, and how many these are."""
+    records = decoded.records
+    if not isinstance(records, ExpiredFields):
+        return decoded, 0
+    keep = ~records.lacking()
+    if keep.all():
+        return decoded, 0
+    values = [one for one, there in zip(records.values, keep.tolist(), strict=True) if there]
+    left = replace(decoded, rows=decoded.rows[keep], records=replace(records, values=values))
+    return left, int((~keep).sum())
 
 
 class ExpiredCodec(ReducedCodec):
@@ -190,8 +226,8 @@ class ExpiredCodec(ReducedCodec):
         form = partial(ExpiredFields, fields=fields, empty=empty)
         decoded = decode_each(_left_in, form, buffer, offset, length)
         assert isinstance(decoded.records, ExpiredFields)
-        left = decoded.records.values
-        decoded.surplus = decoded.rows[[one.has_surplus for one in left]] if left else NO_ROWS
+        has_surplus = [bool(one.flags & _SURPLUS) for one in decoded.records.values]
+        decoded.surplus = decoded.rows[np.array(has_surplus, np.bool_)]
         return decoded
 
 
@@ -200,15 +236,15 @@ class _Left:
     """What is left of an expired message that was readable."""
 
     body: bytes
-    has_surplus: bool
+    flags: int
 
 
 def _left_in(payload: memoryview) -> _Left:
     remains_of(payload)
-    kind, rest = payload[_HEAD.size], bytes(payload[_HEAD.size + 1 :])
-    if kind == _UNREADABLE:
+    flags, rest = payload[_HEAD.size], bytes(payload[_HEAD.size + 1 :])
+    if flags & _UNREADABLE:
         raise PayloadError(rest.decode())
-    return _Left(rest, kind == _SURPLUS)
+    return _Left(rest, flags)
 
 
 @dataclass(slots=True)
@@ -241,18 +277,70 @@ class ExpiredFields(Objects):
         from hybridlog.schema.arrow_types import converted, without_summaries
 
         assert self.empty is not None
-        if not isinstance(self.empty.records, Records):
+        if not self.is_typed:
             return objects_array(self.plain(whole=True), self.wanted())
         kind = self.empty.arrow().type
         found = [without_summaries(one, kind) for one in self.plain(whole=True)]
         return converted(objects_array(found, self.wanted()), kind)
 
-    def lacking(self) -> NDArray[np.bool_]:
-        """bool[n], True for messages of which a wanted array is only a summary."""
+    @property
+    def is_typed(self) -> bool:
+        """True if a definition fixes the types of the fields."""
         assert self.empty is not None
-        if not isinstance(self.empty.records, Records):
-            return np.zeros(len(self), np.bool_)
+        return isinstance(self.empty.records, Records)
+
+    def statistic(self, path: str, what: str) -> pa.Array[Any] | None:
+        """One number of the summary of an array in each message; None if there is none.
+
+        Args:
+            path: Dotted path of the array.
+            what: `n`, `min`, `max` or `mean`.
+        """
+        import pyarrow as pa
+
+        from hybridlog.schema.arrow_types import statistic
+
+        assert self.empty is not None
+        kind = self.empty.arrow().type
+        found = self.plain(whole=True)
+        for name in path.split("."):
+            kind = kind.field(name).type
+            found = [one.get(name) if isinstance(one, dict) else None for one in found]  # type: ignore[misc]
+        lists = pa.array([one if isinstance(one, list) else None for one in found], kind)
+        made = statistic(lists, what)
+        if made is None:
+            return None
+        kept = [one.get(what) if isinstance(one, dict) else None for one in found]
+        return pa.array(kept, made.type).fill_null(made) if made.null_count else made
+
+    def _wanted_of(self, fields: dict[str, object]) -> list[object]:
+        """The wanted values of a message."""
+        if self.fields is None:
+            return [fields]
+        found: list[object] = []
+        for path in self.wanted() or ():
+            value: Any = fields
+            for name in path:
+                value = value.get(name) if isinstance(value, dict) else value
+            found.append(value)
+        return found
+
+    def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
+        """bool[n], True for messages of which a wanted value is not in the document.
+
+        Args:
+            but: Dotted paths of arrays of which only summaries are wanted.
+        """
         from hybridlog.schema.arrow_types import lacks_arrays
 
+        assert self.empty is not None
+        if not self.is_typed:
+            is_lossy = [bool(one.flags & _LOSSY) for one in self.values]
+            found = [
+                lossy and any(map(_is_doubtful, self._wanted_of(one)))
+                for one, lossy in zip(self.plain(whole=True), is_lossy, strict=True)
+            ]
+            return np.array(found, np.bool_)
         kind = self.empty.arrow().type
-        return np.array([lacks_arrays(one, kind) for one in self.plain(whole=True)], np.bool_)
+        found = [lacks_arrays(one, kind, but) for one in self.plain(whole=True)]
+        return np.array(found, np.bool_)

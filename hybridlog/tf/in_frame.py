@@ -135,7 +135,7 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
         found: list[tuple[Points, dict[str, object]]] = []
         for message in messages_in(run):
             if message.is_reduced:
-                counters.reduced += 1
+                counters.leave_out(1, message.state)
                 continue
             try:
                 array, fields = message.to_numpy(), message.fields

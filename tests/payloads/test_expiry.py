@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
 from hybridlog.maintenance.opening import put_entry
 from hybridlog_storage import journal
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import PayloadError
 from tests.payloads.logs import COUNT
 
@@ -110,5 +113,96 @@ def test_answers_stay_when_payloads_go(
         assert all(file.has_fields for file in listed.payloads.values())
 
 
-def _die(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
+class Dying(files.System):
+    """A file system of a process that dies before its n-th change."""
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in {"writev", "pwritev", "truncate", "sync", "rename", "unlink", "rmdir", "mkdir"}:
+            self.left -= 1
+            if self.left < 0:
+                os._exit(9)
+        return super().__getattribute__(name)
+
+
+def die_at(step: int, work: Callable[[], object]) -> bool:
+    """Do some work in a process that dies before a change of the disk; true if it lives."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            files.system = Dying(step)
+            work()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    _, status = os.waitpid(pid, 0)
+    code = os.waitstatus_to_exitcode(status)
+    assert code in {0, 9}
+    return code == 0
+
+
+@pytest.mark.parametrize(
+    "stride", [15, pytest.param(1, marks=pytest.mark.exhaustive)], ids=["some", "all"]
+)
+def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, stride: int) -> None:
+    with hl.open(copy, mongo="none") as store:
+        store.compact(topics=["scan"], drop_mcap=True)
+    right = answers(copy)
+    step, seen, lived = 0, set(), False
+    while not lived:
+        place = tmp_path / f"at {step}"
+        shutil.copytree(copy, place)
+        lived = die_at(step, partial(expire, place, [0, 1]))
+        with hl.open(place, mongo="none") as store:  # finishes or undoes it
+            assert {one.place for one in store.verify().findings} <= {"catalog"}
+            states = [message.state.value for message in store.all_topics()]
+        assert answers(place) == right
+        seen.add(states.count("expired"))
+        expire(place, [0, 1])
+        with hl.open(place, mongo="none") as store:
+            assert {message.state.value for message in store.all_topics()} == {"expired"}
+            assert store.verify().findings == []
+        assert answers(place) == right
+        shutil.rmtree(place)
+        step += stride
+    assert step > 40
+    assert len(seen) == 3  # none, those of a segment, those of both
+
+
+def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_path: Path) -> None:
+    right = answers(copy)
+    expire(copy, [0, 1])
+    other = tmp_path / "other"
+    with hl.open(other, create=True, mongo="none") as store:
+        store.import_from(copy)
+        assert store.verify().findings == []
+        store.rename("log", "new")
+        store.rename("new", "log")
+    assert answers(other) == right
+    (copy / "recordings" / "log" / journal.JOURNAL).unlink()
+    with hl.open(copy, mongo="none") as store:
+        assert [f.place for f in store.verify().findings] == ["journal"]
+    assert answers(copy) | {"status": 0} == right | {"status": 0}
+    with hl.open(other, mongo="none") as store:
+        path = next((other / "recordings" / "log" / "payloads").glob("fields=scan/*"))
+        whole = path.read_bytes()
+        path.write_bytes(whole[:900] + bytes([whole[900] ^ 1]) + whole[901:])
+        places = [one.place for one in store.verify().findings]
+        assert f"payloads/fields=scan/{path.name}" in places
+        path.unlink()
+    with hl.open(other, mongo="none") as store:
+        (entry,) = store.recordings()
+        assert entry.status == "damaged"
+        (loss,) = entry.end["losses"]
+        assert (loss["topic"], loss["count"]) == ("/scan", COUNT)
+        assert store.topic("/scan").count() == COUNT
+        store.remove("log")
+        assert not store.recordings()
+
+
+def test_a_store_says_that_payloads_expire(copy: Path) -> None:
+    assert "requires" not in (copy / "hybridlog.toml").read_text()
+    expire(copy, [0])
+    assert 'requires = ["expired"]' in (copy / "hybridlog.toml").read_text()

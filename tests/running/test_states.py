@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 from mcap.records import Metadata
 
 import hybridlog as hl
+from hybridlog.maintenance.expiry import expire
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
@@ -65,6 +67,69 @@ def test_a_copy_is_recovered(running: Running, tmp_path: Path) -> None:
         assert store.entry(LABEL).status == "recovered"
         check(store, known)
     assert running.before.entry(LABEL).status == "open"
+
+
+NEED_PAYLOADS = {
+    "batches",
+    "count",  # by elements of a long array
+    "latched",
+    "to_arrow",  # with such an array
+    "to_numpy",
+    "where",  # by elements of one
+}
+"""Methods that cannot answer of expired messages, at least one of the questions."""
+
+
+def check_expired(store: hl.Store, known: Known) -> None:
+    """All answers are as if nothing had expired."""
+    for name, rule in METHODS.items():
+        if name not in {*ABOUT_LOSSES, *NEED_PAYLOADS, "channels"}:
+            found, wanted = rule.ask(store), rule.right(known)
+            assert same(found, wanted), (name, found, wanted)
+    gone = sum(message.is_reduced for message in store.topic("arm"))
+    for query, told in (
+        (store.topic("arm"), "no long arrays: their payloads were deleted to make room; "),
+        (store.topic("arm").where("ranges[3:7].min >= 4"), "could not be asked"),
+    ):
+        query.to_arrow()
+        assert any(told in one for one in query.completeness().sentences) == bool(gone)
+    query = store.topic("arm").fields("n", "ranges.max")
+    assert query.to_arrow().column("ranges.max").null_count == 0
+    assert not [one for one in query.completeness().sentences if "deleted" in one]
+
+
+def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -> None:
+    known = running.flushed()
+    copied = copy_of(running, tmp_path / "copy")
+    with hl.open(copied, mongo=NO_MONGODB) as store:
+        entry = store.entry(LABEL)
+        with store.directory.writing(entry.label, entry.id) as label:
+            expire(store.directory, label, [*map(int, entry.digests)])
+        store.refresh()
+        check_expired(store, known)
+    shutil.rmtree(copied / "tables")
+    with hl.open(copied, mongo=NO_MONGODB) as store:
+        check_expired(store, known)
+        assert store.entry(LABEL).messages == len(known.of())
+
+
+def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
+    with begun(tmp_path / "store", "many", 130) as running:
+        known = running.flushed()
+        sealed = sorted(map(int, running.before.entry(LABEL).digests))
+        expire(running.store.directory, LABEL, sealed[:1])
+        check_expired(running.before, known)
+        expire(running.store.directory, LABEL, sealed[:3], ["/cam", "/arm"])
+        running.write(30)
+        known = running.flushed()
+        check_expired(running.before, known)
+        expire(running.store.directory, LABEL, sealed)
+        known = running.flushed()
+        check_expired(running.before, known)
+    with hl.open(tmp_path / "store") as store:
+        assert store.entry(LABEL).status == "complete"
+        check_expired(store, known)
+        assert store.verify().findings == []
 
 
 @pytest.mark.parametrize("kind", ["one", "many"])

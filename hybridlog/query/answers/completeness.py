@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.record.losses import Cause
+from hybridlog.schema.states import State, without_fields, without_payload
 from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import IncompleteError
 
@@ -135,13 +136,18 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     """Messages that an answer could not read or has no payload of."""
     if counters.unreadable:
         yield _unreadable(counters.unreadable, question)
-    if counters.reduced:
-        from hybridlog.schema.states import without_payload
-
-        yield (
-            f"{without_payload(counters.reduced)}: not in this answer; --where and --fields find "
-            "the fields."
-        )
+    gone = {
+        State.REDUCED: counters.reduced - counters.expired,
+        State.EXPIRED: counters.expired,
+    }
+    for state, number in gone.items():
+        if number:
+            yield (
+                f"{without_payload(number, state)}: not in this answer; --where and --fields "
+                "find the fields."
+            )
+    if counters.lacking:
+        yield f"{without_fields(counters.lacking, State.EXPIRED)}; these are null."
     reasons: Counter[str] = Counter()
     for why, number in counters.no_transform:
         reasons[why] += number

@@ -110,7 +110,8 @@ def _last_of(
         return chunk
 
     def read(entry: Chunk) -> StoredChunk:
-        key = recording.id, entry.segment, entry.number
+        stored = recording.stored.get(str(entry.segment), "")
+        key = recording.id, entry.segment, entry.number, stored
         return session.cache.made("chunk", *key, make=partial(load, entry), size_of=_size_of)
 
     chunks = session.chunks_before(recording, list(channels), span[1])

@@ -138,7 +138,10 @@ class _LatchedScan:
             of, time = run.batch.channel, run.batch.log_time
             at = times[of]
             keep = (time > at) | ((time == at) & (run.seq >= numbers[of]))
-            self._counters.reduced += int((keep & ~whole[of]).sum())
+            for number, channel in enumerate(own):
+                if not whole[number]:
+                    left = int((keep & (of == number)).sum())
+                    self._counters.leave_out(left, channel.state)
             keep &= whole[of]
             if keep.any():
                 yield run.batch.take(keep), own

@@ -17,6 +17,7 @@ from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
+from hybridlog.schema.states import CAUSES
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 from hybridlog_storage.times import BEGIN
 
@@ -124,7 +125,7 @@ def back_to_key(
             if each.is_reduced:
                 raise PayloadError(
                     "a frame of video cannot be decoded: the payload of one between it and "
-                    "the key frame before it was dropped under pressure"
+                    f"the key frame before it was {CAUSES[each.state]}"
                 )
             form, data = frame_of(each.decode())
             yield each, form, data

@@ -9,6 +9,7 @@ import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
 from hybridlog.query.engines.base import MatchColumns, Need, Values
+from hybridlog.schema.reduced_codec import without_lossy
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, MessageRun
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
     from hybridlog.query.engines.base import Objects
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Part, RecordedChannel
+    from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
+    from hybridlog_storage.messages import Batch
 
 _START_S = 1e-3  # seconds to start
 _CHUNK_S = 5e-4  # seconds to read a chunk with other topics in it
@@ -76,26 +79,34 @@ class PayloadScan:
         """Fields of the messages of a plan, in order."""
         for channel, run in self._by_channel(plan):
             batch = run.batch
-            decoded = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+            decoded = self._decoded(channel, batch, fields)
             good = decoded.rows
-            self._counters.unreadable += len(batch) - len(good)
             yield Values(batch.log_time[good], run.seq[good], decoded.arrow())
 
     def objects_of(self, plan: ScanPlan) -> Iterator[Objects]:
         """The messages of a plan as plain objects, in order."""
         for channel, run in self._by_channel(plan):
             batch = run.batch
-            found = channel.codec.columns(batch.buffer, batch.offset, batch.length)
-            self._counters.unreadable += len(batch) - len(found.rows)
+            found = self._decoded(channel, batch)
             yield batch.log_time[found.rows], found.plain()
 
+    def _decoded(
+        self, channel: RecordedChannel, batch: Batch, fields: Collection[str] | None = None
+    ) -> Decoded:
+        """The fields of messages; those that cannot be read, or lack some, are counted."""
+        found = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        self._counters.unreadable += len(batch) - len(found.rows)
+        found, lacking = without_lossy(found) if channel.is_reduced else (found, 0)
+        self._counters.leave_out(lacking, channel.state)
+        return found
+
     def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
-        """The whole messages of a plan in order, those of one channel at a time."""
+        """The messages of a plan with fields in order, those of one channel at a time."""
         for run in ChunkScan(plan, self._session.segment).runs():
             changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
             for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
                 channel = plan.channels[int(own.batch.channel[0])]
-                if channel.is_reduced:
+                if not channel.is_typed:
                     self._counters.reduced += len(own.batch)
                 elif len(own.batch):
                     yield channel, own

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.times import format_time
+from hybridlog.schema.states import CAUSES
 from hybridlog.view.context import current, route, start_of
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 
@@ -41,7 +42,7 @@ def message(context: Context, asked: RequestParams) -> dict[str, Any]:
         "publish_time": _time(shown.publish_time_ns),
         "seq": shown.seq,
         "sequence": shown.sequence,
-        "reduced": shown.is_reduced,
+        "reduced": CAUSES.get(shown.state),
     }
     try:
         if not shown.is_reduced:

@@ -101,7 +101,7 @@ function factsOf(found) {
     found.log_time,
     found.type,
     found.bytes === undefined ? null : size(found.bytes),
-    found.reduced ? "its payload was dropped while recording: only fields of the index" : null,
+    found.reduced ? `its payload was ${found.reduced}: only fields of the index` : null,
   ];
   return parts.filter(Boolean).join(" · ");
 }
