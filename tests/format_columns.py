@@ -50,7 +50,8 @@ class Columns:
         """The content of a moved chunk: the records of its messages, where each starts."""
         if self._records is None:
             found = defaultdict(list)
-            for path, file in self._listed.items():
+            columns = {p: f for p, f in self._listed.items() if not p.startswith("fields=")}
+            for path, file in columns.items():
                 for place, start, record in self._file(self._folder / path, file):
                     found[place].append((start, record))
             self._records = found
@@ -60,10 +61,32 @@ class Columns:
             content += record
         return content
 
-    def _file(
-        self, path: Path, listed: Mapping[str, Any]
-    ) -> Iterator[tuple[tuple[int, int], int, bytes]]:
-        """Segment and chunk, start, and bytes of each message record."""
+    def left(self, segment: int, chunk: int) -> list[tuple[int, int, bytes]]:
+        """What is left of the messages of an expired chunk, as records in its order.
+
+        Each has the place where its record was, and the bytes that its payload had.
+        """
+        found: dict[int, tuple[int, int, bytes]] = {}
+        for path, listed in self._listed.items():
+            if not path.startswith("fields="):
+                continue
+            file, about = self._checked(self._folder / path, listed)
+            for group, chunks in enumerate(about["payloads"]["chunks"]):
+                rows = [(s, c) for s, c, count in chunks for _ in range(count)]
+                if (segment, chunk) not in rows:
+                    continue
+                for place, row in zip(rows, file.read_row_group(group).to_pylist(), strict=True):
+                    ref = row["ref"]
+                    demand((ref["seg"], ref["chunk"]) == place, "the chunk of a row")
+                    if place == (segment, chunk):
+                        head = row["channel"], ref["sequence"], row["t"], row["pub"]
+                        size = 22 + len(ref["left"])
+                        record = struct.pack("<BQHIQQ", 5, size, *head) + ref["left"]
+                        found[ref["off"]] = ref["off"] - 31, ref["len"], record
+        return [found[at] for at in sorted(found)]
+
+    def _checked(self, path: Path, listed: Mapping[str, Any]) -> tuple[pq.ParquetFile, Any]:
+        """A file whose checksums are right, and what it says of itself."""
         demand(path.is_file(), "a file of columns is missing")
         data = path.read_bytes()
         demand(len(data) == listed["bytes"] and data[-4:] == b"PAR1", "the size of a file")
@@ -83,6 +106,13 @@ class Columns:
         demand(checksums == about["checksums"], "the checksum of a block")
         rows = {listed["topic"]: [listed["messages"], 0, 0]}
         demand(section["topics"] == rows, "the rows of a file")
+        return file, about
+
+    def _file(
+        self, path: Path, listed: Mapping[str, Any]
+    ) -> Iterator[tuple[tuple[int, int], int, bytes]]:
+        """Segment and chunk, start, and bytes of each message record."""
+        file, about = self._checked(path, listed)
         for group, chunks in enumerate(about["payloads"]["chunks"]):
             table = file.read_row_group(group)
             rows = [(segment, chunk) for segment, chunk, count in chunks for _ in range(count)]

@@ -221,11 +221,13 @@ class Journal:
                 self.marks.append(line)
             case "adopted":
                 self.store = line["store"]
-            case "compacted":
+            case "compacted" | "expired":
                 self.files |= {file["file"]: file for file in line.get("files", ())}
                 for one in line.get("segments", ()):
                     written = one["digest"], one["bytes"]
                     self.thinned.setdefault(one["segment"], []).append(written)
+                for path in line.get("deleted", ()):
+                    self.files.pop(path, None)
             case "rebuilt":
                 self.is_rebuilt = True
             case "removing":
@@ -318,12 +320,18 @@ class Segment:
             demand(bool(parts) and channels == sorted(set(channels)), "the parts of a chunk")
             demand(chunk.first == min(p.first for p in parts), "the first time of a chunk")
             demand(chunk.last == max(p.last for p in parts), "the last time of a chunk")
-            for part in parts if not self.is_moved(number) else ():
+            for part in parts if self._opcode(number) == 0x06 else ():
                 counts[part.channel] = counts.get(part.channel, 0) + part.messages
         demand(counts == {c: n for c, n in self._counts.items() if n}, "the statistics")
 
+    def _opcode(self, number: int) -> int:
+        return self.data[self.chunks[number].offset]
+
     def is_moved(self, number: int) -> bool:
-        return self.data[self.chunks[number].offset] == 0x93
+        return self._opcode(number) == 0x93
+
+    def is_expired(self, number: int) -> bool:
+        return self._opcode(number) == 0x94
 
     def parts_of(self, number: int) -> list[Part]:
         before = sum(chunk.parts for chunk in self.chunks[:number])
@@ -363,12 +371,18 @@ class Segment:
         demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
         is_indexed = zlib.crc32(trailer) == place.trailer_crc
         ((_, opcode, body),) = records(record)
-        demand(opcode == (0x93 if self.is_moved(number) else 0x06), "no chunk")
-        if self.is_moved(number):
+        demand(opcode in {0x06, 0x93, 0x94}, "no chunk")
+        left: list[tuple[int, bytes]] = []
+        if opcode == 0x94:
+            left = self._expired(number, Content(body), place)
+            content = b"".join(record for _, record in left)
+        elif opcode == 0x93:
             content = self._moved(number, Content(body), place)
         else:
             content = self._content(Content(body), place)
         messages = list(records(content))
+        if left:  # at the places where they were
+            messages = [(at, *m[1:]) for (at, _), m in zip(left, messages, strict=True)]
         *indexes, (_, opcode, arrivals) = records(trailer)
         demand(opcode == 0x90, "no arrival record")
         owner, size, *checksums, own = struct.unpack_from("<QQIIIII", arrivals)
@@ -397,11 +411,12 @@ class Segment:
         if is_indexed:
             listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
             demand(sorted(heads) == sorted(listed), "the message indexes")
-        self._compare(number, messages)
+        if not left:
+            self._compare(number, messages)
 
     @staticmethod
     def _head(record: bytes) -> int:
-        if record[0] == 0x93:
+        if record[0] in {0x93, 0x94}:
             return len(record)
         body = Content(record[37:])
         return 37 + 4 + len(body.text()) + 8
@@ -418,6 +433,21 @@ class Segment:
             raise Damaged(str(error)) from error
         demand(len(content) == size and zlib.crc32(content) == crc, "the content of a moved chunk")
         return content
+
+    def _expired(self, number: int, body: Content, place: Chunk) -> list[tuple[int, bytes]]:
+        """What is left of messages as records, and where they were in the content."""
+        times = body.take("<Q"), body.take("<Q")
+        demand(times == (place.first, place.last), "the times of an expired chunk")
+        size, _, before = body.take("<Q"), body.take("<I"), body.take("<Q")
+        demand(not body.rest() and before > 0, "the record of an expired chunk")
+        assert self.columns is not None
+        try:
+            left = self.columns.left(self.about["segment"], number)
+        except WrongColumnsError as error:
+            raise Damaged(str(error)) from error
+        ends = [at + 31 + length for at, length, _ in left]
+        demand([0, *ends] == [*(at for at, _, _ in left), size], "places of expired messages")
+        return [(at, record) for at, _, record in left]
 
     @staticmethod
     def _content(body: Content, place: Chunk) -> bytes:
@@ -569,7 +599,7 @@ class Recording:
     def _lost_chunks(self) -> Iterator[dict[str, Any]]:
         for number, chunk in self.damage:
             segment = self.segments[number]
-            if segment.is_moved(chunk):
+            if segment.is_moved(chunk) or segment.is_expired(chunk):
                 continue
             place = segment.chunks[chunk]
             for part in segment.parts_of(chunk):
@@ -578,15 +608,17 @@ class Recording:
                 yield _row(segment.path.name, place.offset, place.length, *about)
 
     def _lost_columns(self) -> Iterator[dict[str, Any]]:
-        moved: dict[str, list[Part]] = {}
+        moved: dict[tuple[str, bool], list[Part]] = {}
         for segment in self.segments.values():
-            for chunk in filter(segment.is_moved, range(len(segment.chunks))):
-                for part in segment.parts_of(chunk):
-                    moved.setdefault(segment.channels[part.channel][1], []).append(part)
+            for chunk in range(len(segment.chunks)):
+                is_gone = segment.is_expired(chunk)
+                for part in segment.parts_of(chunk) if is_gone or segment.is_moved(chunk) else ():
+                    key = segment.channels[part.channel][1], is_gone
+                    moved.setdefault(key, []).append(part)
         for file in self.journal.files.values() if self.journal is not None else ():
             path = self.path / "payloads" / file["file"]
             is_there = path.is_file() and path.stat().st_size == file["bytes"]
-            parts = moved.get(file["topic"], [])
+            parts = moved.get((file["topic"], file["file"].startswith("fields=")), [])
             if parts and not is_there:
                 times = min(p.first for p in parts), max(p.last for p in parts)
                 about = (file["messages"], file["topic"], *times)
@@ -673,7 +705,7 @@ class FormatReader:
         self.store = store
         settings = tomllib.loads((store / "hybridlog.toml").read_text())
         demand(settings["format"] == 3, "another format")
-        demand(not settings.get("requires", []), "a feature that is unknown")
+        demand({*settings.get("requires", [])} <= {"expired"}, "a feature that is unknown")
         self.store_id: str = settings["store_id"]
 
     def labels(self) -> list[str]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
+import struct
 from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import bson
 import pytest
 
 import hybridlog as hl
@@ -18,6 +21,7 @@ from hybridlog.maintenance.opening import put_entry
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import PayloadError
+from tests.format_reader import FormatReader
 from tests.payloads.logs import COUNT
 
 TOPICS = ["/cloud", "/image", "/number", "/scan"]
@@ -206,3 +210,31 @@ def test_a_store_says_that_payloads_expire(copy: Path) -> None:
     assert "requires" not in (copy / "hybridlog.toml").read_text()
     expire(copy, [0])
     assert 'requires = ["expired"]' in (copy / "hybridlog.toml").read_text()
+
+
+def test_the_second_reader_tells_what_is_left(copy: Path) -> None:
+    """By the specification: size, hash and document of each expired message."""
+
+    def told() -> list[Any]:
+        recording = FormatReader(copy).recording("log")
+        assert (recording.status, recording.damage, recording.losses) == ("complete", {}, [])
+        return [message for _, message in recording.messages()]
+
+    with hl.open(copy, mongo="none") as store:
+        fields = {message.seq: message.fields for message in store.all_topics()}
+    before = {message.seq: message for message in told()}
+    expire(copy, [0], ["/scan"])
+    expire(copy, [0])
+    gone = 0
+    for message in told():
+        was = before.pop(message.seq)
+        assert message[1:-1] == was[1:-1]
+        if message.payload != was.payload:
+            size, digest, flags = struct.unpack_from("<Q32sB", message.payload)
+            assert (size, digest) == (len(was.payload), hashlib.sha256(was.payload).digest())
+            body = message.payload[41:]
+            document = bson.decode(struct.pack("<i", len(body) + 5) + body + b"\0")
+            assert (flags, document) == (0, fields[message.seq])
+            gone += 1
+    assert not before
+    assert gone == 167
