@@ -207,6 +207,8 @@ def replace_chunks(
         written = thin(reader, target, records, about)
         _prove(target, reader, summary, records, contents)
         line = {"segment": reader.number, "bytes": written.bytes, "digest": written.digest}
+        if event == journal.EXPIRED:
+            line["topics"] = sorted(_messages(summary, records))
         log.append(journal.event(event, segments=[line]))
         listed = True
         thinned = {reader.number: [(written.digest, written.bytes)]}

@@ -8,9 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
-from hybridlog.schema.states import State
-
 if TYPE_CHECKING:
+    from hybridlog.schema.states import State
     from hybridlog_storage.messages import Batch
 
 
@@ -75,7 +74,7 @@ class Counters:
     def leave_out(self, messages: int, state: State) -> None:
         """Count messages that are left out since their payloads are gone."""
         self.reduced += messages
-        if state is State.EXPIRED:
+        if state == "expired":
             self.expired += messages
 
     @contextmanager

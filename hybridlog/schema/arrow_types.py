@@ -504,3 +504,25 @@ def _lacks(value: Any, kind: pa.DataType, but: Collection[str] = (), path: str =
     if isinstance(value, dict):
         return True
     return is_list(kind) and any(_lacks(one, kind.value_type) for one in value or ())
+
+
+def kept_statistic(
+    documents: Sequence[Any], kind: pa.DataType, path: Sequence[str], what: str
+) -> Array | None:
+    """One number of the summary of an array in documents; None if there is none.
+
+    Args:
+        documents: The documents.
+        kind: Type of the messages.
+        path: Names on the path of the array.
+        what: `n`, `min`, `max` or `mean`.
+    """
+    for name in path:
+        kind = kind.field(name).type
+        documents = [one.get(name) if isinstance(one, dict) else None for one in documents]
+    lists = pa.array([one if isinstance(one, list) else None for one in documents], kind)
+    made = statistic(lists, what)
+    if made is None or not made.null_count:
+        return made
+    kept = [one.get(what) if isinstance(one, dict) else None for one in documents]
+    return pc.coalesce(made, pa.array(kept, made.type))

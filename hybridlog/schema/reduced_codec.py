@@ -296,22 +296,11 @@ class ExpiredFields(Objects):
             path: Dotted path of the array.
             what: `n`, `min`, `max` or `mean`.
         """
-        import pyarrow as pa
-
-        from hybridlog.schema.arrow_types import statistic
+        from hybridlog.schema.arrow_types import kept_statistic
 
         assert self.empty is not None
         kind = self.empty.arrow().type
-        found = self.plain(whole=True)
-        for name in path.split("."):
-            kind = kind.field(name).type
-            found = [one.get(name) if isinstance(one, dict) else None for one in found]  # type: ignore[misc]
-        lists = pa.array([one if isinstance(one, list) else None for one in found], kind)
-        made = statistic(lists, what)
-        if made is None:
-            return None
-        kept = [one.get(what) if isinstance(one, dict) else None for one in found]
-        return pa.array(kept, made.type).fill_null(made) if made.null_count else made
+        return kept_statistic(self.plain(whole=True), kind, path.split("."), what)
 
     def _wanted_of(self, fields: dict[str, object]) -> list[object]:
         """The wanted values of a message."""

@@ -154,6 +154,7 @@ class JournalState:
         replaced: Segments that a crash shortened: as listed before, and as they are.
         payloads: Files of payloads, and of fields of expired ones, by path.
         deleted: Files of payloads that have expired, too.
+        expired: Topics with expired messages, by the number of their segment.
         thinned: Digest and size of each segment without moved or expired chunks, by its number;
             a later one follows an earlier one.
         end: The end of the recording; None while it is running.
@@ -178,6 +179,7 @@ class JournalState:
     replaced: list[tuple[SealedSegment, SealedSegment]] = field(default_factory=list)
     payloads: dict[str, PayloadFile] = field(default_factory=dict)
     deleted: set[str] = field(default_factory=set)
+    expired: dict[int, set[str]] = field(default_factory=dict)
     thinned: dict[int, list[tuple[str, int]]] = field(default_factory=dict)
     end: dict[str, Any] | None = None
     moving: tuple[str, str] | None = None
@@ -273,11 +275,15 @@ class JournalState:
 
     def _compact(self, line: Event) -> None:
         found = payload_files(line.get("files", ()))
-        segments = [_values(value, _THINNED) for value in line.get("segments", ())]
+        values = line.get("segments", ())
+        segments = [_values(value, _THINNED) for value in values]
+        expired = [(one["segment"], {*map(_text, one.get("topics", ()))}) for one in values]
         deleted = {_text(path) for path in line.get("deleted", ())}
         self.payloads.update({file.file: file for file in found})
         for one in segments:
             self.thinned.setdefault(one["segment"], []).append((one["digest"], one["bytes"]))
+        for segment, topics in expired if line["event"] == EXPIRED else ():
+            self.expired.setdefault(segment, set()).update(topics)
         self.deleted |= self.payloads.keys() & deleted
         for path in deleted:
             self.payloads.pop(path, None)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.record.losses import Cause
-from hybridlog.schema.states import State, without_fields, without_payload
 from hybridlog.wording import counted, listed, unfit
 from hybridlog_storage.errors import IncompleteError
 
@@ -134,6 +133,8 @@ def not_indexed(messages: int) -> str:
 
 def left_out(question: Question, counters: Counters) -> Iterator[str]:
     """Messages that an answer could not read or has no payload of."""
+    from hybridlog.schema.states import State, without_fields, without_payload
+
     if counters.unreadable:
         yield _unreadable(counters.unreadable, question)
     gone = {
