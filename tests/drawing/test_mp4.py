@@ -263,6 +263,7 @@ def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:
         (images.reverse(), UsageError, "--reverse"),
         (cam.every(2), UsageError, "refer to one another"),
         (cam.where("format == 'h264'"), UsageError, "refer to one another"),
+        (cam.clock("publish").between("+0s", "+1s"), UsageError, "refer to one another"),
         (store.query(["/none"], ["h264"]), PayloadError, "video"),
         (images.between("+1s", "+2s"), UsageError, "no image in this answer"),
         (images.between(1, 2), TimeError, "."),

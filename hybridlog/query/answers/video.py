@@ -88,10 +88,11 @@ def frames_in_front(session: Session, question: Question) -> list[Message]:
     if first is None or not is_video_type(first.type):
         return []
     windows = 0 if question.during is None else len(question.during)
-    if question.every > 1 or question.predicate is not None or windows > 1:
+    is_range = question.is_by_log_time and question.predicate is None and windows < 2
+    if not is_range or question.every > 1:
         raise UsageError(
-            f"The frames of {first.topic} refer to one another, so a video has all of a time "
-            "range: leave out --every and --where, or write --format png."
+            f"The frames of {first.topic} refer to one another, so a video has all of a range of "
+            "log time: leave out --every, --where and --clock, or write --format png."
         )
     with suppress(PayloadError, DefinitionError):
         if not is_key_frame(*frame_of(first.decode())):
