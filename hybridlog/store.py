@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -24,7 +25,7 @@ from hybridlog.maintenance.report import (
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
-from hybridlog.query.times import parse_time
+from hybridlog.query.times import parse_range, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Session, of_one_moment
 from hybridlog.wording import listed
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.imports import ImportReport
+    from hybridlog.maintenance.keep import Kept
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
@@ -1033,6 +1035,94 @@ class Store:
         finally:
             self.refresh()
         return found
+
+    def keep(
+        self,
+        rules: Mapping[str, Any] | None = None,
+        *,
+        dry_run: bool = False,
+        progress: Progress | None = None,
+    ) -> Kept:
+        """Delete what rules of retention do not let stay: payloads, then what is left of them.
+
+        Args:
+            rules: As the table `[retention]` in `hybridlog.toml` has them, such as
+                `{"quota": "200GB"}`; None for that table.
+            dry_run: True to say what would go, and delete nothing.
+            progress: Called while payloads are replaced.
+
+        Returns:
+            What went, and why.
+
+        Raises:
+            UsageError: A rule is malformed.
+            StoreError: Another process deletes here, too; or the store is read-only.
+        """
+        from hybridlog.maintenance.keep import Keeper, Kept
+        from hybridlog.maintenance.retention import Rules
+
+        wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
+        keeper = Keeper(self.directory, self.remove)
+        if dry_run:
+            return Kept(keeper.plan(wanted))
+        self.directory.check_writable()
+        try:
+            return keeper.keep(wanted, progress)
+        finally:
+            self.session.catch_up()
+
+    def pin(
+        self,
+        recording: str | RecordingEntry,
+        begin: TimeLike | None = None,
+        end: TimeLike | None = None,
+        topics: Sequence[str] | None = None,
+        reason: str = "",
+    ) -> str:
+        """Pin a time of a recording: its payloads are never deleted to make room.
+
+        Args:
+            recording: Its label, name or id, or its entry; it may be running.
+            begin: First log time; None for the beginning.
+            end: Log time after the last one; None for the end.
+            topics: Full names of topics; None for all.
+            reason: Why it is pinned.
+
+        Returns:
+            The name of the pin.
+
+        Raises:
+            TimeError: A time is invalid, or the range is empty.
+        """
+        from hybridlog.maintenance.keep import append_pins, pin_of
+
+        (entry,) = self.select([recording])
+        start, stop = extent_of(entry)
+        if begin is not None or end is not None:
+            parse_range(begin, end, start=start, end=stop)
+        times = [None if t is None else parse_time(t, start=start, end=stop) for t in (begin, end)]
+        name = secrets.token_hex(4)
+        line = pin_of(name, (times[0], times[1]), topics, text(reason))
+        append_pins(self.directory, entry.label, entry.id, [line])
+        self.session.catch_up(entry.id)
+        return name
+
+    def unpin(self, *names: str) -> None:
+        """Remove pins.
+
+        Raises:
+            UsageError: There is no pin of a name.
+        """
+        from hybridlog.maintenance.keep import append_pins
+
+        known = {pin["id"]: entry for entry in self.select(None) for pin in entry.pins}
+        for name in names:
+            if name not in known:
+                raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")
+        for name in names:
+            entry, line = known[name], journal.event(journal.UNPINNED, id=name)
+            append_pins(self.directory, entry.label, entry.id, [line])
+            self.session.catch_up(entry.id)
 
     def remove(self, recording: str) -> None:
         """Delete a recording.

@@ -1,10 +1,15 @@
-"""Numbers and lists of names in messages for people."""
+"""Numbers, sizes and lists of names, as people write and read them."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
+from hybridlog_storage.errors import UsageError
+
 MAX_LISTED = 10
+_UNITS = ("B", "kB", "MB", "GB", "TB")
+_SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
 
 def listed(names: Iterable[str], most: int = MAX_LISTED) -> str:
@@ -25,3 +30,28 @@ def unfit(messages: int) -> str:
     """A number of unreadable messages: `1 message does not fit its definition`."""
     verb = "does not fit its" if messages == 1 else "do not fit their"
     return f"{counted(messages, 'message')} {verb} definition"
+
+
+def size(count: float) -> str:
+    """Bytes for people: `12.3 MB`."""
+    value = float(count)
+    for unit in _UNITS:
+        if value < 999.95 or unit == _UNITS[-1]:
+            break
+        value /= 1000
+    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+
+
+def parse_size(text: str) -> int:
+    """Bytes from `1MiB`, `500kB`, `65536`.
+
+    Raises:
+        UsageError: The text is no size.
+    """
+    match = _SIZE.fullmatch(text)
+    if match is None:
+        raise UsageError(f"{text!r} is no size: write 65536, 500kB or 1MiB.")
+    number, prefix, binary = match.groups()
+    base = 1024 if binary else 1000
+    power = " kmgt".index(prefix.lower()) if prefix else 0
+    return int(float(number) * base**power)

@@ -18,7 +18,7 @@ _ALL: Final = "hybridlog.all"  # whether `--all` was given
 
 EXIT_CODES: Final = {
     0: "done",
-    1: "verify found something, or an error that has no code of its own",
+    1: "verify found something, keep lacks room, or an error that has no code of its own",
     2: "wrong usage: an option, a topic, a time or a predicate",
     3: "a log that cannot be read, or a robot that was never reached",
     4: "a damaged log, or lost messages: the rest is stored",
@@ -84,6 +84,7 @@ COMMANDS: Final = {
     "verify": "maintain",
     "repair": "maintain",
     "compact": "maintain",
+    "keep": "keep",
     "rm": "edit",
     "trust": "index",
     "demo": "demo",

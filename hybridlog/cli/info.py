@@ -14,6 +14,7 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.attachments import as_dict as attachment_as_dict
 from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.keep import pin_cells
 from hybridlog.cli.ls import print_sizes, recording_dict, size_dict, status_text, with_misfits
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import recordings_of
@@ -165,6 +166,7 @@ def _as_dict(
         "losses": losses_of(entry),
         "notes": entry.notes,
         "marks": entry.marks,
+        "pins": entry.pins,
         "attachments": [attachment_as_dict(each) for each in attachments],
         "metadata_records": [each._asdict() for each in metadata],
         "channels": [
@@ -246,6 +248,7 @@ def _print_recording(
         *(("", line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
+        *_cut("pin", [f"{pin['id']}: {', '.join(pin_cells(pin))}" for pin in entry.pins]),
         *_cut("attachment", [f"{a.name} ({_content(a)})" for a in attachments]),
         *_cut("metadata", [f"{m.name} ({', '.join(m.values)})" for m in metadata]),
         ("index", index),

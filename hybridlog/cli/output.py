@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +11,6 @@ from itertools import islice, zip_longest
 from typing import TYPE_CHECKING, Literal
 
 from hybridlog import wording
-from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,14 +19,14 @@ if TYPE_CHECKING:
 
 counted = wording.counted
 unfit = wording.unfit
+size = wording.size
+parse_size = wording.parse_size
 
 Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
 ROWS_AT_ONCE = 10_000
 """Rows of a table that are laid out together."""
-_UNITS = ("B", "kB", "MB", "GB", "TB")
-_SIZE = re.compile(r"\s*(\d{1,15}(?:\.\d{1,15})?)\s*([kKmMgGtT]?)(i?)[bB]?\s*")
 
 
 def console(*, error: bool = False) -> Console:
@@ -230,16 +228,6 @@ def notes(lines: Iterable[str]) -> None:
         note(line)
 
 
-def size(count: float) -> str:
-    """Bytes for people: `12.3 MB`."""
-    value = float(count)
-    for unit in _UNITS:
-        if value < 999.95 or unit == _UNITS[-1]:
-            break
-        value /= 1000
-    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-
-
 def stored(messages: int) -> str:
     """A number of stored messages: `1 message is stored`."""
     return f"{counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"
@@ -284,21 +272,6 @@ def short_duration(ns: int) -> str:
     elif abs(ns) >= 86_400 * 10**9:
         step = 3_600 * 10**9
     return format_duration(round(ns / step) * step)
-
-
-def parse_size(text: str) -> int:
-    """Bytes from `1MiB`, `500kB`, `65536`.
-
-    Raises:
-        UsageError: The text is no size.
-    """
-    match = _SIZE.fullmatch(text)
-    if match is None:
-        raise UsageError(f"{text!r} is no size: write 65536, 500kB or 1MiB.")
-    number, prefix, binary = match.groups()
-    base = 1024 if binary else 1000
-    power = " kmgt".index(prefix.lower()) if prefix else 0
-    return int(float(number) * base**power)
 
 
 def _plain(value: object) -> object:

@@ -245,6 +245,12 @@ class IndexWriter:
         """Number of messages that it lacks after a failure of the database."""
         return self._flushed - self.indexed if self.failure is not None else 0
 
+    @property
+    def first_unread(self) -> int:
+        """Number of the first segment that it may still read."""
+        sender, segment = self._sender, self._next[0]
+        return segment if sender is None else min(segment, sender.through.segment)
+
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Note a chunk that is in its segment."""
         if self._crash is not None:

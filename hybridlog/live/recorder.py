@@ -35,10 +35,12 @@ from hybridlog.live.recording import (
     LiveRecording,
     indexed_within_s,
 )
+from hybridlog.live.retention import RetentionThread
 from hybridlog.live.silence import RULE, Commands, SilenceWatch
 from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
+from hybridlog.maintenance.keep import Own
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import CLOCK_SET, CONTRACT, mark_channel, mark_payload
@@ -228,8 +230,7 @@ class Recorder:
         self._unended = len(sources)
         self._over = threading.Event()
         self._reason = ""
-        self._left = options.max_messages
-        self._room = options.max_bytes
+        self._left, self._room = options.max_messages, options.max_bytes
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
         self._marks = mark_channel()
@@ -266,6 +267,7 @@ class Recorder:
                 clock=self._clock,
             )
         try:
+            self._retention = RetentionThread(store.directory, store.remove, self._own(), self.say)
             self._control = ControlServer(
                 store.directory.path,
                 self.name,
@@ -300,6 +302,13 @@ class Recorder:
             ),
         )
 
+    def _own(self) -> Own | None:
+        """The recording in progress, for retention."""
+        target = self._target
+        if isinstance(target, Snapshots):
+            return None
+        return Own(self.name, lambda: target.first_unread, lambda: target.sealed)
+
     # Methods for the program that runs the recorder.
 
     def start(self) -> None:
@@ -325,6 +334,7 @@ class Recorder:
         if self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
             self._note_clock(f"{says}, and recording {self._newest.label} was begun later", {}, now)
+        self._retention.start()
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
@@ -359,6 +369,7 @@ class Recorder:
         if self._simulated is not None:
             self._simulated.close()
         self._control.close()
+        self._retention.stop()
         if isinstance(self._target, Snapshots):
             reports = self._target.close()
         elif not (self.stopped_for_disk and self._target.is_empty) and (

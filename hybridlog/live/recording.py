@@ -335,6 +335,16 @@ class LiveRecording:
         return sum(self._taken), self._capture.writer.written.total()
 
     @property
+    def sealed(self) -> int:
+        """Number of sealed segments."""
+        return self._capture.writer.totals.segments
+
+    @property
+    def first_unread(self) -> int:
+        """Number of the first segment that the index may still read."""
+        return self._capture.index.first_unread
+
+    @property
     def is_empty(self) -> bool:
         """True if it has taken no message."""
         return not any(self._taken)

@@ -7,8 +7,10 @@ divided by payload and by number of messages.
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -139,6 +141,23 @@ def sizes_of(
             for topic in {"", *messages}
         ]
     return Sizes(_largest_first(rows))
+
+
+def disk_bytes(root: Path) -> int:
+    """Bytes that everything below a folder takes; links are not followed.
+
+    Args:
+        root: The folder.
+    """
+    found, folders = 0, [os.fspath(root)]
+    while folders:
+        with suppress(OSError), os.scandir(folders.pop()) as entries:  # it may go meanwhile
+            for entry in entries:
+                with suppress(OSError):
+                    found += entry.stat(follow_symlinks=False).st_blocks * 512
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append(entry.path)
+    return found
 
 
 def _sum(recording: str, topic: str, rows: Sequence[Size]) -> Size:

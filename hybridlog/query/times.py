@@ -82,6 +82,7 @@ _ISO = re.compile(
 )
 _PART = r"(?:([0-9]+)(?:\.([0-9]+))?\s*{}\s*)?"
 _UNITS: tuple[tuple[str, int], ...] = (
+    ("y", 365 * 86_400 * _SECOND),
     ("d", 86_400 * _SECOND),
     ("h", 3_600 * _SECOND),
     ("m(?:in)?", 60 * _SECOND),
@@ -197,8 +198,8 @@ def parse_duration(text: DurationLike) -> int:
     """A duration in nanoseconds, not negative.
 
     Args:
-        text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`. Units are in descending
-            order, each number may have a fraction; a number without unit is seconds.
+        text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`, `2y` (730 days). Units are in
+            descending order, each number may have a fraction; one without unit is seconds.
 
     Raises:
         TimeError: not a duration, negative, finer than a nanosecond, or 2**63 or more.

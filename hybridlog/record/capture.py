@@ -10,7 +10,7 @@ import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from hybridlog.entries import new_id, recording_metadata, sealed_event, text
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
+from hybridlog.maintenance.retention import Rules
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -103,6 +104,8 @@ class Capture:
         self._directory = directory
         self._no_index = no_index or (lambda _: False)
         self._sync = settings.sync != "never"
+        largest = Rules.of(directory.settings.retention).segment_size
+        settings = replace(settings, segment_size=int(min(settings.segment_size, largest)))
         self._end: Mapping[str, Any] | None = None
         self._turn = 1
         self._held = ExitStack()

@@ -49,6 +49,7 @@ COMPACTED: Final = "compacted"
 EXPIRED: Final = "expired"
 PINNED: Final = "pinned"
 UNPINNED: Final = "unpinned"
+RETAINED: Final = "retained"
 RESERVED: Final = ("signature",)
 """Events of later versions; this version preserves and ignores them."""
 
@@ -157,6 +158,8 @@ class JournalState:
         expired: Topics with expired messages, by the number of their segment.
         thinned: Digest and size of each segment without moved or expired chunks, by its number;
             a later one follows an earlier one.
+        retained: Segments that a rule of retention was applied to: topics whose payloads have
+            expired, None for all.
         end: The end of the recording; None while it is running.
         moving: Old and new label of a rename that is not finished, else None.
         removing: Whether a removal began.
@@ -181,6 +184,7 @@ class JournalState:
     deleted: set[str] = field(default_factory=set)
     expired: dict[int, set[str]] = field(default_factory=dict)
     thinned: dict[int, list[tuple[str, int]]] = field(default_factory=dict)
+    retained: dict[int, frozenset[str] | None] = field(default_factory=dict)
     end: dict[str, Any] | None = None
     moving: tuple[str, str] | None = None
     removing: bool = False
@@ -235,6 +239,8 @@ class JournalState:
             self._pin(line)
         elif name == UNPINNED:
             self.pins.pop(_text(line["id"]), None)
+        elif name == RETAINED:
+            self._retain(line)
 
     def _begin(self, line: Event) -> None:
         if self.begun:
@@ -263,6 +269,13 @@ class JournalState:
         if None not in (pin["from"], pin["to"]) and pin["to"] < pin["from"]:
             raise ValueError("a pin that ends before it begins")
         self.pins[pin["id"]] = pin
+
+    def _retain(self, line: Event) -> None:
+        topics = _TOPICS(line.get("topics"))
+        for number in [_segment(one) for one in _list(line["segments"])]:
+            before = self.retained.get(number, frozenset())
+            whole = topics is None or before is None
+            self.retained[number] = None if whole else frozenset({*(before or ()), *topics})
 
     def _seal(self, line: Event) -> None:
         channels = tuple(_values(channel, _CHANNEL) for channel in _list(line["channels"]))
@@ -570,10 +583,11 @@ _MARK: Final[Mapping[str, _Check]] = {
     "tags": _tags,
     "segment": _segment,
 }
+_TOPICS: Final = _or_none(lambda value: [_text(topic) for topic in _list(value)])
 _PIN: Final[Mapping[str, _Check]] = {
     "id": _text,
     **dict.fromkeys(("from", "to"), _or_none(_time)),
-    "topics": _or_none(lambda value: [_text(topic) for topic in _list(value)]),
+    "topics": _TOPICS,
     "reason": lambda value: "" if value is None else _text(value),
 }
 _SOURCE: Final[Mapping[str, _Check]] = {

@@ -394,6 +394,11 @@ COMMANDS: dict[str, list[Asked]] = {
         refused(f"compact -r {LABEL} -q", 5),
         asked("compact --json", lambda a, _: a.json, lambda _: []),
     ],
+    "keep": [
+        # Sealed segments of a running recording are left to its recorder.
+        asked("keep --max-age 0s --json", lambda a, _: a.json["plan"]["steps"], lambda _: []),
+        asked("keep --pins --json", lambda a, _: a.json, lambda _: []),
+    ],
     "rename": [refused(f"rename {LABEL} other", 5)],
     "tag": [
         refused(f"tag {LABEL} a=b", 5),

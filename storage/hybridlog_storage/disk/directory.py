@@ -23,11 +23,11 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
@@ -185,16 +185,22 @@ class StoreDirectory:
         Raises:
             StoreError: They cannot be written.
         """
-        if feature in self.settings.requires:
-            return
+        if feature not in self.settings.requires:
+            others = [one for one in read_settings(self.path).requires if one != feature]
+            self.change_settings(requires=(*others, feature))
+
+    def change_settings(self, **changes: Any) -> None:
+        """Change settings of the store.
+
+        Raises:
+            StoreError: They cannot be written.
+        """
         with self.alone():
-            settings = read_settings(self.path)
-            if feature not in settings.requires:
-                settings = replace(settings, requires=(*settings.requires, feature))
-                try:
-                    write_settings(self.path, settings)
-                except OSError as error:
-                    raise durability.explain(error, self.path, "writing settings of") from error
+            settings = replace(read_settings(self.path), **changes)
+            try:
+                write_settings(self.path, settings)
+            except OSError as error:
+                raise durability.explain(error, self.path, "writing settings of") from error
             self.settings = settings
 
     @property
@@ -432,6 +438,19 @@ class StoreDirectory:
                 yield
         except OSError as error:
             raise durability.explain(error, self.path, "locking") from error
+
+    @contextmanager
+    def retaining(self) -> Iterator[bool]:
+        """Lock out other passes of retention; yields False if another process makes one."""
+        with ExitStack() as held:
+            try:
+                held.enter_context(_alone(self.path, depth=0, wait=False))
+            except BlockingIOError:
+                yield False
+                return
+            except OSError as error:
+                raise unreadable(error, self.path) from error
+            yield True
 
     def id_of(self, label: str) -> str:
         """The id of a recording: by its journal, else by most of its segments.

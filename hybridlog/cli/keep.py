@@ -1,0 +1,258 @@
+"""`hybridlog keep`: rules of retention, and pins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.query_options import query_of, recordings_of
+from hybridlog.cli.signals import if_stopped
+from hybridlog.query.choice import Choice
+from hybridlog.wording import listed
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.maintenance.keep import Kept
+    from hybridlog.maintenance.retention import Step
+    from hybridlog.store import Store
+
+_MAX_PINS = 1000
+
+
+@click.command()
+@click.option("--quota", metavar="SIZE", help="The most that the store may take, such as 200GB.")
+@click.option("--min-free", metavar="SIZE", help="The least that stays free on the disk.")
+@click.option("--max-age", metavar="DURATION", help="Payloads older than this go, such as 30d.")
+@click.option(
+    "--topic",
+    "-t",
+    multiple=True,
+    metavar="TOPIC=AGE",
+    help="Payloads of this topic go at this age, and first when room is short; earlier ones "
+    "before later ones. With --pin: TOPIC alone, to pin only this topic. Repeatable.",
+)
+@click.option(
+    "--never-tag",
+    multiple=True,
+    metavar="K=V",
+    help="Nothing of recordings with this tag goes; K alone is any value. Repeatable.",
+)
+@click.option(
+    "--fields-age",
+    metavar="DURATION",
+    help="Recordings older than this go, with fields and counts, such as 2y.",
+)
+@click.option("--save", is_flag=True, help="Write these rules into the store, for recorders too.")
+@click.option("--dry-run", is_flag=True, help="Only say what would go.")
+@click.option("--pin", is_flag=True, help="Pin recordings, or a time of them: it never goes.")
+@click.option("--at", metavar="T", help="With --pin: the time around T, see --before and --after.")
+@click.option(
+    "--when",
+    multiple=True,
+    metavar="TOPIC: PREDICATE",
+    help="With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around messages "
+    "of a topic alone, or of marks. Repeatable.",
+)
+@click.option("--before", default="0s", metavar="TIME", help="With --pin: so much before it, too.")
+@click.option("--after", default="0s", metavar="TIME", help="With --pin: so much after it, too.")
+@click.option("--reason", default="", metavar="TEXT", help="With --pin: why.")
+@click.option("--unpin", multiple=True, metavar="PIN", help="Remove a pin. Repeatable.")
+@click.option("--pins", is_flag=True, help="List the pins.")
+@options.choice
+@options.store
+@options.mongo
+@options.as_json
+@options.quiet
+def keep_command(
+    *,
+    choice: Choice,
+    store: Path | None,
+    mongo: str | None,
+    as_json: bool,
+    quiet: bool,
+    **given: Any,
+) -> None:
+    """Keep the store within a quota; pin what never goes.
+
+    Payloads go, fields and counts stay. Without options for rules, those of [retention] in
+    hybridlog.toml hold. Above 80 % of the quota payloads of the topics of --topic go, above
+    90 % whole segments, the oldest first. Exits with 1 when not enough may go.
+    """
+    pinning = [name for name in ("pin", "pins", "unpin") if given[name]]
+    rules = _rules(given) if not given["pin"] else {}
+    _check(pinning, rules, choice, given)
+    with opened_store(store, mongo, quiet=quiet or as_json) as opened:
+        if given["pin"]:
+            found = _pin(opened, choice, given)
+            if as_json:
+                output.print_json(found)
+            elif not quiet:
+                output.say(f"{output.counted(len(found), 'pin')}: {listed(found)}")
+        elif given["unpin"]:
+            opened.unpin(*given["unpin"])
+        elif given["pins"]:
+            _show_pins(opened, choice, as_json=as_json)
+        else:
+            _keep(opened, rules, given, as_json=as_json, quiet=quiet)
+
+
+def _rules(given: dict[str, Any]) -> dict[str, Any]:
+    """Options in the form of the table `[retention]`."""
+    named = {key.replace("_", "-"): given[key] for key in ("quota", "min_free", "max_age")}
+    named |= {"fields-age": given["fields_age"], "never-tag": [*given["never_tag"]]}
+    topics = [word.rpartition("=") for word in given["topic"]]
+    for word, (pattern, _, age) in zip(given["topic"], topics, strict=True):
+        if not pattern or not age:
+            raise UsageError(f"--topic takes TOPIC=AGE, such as '/camera/**=7d', not {word!r}.")
+    named["topic"] = {pattern: age for pattern, _, age in topics}
+    return {key: value for key, value in named.items() if value}
+
+
+def _check(
+    pinning: list[str], rules: dict[str, Any], choice: Choice, given: dict[str, Any]
+) -> None:
+    """Refuse options that do not go together.
+
+    Raises:
+        UsageError: They do not.
+    """
+    if len(pinning) > 1 or (pinning and (rules or given["save"] or given["dry_run"])):
+        raise UsageError("Give --pin, --unpin, --pins or rules, one of them at a time.")
+    if not given["pin"] and (given["at"] or given["when"] or given["reason"]):
+        raise UsageError("--at, --when and --reason are for --pin.")
+    if given["pin"] and choice.is_everything:
+        raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
+    if not pinning and not choice.is_everything:
+        raise UsageError("Rules are for the whole store; --never-tag leaves recordings out.")
+    if given["save"] and not rules:
+        raise UsageError("--save needs rules: --quota 200GB.")
+
+
+def _pin(store: Store, choice: Choice, given: dict[str, Any]) -> list[str]:
+    """Pin what is asked for; returns the names of the pins."""
+    topics = None
+    if given["topic"]:
+        topics = query_of(store, given["topic"], choice).topics
+    spans = [*_spans(store, choice, given)]
+    if len(spans) > _MAX_PINS:
+        raise UsageError(
+            f"These are {len(spans)} times, and {_MAX_PINS} can be pinned at once: join them "
+            "with --before and --after."
+        )
+    if not spans:
+        raise UsageError("Nothing to pin: the predicate never held.")
+    reason = given["reason"] or "; ".join(given["when"])
+    return [store.pin(name, begin, end, topics, reason) for name, begin, end in spans]
+
+
+def _spans(
+    store: Store, choice: Choice, given: dict[str, Any]
+) -> Iterator[tuple[str, int | None, int | None]]:
+    """Id of a recording, begin and end of what is to be pinned of it; None for all."""
+    from hybridlog.query.times import parse_duration, parse_time
+    from hybridlog.query.topics import split_topic
+    from hybridlog.record.losses import extent_of
+
+    before, after = given["before"], given["after"]
+    if given["at"] is not None:
+        for entry in recordings_of(store, choice):
+            start, end = extent_of(entry)
+            at = parse_time(given["at"], start=start, end=end)
+            yield entry.id, at - parse_duration(before), at + parse_duration(after) + 1
+    elif not given["when"]:
+        yield from ((one.id, None, None) for one in recordings_of(store, choice).summaries)
+    for condition in given["when"]:
+        pattern, predicate = split_topic(condition)
+        query = query_of(store, [pattern], choice)
+        query = query.where(predicate) if predicate else query
+        if predicate and not _are_marks(store, query.topics):
+            found = query.intervals().widened(before, after)
+        else:
+            found = query.windows(before, after)
+        # A moment is a range of one nanosecond.
+        yield from ((one.recording, one.begin_ns, one.end_ns + 1) for one in found)
+
+
+def _are_marks(store: Store, topics: Sequence[str]) -> bool:
+    from hybridlog.query.answers.marks import mark_topics
+
+    return {*topics} <= {*mark_topics(store.session)}
+
+
+def _show_pins(store: Store, choice: Choice, *, as_json: bool) -> None:
+    chosen = recordings_of(store, choice)
+    rows = [{"recording": entry.label, **pin} for entry in chosen for pin in entry.pins]
+    if as_json:
+        output.print_json(rows)
+    elif rows:
+        cells = [[row["id"], row["recording"], *pin_cells(row)] for row in rows]
+        names = ("pin", "recording", "from", "to", "topics", "reason")
+        output.print_table([(name, "left") for name in names], cells)
+
+
+def pin_cells(pin: dict[str, Any]) -> list[str]:
+    """From, to, topics and reason of a pin."""
+    from hybridlog.query.times import format_time
+
+    times = ["-" if pin[key] is None else format_time(pin[key]) for key in ("from", "to")]
+    return [*times, "all" if pin["topics"] is None else listed(pin["topics"]), pin["reason"]]
+
+
+def _keep(
+    store: Store, rules: dict[str, Any], given: dict[str, Any], *, as_json: bool, quiet: bool
+) -> None:
+    from hybridlog.maintenance.retention import Rules
+
+    wanted = rules or store.directory.settings.retention
+    if Rules.of(wanted).is_empty:
+        raise UsageError(
+            "No rule says what may go: give --quota, --min-free, --max-age, --topic or "
+            "--fields-age, or write them into [retention] of hybridlog.toml, as --save does."
+        )
+    if given["save"]:
+        store.directory.check_writable()
+        store.directory.change_settings(retention=rules)
+    dry_run = given["dry_run"]
+    with (
+        if_stopped("What was not deleted is as it was; run it again."),
+        progress_bar("keep", 0, quiet=quiet or as_json) as bar,
+    ):
+        found = store.keep(wanted, dry_run=dry_run, progress=Stages(bar))
+    if as_json:
+        output.print_json({**asdict(found), "dry_run": dry_run})
+    elif not quiet:
+        for line in _lines(found, dry_run=dry_run):
+            output.say(line)
+    for problem in (*found.problems, *found.plan.warnings):
+        output.note(problem)
+    if found.problems or found.plan.is_short:
+        raise click.exceptions.Exit(1)
+
+
+def _lines(found: Kept, *, dry_run: bool) -> Iterator[str]:
+    plan = found.plan
+    yield from (_told(step) for step in plan.steps)
+    pinned = f", {output.size(plan.pinned_bytes)} pinned" if plan.pinned_bytes else ""
+    count = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
+    did = f"{output.size(count)} would become free" if dry_run else f"{output.size(count)} freed"
+    yield (
+        f"{output.size(plan.used_bytes)} used{pinned}, {output.size(plan.free_bytes)} free: {did}"
+    )
+
+
+def _told(step: Step) -> str:
+    """A line about a deletion."""
+    what = "all of it"
+    if step.segments:
+        first, last = step.segments[0], step.segments[-1]
+        what = f"segment {first}" if first == last else f"segments {first} to {last}"
+        if step.topics:
+            what = f"{listed(step.topics)} in {what}"
+    return f"{step.recording}: {what}, about {output.size(step.bytes)}: {step.reason}"

@@ -1,0 +1,226 @@
+"""Passes of retention: takes stock, makes the plan, and lets `expire` do each step.
+
+A pass reads journals only. A recorder makes passes for its own recording and for those that
+have ended; what others record is left to them.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.maintenance.expiry import expire
+from hybridlog.maintenance.retention import (
+    Held,
+    Plan,
+    Rules,
+    Step,
+    held_of,
+    pinned_topics,
+    plan,
+)
+from hybridlog.maintenance.sizes import disk_bytes
+from hybridlog_storage import journal
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_settled
+from hybridlog_storage.errors import DiskFullError, HeldError, StoreError, TopicError
+from hybridlog_storage.journal import Journal
+
+if TYPE_CHECKING:
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.journal import Event, JournalState
+
+_MAX_ROUNDS: Final = 20  # fields take room, too: then a little more has to go
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """The recording that this process makes; it holds the lock of it.
+
+    Attributes:
+        label: Its label.
+        first_unread: Returns the number of the first segment that it still reads.
+        sealed: Returns the number of segments sealed so far.
+    """
+
+    label: str
+    first_unread: Callable[[], int]
+    sealed: Callable[[], int]
+
+
+@dataclass(slots=True)
+class Kept:
+    """The result of a pass.
+
+    Attributes:
+        plan: The store at its beginning, and what was planned in all.
+        freed_bytes: Bytes that became free.
+        problems: What could not be done, in sentences.
+    """
+
+    plan: Plan
+    freed_bytes: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+class Keeper:
+    """Applies rules of retention to a store.
+
+    Args:
+        directory: The store.
+        remove: Removes a whole recording, by its id.
+        own: The recording that this process makes; None if it makes none.
+        is_wanted: Returns whether to go on; asked before each deletion.
+    """
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        remove: Callable[[str], None],
+        own: Own | None = None,
+        *,
+        is_wanted: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self._directory = directory
+        self._remove = remove
+        self._own = own
+        self._is_wanted = is_wanted
+        self._known: dict[str, tuple[str, Held]] = {}  # by label, with its look
+        self._failed: set[str] = set()  # ids of recordings that this pass could not change
+
+    def plan(self, rules: Rules) -> Plan:
+        """What would go now."""
+        path, now = self._directory.path, time.time_ns()
+        used, free = disk_bytes(path), shutil.disk_usage(path).free
+        return plan(self._held(now), rules, used=used, free=free, now=now)
+
+    def keep(self, rules: Rules, progress: Progress | None = None) -> Kept:
+        """Let go what has to go.
+
+        Raises:
+            HeldError: Another process makes a pass.
+        """
+        with self._directory.retaining() as is_alone:
+            if not is_alone:
+                raise HeldError(
+                    "Another process makes room in this store already.", is_recording=False
+                )
+            self._failed.clear()
+            found = Kept(self.plan(rules))
+            planned = found.plan
+            for _ in range(_MAX_ROUNDS):
+                if not planned.steps:
+                    break
+                for step in planned.steps:
+                    if not self._is_wanted():
+                        return found
+                    self._do(step, found, progress)
+                planned = self.plan(rules)
+                found.plan.steps += planned.steps
+            found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
+        return found
+
+    def _held(self, now: int) -> Iterator[Held]:
+        """What the recordings hold; damaged ones are left alone."""
+        looks = self._directory.looks(self._directory.names())
+        self._known = {label: known for label, known in self._known.items() if label in looks}
+        for label, look in looks.items():
+            before, held = self._known.get(label, ("", None))
+            if before != look or held is None:
+                with suppress(StoreError):
+                    held = self._read(label, now)
+                if held is not None and is_settled(look):
+                    self._known[label] = look, held
+            if held is None or held.id in self._failed:
+                continue
+            if self._own is not None and label == self._own.label:
+                unread = self._own.first_unread()
+                yield replace(held, segments=[s for s in held.segments if s.number < unread])
+            else:
+                yield held if held.is_ended else replace(held, segments=[])
+
+    def _read(self, label: str, now: int) -> Held | None:
+        state = journal.read(self._directory.recording(label))
+        if state is None or not state.begun or state.damaged or state.removing:
+            return None
+        return held_of(label, state, now)
+
+    def _do(self, step: Step, found: Kept, progress: Progress | None) -> None:
+        try:
+            if not step.segments:
+                self._remove(step.id)
+                found.freed_bytes += step.bytes
+                return
+            with self._locked(step) as label:
+                found.freed_bytes += self._expire(step, label, progress)
+        except DiskFullError:
+            raise
+        except (StoreError, TopicError) as error:
+            self._failed.add(step.id)
+            found.problems.append(str(error))
+
+    @contextmanager
+    def _locked(self, step: Step) -> Iterator[str]:
+        """The present label of a recording that nobody else writes."""
+        if self._own is not None and step.recording == self._own.label:
+            yield self._own.label
+            return
+        with self._directory.writing(step.recording, step.id, wait_s=LOCK_WAIT_S) as label:
+            yield label
+
+    def _expire(self, step: Step, label: str, progress: Progress | None) -> int:
+        def check(state: JournalState) -> None:
+            for number in step.segments:
+                pinned = pinned_topics(state.sealed[number], state)
+                if pinned & {*step.topics} if step.topics else pinned:
+                    raise StoreError(f"{label}: a pin was set meanwhile.")
+
+        log = Journal(self._directory.recording(label), check=check)
+        topics = step.topics or None
+        done = expire(self._directory, label, step.segments, topics, log=log, progress=progress)
+        said = {} if topics is None else {"topics": [*topics]}
+        log.append(journal.event(journal.RETAINED, segments=[*step.segments], **said))
+        return done.freed
+
+
+def append_pins(
+    directory: StoreDirectory, label: str, recording: str, lines: Sequence[Event]
+) -> None:
+    """Append lines about pins to the journal of a recording, also of a running one.
+
+    Args:
+        directory: The store.
+        label: Label of the recording.
+        recording: Its id.
+        lines: The lines.
+
+    Raises:
+        StoreError: Another command holds it, or it cannot be written.
+        TopicError: It is gone.
+    """
+    try:
+        with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
+            Journal(directory.recording(now)).append(*lines)
+            return
+    except HeldError as error:
+        if not error.is_recording:
+            raise
+    path = directory.recording(directory.label_now(label, recording))
+    Journal(path).append(*lines)
+    state = journal.read(path)
+    if state is None or state.id != recording:  # it ended, and was renamed or removed
+        raise StoreError(f"Recording {label!r} was changed meanwhile. Try again.")
+
+
+def pin_of(
+    name: str, span: tuple[int | None, int | None], topics: Sequence[str] | None, reason: str
+) -> dict[str, Any]:
+    """The line about a pin."""
+    begin, end = span
+    values: dict[str, Any] = {"id": name, "from": begin, "to": end, "topics": topics}
+    said = {key: value for key, value in values.items() if value is not None}
+    return journal.event(journal.PINNED, **said, reason=reason)

@@ -1,0 +1,372 @@
+"""`hybridlog keep`: passes of retention and pins, on stores of many small segments."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import struct
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.cli.keep import keep_command
+from hybridlog.maintenance import keep as keeping
+from hybridlog.maintenance.expiry import Expired
+from hybridlog.maintenance.keep import Keeper
+from hybridlog.maintenance.retention import Rules
+from hybridlog.maintenance.sizes import disk_bytes
+from hybridlog_storage import journal
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
+from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.cli.running import run
+from tests.cli.within import answer
+from tests.power import PowerCut
+
+CAMERA = Channel("/camera", "ros1", Schema("a/Image", "ros1msg", b"uint32 n\nuint8[] data\n"), {})
+ARM = Channel("/arm", "ros1", Schema("a/Arm", "ros1msg", b"uint32 n\nfloat64 x\n"), {})
+SECOND = 10**9
+BEGIN = 1_700_000_000 * SECOND
+COUNT = 120
+
+
+def image(number: int) -> bytes:
+    data = random.Random(number).randbytes(4000)
+    return struct.pack("<II", number, len(data)) + data
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with a recording of many segments: a message of each topic a second, two minutes."""
+    path = tmp_path_factory.mktemp("keep") / "store"
+    settings = SegmentSettings(chunk_size=1024, segment_size=50_000)
+    with hl.open(path, mongo="none", create=True) as store:
+        recording = store.start("run", settings=settings)
+        for number in range(COUNT):
+            at = BEGIN + number * SECOND
+            recording.write(CAMERA, image(number), log_time=at)
+            recording.write(ARM, struct.pack("<Id", number, number / 2), log_time=at + 1)
+        recording.close()
+        store.mark("run", "+100s", "slipped", {"trigger": "bump"})
+    return path
+
+
+@pytest.fixture
+def store(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "store", copy_function=shutil.copy2))
+
+
+keep = partial(answer, "keep")
+
+
+def pin(at: str, around: str, path: Path) -> None:
+    """Pin the camera around a time."""
+    words = ("-r", "run", "-t", "camera", "--at", at, "--before", around, "--after", around)
+    keep("--pin", *words, store=path)
+
+
+def payloads(path: Path) -> dict[int, bytes | None]:
+    """Payloads of the camera by number; None for those that have expired."""
+    found: dict[int, bytes | None] = {}
+    with hl.open(path, mongo="none") as opened:
+        for message in opened.topic("/camera"):
+            try:
+                found[message.fields["n"]] = message.raw
+            except PayloadError:
+                found[message.fields["n"]] = None
+    return found
+
+
+def check_answers(path: Path) -> None:
+    """Counts and fields are those of all messages, whatever has expired."""
+    with hl.open(path, mongo="none") as opened:
+        assert opened.topic("/camera").count() == opened.topic("/arm").count() == COUNT
+        assert opened.topic("/arm").where("x >= 30").count() == COUNT - 60
+        assert opened.topic("/camera").between("+10s", "+20s").count() == 10
+        assert [m.fields["n"] for m in opened.topic("/arm")] == [*range(COUNT)]
+        assert opened.recordings()[0].status == "complete"
+        assert opened.verify().findings == []
+
+
+def test_a_pass_makes_room_and_leaves_counts_fields_and_pins(store: Path) -> None:
+    used = disk_bytes(store)
+    pin("+10s", "2s", store)
+    quota = used * 2 // 3
+    (dry, done) = (
+        keep("--quota", quota, "--json", *words, store=store).json for words in (["--dry-run"], [])
+    )
+    assert dry["dry_run"]
+    assert dry["freed_bytes"] == 0
+    (first, *_) = done["plan"]["steps"]
+    assert first == dry["plan"]["steps"][0]
+    assert first["recording"] == "run"
+    assert first["topics"] == []
+    assert f"more than 90% of {quota / 1000:.1f} kB" in first["reason"]
+    gone = sorted(n for step in done["plan"]["steps"] for n in step["segments"])
+    # The oldest went, but for those with what is pinned.
+    state = journal.read(store / "recordings" / "run")
+    assert state is not None
+    free = [
+        number
+        for number, one in state.sealed.items()
+        if all(
+            c["last"] < BEGIN + 8 * SECOND or c["first"] > BEGIN + 12 * SECOND
+            for c in one.channels
+            if c["topic"] == "/camera"
+        )
+    ]
+    assert len(state.sealed) - 2 <= len(free) < len(state.sealed)
+    assert gone == free[: len(gone)]
+    left = payloads(store)
+    assert all(raw is None or raw == image(n) for n, raw in left.items())
+    assert all(left[n] is not None for n in (*range(8, 13), *range(100, COUNT)))
+    assert done["freed_bytes"] > 0.1 * used
+    assert disk_bytes(store) < 0.9 * quota
+    check_answers(store)
+    # What went does not go again.
+    again = keep("--quota", quota, "--json", store=store).json
+    assert again["plan"]["steps"] == []
+
+
+def test_topics_go_and_the_rest_of_their_segments_stays(store: Path) -> None:
+    out = keep("--topic", "/camera=0s", store=store).out
+    assert "/camera in segments" in out
+    assert "/camera older than 0s" in out
+    assert {*payloads(store).values()} == {None}
+    with hl.open(store, mongo="none") as opened:
+        assert [m.raw for m in opened.topic("/arm")] == [
+            struct.pack("<Id", n, n / 2) for n in range(COUNT)
+        ]
+    check_answers(store)
+    assert "0 B freed" in keep("--topic", "/camera=0s", store=store).out
+
+
+def test_a_recording_goes_with_its_fields(store: Path) -> None:
+    assert keep("--fields-age", "1y", "--json", store=store).json["plan"]["steps"] == []
+    keep("--pin", "-r", "run", store=store)
+    assert keep("--fields-age", "0s", "--json", store=store).json["plan"]["steps"] == []
+    (row,) = keep("--pins", "--json", store=store).json
+    keep("--unpin", row["id"], store=store)
+    assert "run: all of it" in keep("--fields-age", "0s", store=store).out
+    with hl.open(store, mongo="none") as opened:
+        assert opened.summaries() == []
+
+
+def test_saved_rules_are_those_of_later_passes(store: Path) -> None:
+    answer("tag", "run", "keep=yes", store=store)
+    rules = ("--quota", "1GB", "--topic", "/camera=0s", "--never-tag", "keep=yes")
+    keep(*rules, "--save", store=store)
+    assert StoreDirectory(store).settings.retention == {
+        "quota": "1GB",
+        "topic": {"/camera": "0s"},
+        "never-tag": ["keep=yes"],
+    }
+    found = keep("--json", store=store).json["plan"]
+    assert found["steps"] == []
+    assert found["pinned_bytes"] > 0
+    answer("untag", "run", "keep", store=store)
+    assert keep("--json", store=store).json["plan"]["steps"]
+
+
+def test_too_little_may_go(store: Path) -> None:
+    keep("--pin", "-r", "run", store=store)
+    found = run("keep", "--quota", "1kB", "--mongo", "none", store=store, code=1)
+    assert "What is pinned takes" in found.err
+    assert "nothing else may" in found.err
+    assert payloads(store)[0] == image(0)
+
+
+# Pins.
+
+
+def pins(path: Path) -> list[tuple[float | None, float | None, Any]]:
+    """Begin and end of each pin in seconds of the recording, and its topics."""
+    rows = keep("--pins", "--json", store=path).json
+    return [
+        (*(None if r[k] is None else (r[k] - BEGIN) // SECOND for k in ("from", "to")), r["topics"])
+        for r in rows
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        (["-r", "run"], [(None, None, None)]),
+        (["--tag", "robot=7"], [(None, None, None)]),
+        (["-r", "run", "--at", "+30s", "--before", "10s", "--after", "5s"], [(20, 35, None)]),
+        (["-r", "run", "--at", "+30s", "--topic", "camera"], [(30, 30, ["/camera"])]),
+        # A predicate: while it held. A message is valid until the next one.
+        (["-r", "run", "--when", "arm: x >= 10 and x < 20"], [(20, 40, None)]),
+        (["-r", "*", "--when", "arm: x = 5", "--before", "3s"], [(7, 11, None)]),
+        # Marks, all or some, and what a trigger has marked.
+        (["-r", "run", "--when", "/hybridlog/marks", "--after", "2s"], [(100, 102, None)]),
+        (["-r", "run", "--when", "/hybridlog/marks: text = 'slipped'"], [(100, 100, None)]),
+        (
+            ["-r", "run", "--when", "/hybridlog/marks: tags.trigger = 'bump'", "--before", "1m"],
+            [(40, 100, None)],
+        ),
+    ],
+)
+def test_what_is_pinned(store: Path, words: list[str], right: list[Any]) -> None:
+    answer("tag", "run", "robot=7", store=store)
+    out = keep("--pin", *words, "--reason", "why not", store=store).out
+    assert pins(store) == right
+    (row,) = keep("--pins", "--json", store=store).json
+    assert row["reason"] == "why not"
+    assert out == f"1 pin: {row['id']}\n"
+    assert row["id"] in keep("--pins", store=store).out
+    assert row["id"] in answer("info", "run", store=store).out
+    assert answer("info", "run", "--json", store=store).json["pins"][0]["id"] == row["id"]
+    keep("--unpin", row["id"], store=store)
+    assert pins(store) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["--pin"],
+        ["--pin", "--pins", "-r", "run"],
+        ["--pin", "-r", "run", "--dry-run"],
+        ["--pin", "-r", "run", "--at", "yesterday"],
+        ["--pin", "-r", "run", "--when", "arm: x > 1000"],
+        ["--pin", "-r", "run", "--when", "nothing: x > 1"],
+        ["--pin", "-r", "other"],
+        ["--unpin", "nothing"],
+        ["--at", "+1s", "--quota", "1GB"],
+        ["--quota", "1GB", "-r", "run"],
+        ["--quota", "much"],
+        ["--topic", "/camera"],
+        ["--max-age", "old"],
+        ["--save"],
+        ["--never-tag", "a=b"],
+    ],
+)
+def test_usage_that_is_refused(store: Path, words: list[str]) -> None:
+    before = files_of(store)
+    keep(*words, store=store, code=2)
+    assert files_of(store) == before
+
+
+def files_of(path: Path) -> dict[str, bytes]:
+    names = [p for p in (path / "recordings").rglob("*") if p.is_file() and p.name != "writer.lock"]
+    return {str(p): p.read_bytes() for p in [*names, path / "hybridlog.toml"]}
+
+
+def test_the_options_are_those_of_the_table() -> None:
+    names = {p.name for p in keep_command.params}
+    assert {"quota", "min_free", "max_age", "topic", "never_tag", "fields_age"} <= names
+
+
+def test_a_pin_set_meanwhile_stops_what_is_not_announced(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pinned_before(*words: Any, **options: Any) -> Expired:
+        with hl.open(store, mongo="none") as other:
+            (entry,) = other.recordings()
+            line = keeping.pin_of("now", (None, None), None, "")
+            journal.Journal(other.directory.recording(entry.label)).append(line)
+        monkeypatch.undo()
+        return keeping.expire(*words, **options)
+
+    monkeypatch.setattr(keeping, "expire", pinned_before)
+    assert "a pin was set meanwhile" in keep("--max-age", "0s", store=store).err
+    assert all(raw == image(n) for n, raw in payloads(store).items())
+    check_answers(store)
+
+
+def test_one_process_at_a_time(store: Path) -> None:
+    with StoreDirectory(store).retaining() as is_alone:
+        assert is_alone
+        with hl.open(store, mongo="none") as opened, pytest.raises(StoreError, match="already"):
+            opened.keep({"max-age": "0s"})
+    assert payloads(store)[0] == image(0)
+
+
+# What a crash leaves.
+
+
+def cut_pass(path: Path, calls: int | None, monkeypatch: pytest.MonkeyPatch) -> PowerCut:
+    """Make a pass that lets go all but what is pinned; the power fails at a call."""
+    power = PowerCut(path, calls)
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "system", power)
+        opened = None
+        with suppress(HybridlogError, OSError):
+            opened = hl.open(path, mongo="none")
+            opened.keep({"topic": {"/camera": "0s"}})
+            opened.keep({"max-age": "0s"})
+        if opened is not None:
+            with suppress(HybridlogError, OSError):
+                opened.close()
+    return power
+
+
+CUTS = [
+    *(n / 7 for n in range(7)),
+    *(pytest.param(n / 100, marks=pytest.mark.exhaustive) for n in range(100)),
+]
+
+
+@pytest.mark.parametrize("share", CUTS)
+def test_a_cut_costs_no_pinned_byte_and_no_count(
+    tmp_path: Path, recorded: Path, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Path(shutil.copytree(recorded, tmp_path / "store", copy_function=shutil.copy2))
+    pin("+50s", "9s", store)
+    whole = Path(shutil.copytree(store, tmp_path / "whole", copy_function=shutil.copy2))
+    calls = cut_pass(whole, None, monkeypatch).calls
+    assert calls > 100
+    power = cut_pass(store, 1 + round(share * calls), monkeypatch)
+    for fate in range(3):
+        found = tmp_path / f"found{fate}"
+        power.after_cut(found, random.Random(f"{share}{fate}"))
+        for _ in range(2):  # as it was left, and after another pass
+            left = payloads(found)
+            assert all(left[n] == image(n) for n in range(41, 60))
+            assert all(raw is None or raw == image(n) for n, raw in left.items())
+            check_answers(found)
+            keep("--max-age", "0s", store=found)
+        assert left[0] is None
+
+
+# What a pass costs.
+
+
+class Counting(files.System):
+    """Counts files that are opened."""
+
+    def __init__(self) -> None:
+        self.opened: list[str] = []
+
+    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
+        self.opened.append(name)
+        return super().open(name, flags, mode, folder=folder)
+
+
+def test_a_plan_opens_each_journal_once(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hl.open(tmp_path / "many", mongo="none", create=True) as store:
+        directory = store.directory
+    data = (recorded / "recordings" / "run" / "journal").read_bytes()
+    lines = [line for _, line in journal.read_lines(data) if line is not None]
+    for number in range(1000):
+        lines[0]["id"] = f"{number:032x}"
+        (directory.recordings / f"r{number}").mkdir()
+        journal.Journal(directory.recordings / f"r{number}", sync=False).append(*lines)
+    keeper = Keeper(directory, lambda _: None)
+    rules = Rules.of({"max-age": "0s"})
+    counting = Counting()
+    monkeypatch.setattr(files, "system", counting)
+    assert len(keeper.plan(rules).steps) == 1000
+    assert counting.opened == ["journal"] * 1000
+    counting.opened.clear()
+    assert keeper.plan(rules).steps
+    assert counting.opened == []

@@ -1,0 +1,271 @@
+"""Rules of retention: what goes, in what order, why, and what never goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, plan
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.journal import (
+    BEGUN,
+    ENDED,
+    PINNED,
+    RETAINED,
+    SEALED,
+    TAGGED,
+    UNPINNED,
+    JournalState,
+    encode,
+    event,
+    parse,
+)
+
+DAY = 86_400 * 10**9
+NOW = 20_000 * DAY  # 2024
+MB = 10**6
+CAMERA, SCAN = "/camera/front", "/scan"
+
+
+def sealed(number: int, age: float, **other: Any) -> dict[str, Any]:
+    """A segment of 10 MB, 8 of them of a camera, that was written so many days ago."""
+    at = NOW - round(age * DAY)
+    channels = [
+        {"id": n, "topic": t, "messages": 9, "payload_bytes": b, "first": at - DAY, "last": at - 1}
+        for n, (t, b) in enumerate(((CAMERA, 8 * MB), (SCAN, 2 * MB)))
+    ]
+    values = {
+        "segment": number,
+        "file": f"{number:06d}.mcap",
+        "bytes": 10 * MB,
+        "digest": "sha256:a",
+        "channels": channels,
+    }
+    return {**event(SEALED, **{**values, **other}), "at": at}
+
+
+def state_of(name: str, *lines: Mapping[str, Any], ended: bool = True) -> JournalState:
+    begun = event(
+        BEGUN,
+        id=f"{sum(name.encode()):032x}",
+        store="5" * 32,
+        name=name,
+        tags={},
+        source={"path": "", "kind": "", "bytes": 0},
+        created=NOW - 400 * DAY,
+    )
+    end = [event(ENDED, end={"status": "complete", "losses": []})] if ended else []
+    state = parse(b"".join(map(encode, [begun, *lines, *end])))
+    assert not state.damaged
+    return state
+
+
+def held(name: str, *lines: Mapping[str, Any], ended: bool = True) -> Held:
+    return held_of(name, state_of(name, *lines, ended=ended), NOW)
+
+
+def made(rules: Mapping[str, Any], *recordings: Held, used: float = 0, free: float = 1e12) -> Plan:
+    return plan(recordings, Rules.of(rules), used=round(used), free=round(free), now=NOW)
+
+
+def told(found: Plan) -> list[tuple[str, tuple[int, ...], tuple[str, ...], str]]:
+    return [(one.recording, one.segments, one.topics, one.reason) for one in found.steps]
+
+
+OLD = held("old", sealed(0, 50), sealed(1, 40), sealed(2, 20))
+NEW = held("new", sealed(0, 10), sealed(1, 5))
+
+
+def test_payloads_of_topics_go_at_their_age_and_segments_at_theirs() -> None:
+    rules = {"max-age": "30d", "topic": {"/camera/**": "7d"}}
+    assert told(made(rules, NEW, OLD)) == [
+        ("old", (0, 1), (), "older than 30d"),
+        ("old", (2,), (CAMERA,), "/camera/** older than 7d"),
+        ("new", (0,), (CAMERA,), "/camera/** older than 7d"),
+    ]
+    assert [one.bytes for one in made(rules, OLD).steps] == [20 * MB, 8 * MB]
+    assert made({"max-age": "60d"}, OLD, NEW).steps == []
+
+
+@pytest.mark.parametrize(
+    ("used", "free", "steps"),
+    [
+        # Below 80 % of 100 MB nothing, then the camera, above 90 % whole segments.
+        (80, 99, []),
+        (81, 99, [("old", (0,), (CAMERA,))]),
+        (90, 99, [("old", (0, 1), (CAMERA,))]),
+        (91, 99, [("old", (0, 1), ())]),
+        (121, 99, [("old", (0, 1, 2), ()), ("new", (0, 1), ())]),
+        # Free space acts alike: 20 MB are to stay free.
+        (1, 25, []),
+        (1, 24, [("old", (0,), (CAMERA,))]),
+        (1, 19, [("old", (0,), ())]),
+        (1, 5, [("old", (0, 1), ())]),
+        (95, 5, [("old", (0, 1), ())]),
+    ],
+)
+def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[Any]) -> None:
+    rules = {"quota": "100MB", "min-free": "20MB", "topic": {CAMERA: "1y"}}
+    found = made(rules, NEW, OLD, used=used * MB, free=free * MB)
+    assert [one[:3] for one in told(found)] == steps
+    assert not found.is_short
+
+
+def test_a_reason_says_what_was_short() -> None:
+    rules = {"quota": "100MB", "min-free": "20MB", "topic": {CAMERA: "1y"}}
+    (whole,) = made(rules, OLD, used=91 * MB).steps
+    assert whole.reason == "more than 90% of 100.0 MB is used"
+    (topics,) = made(rules, OLD, used=81 * MB).steps
+    assert topics.reason == "/camera/front: more than 80% of 100.0 MB is used"
+    (low,) = made(rules, OLD, used=1, free=24 * MB).steps
+    assert low.reason == "/camera/front: less than 25.0 MB is free"
+
+
+def test_topics_go_in_the_order_of_their_rules() -> None:
+    rules = {"quota": "100MB", "topic": {"scan": "1y", "/**": "2y"}}
+    found = made(rules, NEW, OLD, used=98.5 * MB - 9 * MB)
+    # 9.5 MB: the scan of all five segments is 10 MB; nothing of the camera goes.
+    assert told(found) == [
+        ("old", (0, 1, 2), ("/scan",), "scan: more than 80% of 100.0 MB is used"),
+        ("new", (0, 1), ("/scan",), "scan: more than 80% of 100.0 MB is used"),
+    ]
+
+
+def test_what_went_does_not_go_again() -> None:
+    once = held(
+        "old",
+        sealed(0, 50),
+        sealed(1, 40),
+        event(RETAINED, segments=[0]),
+        event(RETAINED, segments=[1], topics=[CAMERA]),
+    )
+    assert told(made({"topic": {CAMERA: "7d"}}, once)) == []
+    found = made({"max-age": "30d"}, once)
+    assert told(found) == [("old", (1,), (), "older than 30d")]
+    # All topics of a segment are gone, and what shared chunks with others is left.
+    both = held("old", sealed(1, 40), event(RETAINED, segments=[1], topics=[CAMERA, SCAN]))
+    assert told(made({"max-age": "30d"}, both)) == [("old", (1,), (), "older than 30d")]
+
+
+def test_all_topics_of_a_segment_are_the_segment() -> None:
+    found = made({"topic": {"/**": "7d"}}, OLD)
+    assert told(found) == [("old", (0, 1, 2), (), "/** older than 7d")]
+
+
+@pytest.mark.parametrize(
+    ("pin", "whole", "topics"),
+    [
+        ({}, [], []),
+        ({"from": NOW - 41 * DAY, "to": NOW - 40 * DAY}, [0, 2], [0, 2]),
+        # Half-open: it ends where the second segment begins.
+        ({"to": NOW - 41 * DAY}, [1, 2], [1, 2]),
+        ({"from": NOW - 40 * DAY}, [0, 1], [0, 1]),
+        ({"topics": [SCAN]}, [], [0, 1, 2]),
+        ({"topics": [CAMERA], "from": NOW - 30 * DAY}, [0, 1], [0, 1]),
+        ({"topics": ["/other"]}, [0, 1, 2], [0, 1, 2]),
+    ],
+)
+def test_what_a_pin_touches_never_goes(
+    pin: dict[str, Any], whole: list[int], topics: list[int]
+) -> None:
+    lines = sealed(0, 50), sealed(1, 40), sealed(2, 20), event(PINNED, id="a", reason="", **pin)
+    for rules, left in (({"max-age": "1d"}, whole), ({"topic": {CAMERA: "1d"}}, topics)):
+        found = made({**rules, "quota": "1MB", "fields-age": "10d"}, held("r", *lines), used=1e9)
+        assert [n for one in found.steps for n in one.segments if not one.topics] == whole
+        assert {n for one in found.steps for n in one.segments} == {*left}
+    assert found.pins == 1
+    assert found.is_short
+    without = held("r", *lines, event(UNPINNED, id="a"))
+    assert [one.segments for one in made({"max-age": "1d"}, without).steps] == [(0, 1, 2)]
+
+
+def test_a_tag_keeps_a_recording_and_is_told_like_pins() -> None:
+    tagged = held("old", sealed(0, 50), event(TAGGED, key="keep", value="yes"))
+    for tag in ("keep=yes", "keep"):
+        rules = {"max-age": "1d", "fields-age": "1d", "quota": "10MB", "never-tag": [tag]}
+        found = made(rules, tagged, NEW, used=20 * MB)
+        assert [one.recording for one in found.steps] == ["new"]
+        assert found.pinned_bytes == 10 * MB
+        assert "10.0 MB of the quota of 10.0 MB" in found.warnings[0]
+    rules = {"max-age": "1d", "never-tag": ["keep=no"]}
+    assert [one.recording for one in made(rules, tagged).steps] == ["old"]
+    assert made({"quota": "20MB", "never-tag": ["keep"]}, tagged).warnings == []
+
+
+def test_fields_go_with_their_recording() -> None:
+    rules = {"fields-age": "25d", "max-age": "1d"}
+    assert (
+        told(made(rules, OLD, NEW))
+        == [
+            ("new", (0, 1), (), "older than 1d"),
+            ("old", (0, 1, 2), (), "older than 1d"),
+        ][::-1]
+    )
+    rules["fields-age"] = "20d"
+    assert told(made(rules, OLD, NEW))[0] == ("old", (), (), "fields older than 20d")
+    running = held("old", sealed(0, 50), ended=False)
+    assert told(made(rules, running)) == [("old", (0,), (), "older than 1d")]
+
+
+@pytest.mark.parametrize(
+    ("ages", "last", "old"),
+    [
+        # A log of long ago that was recorded now is new; one with times to come, too.
+        ([1], -4000, []),
+        ([1], 4000, []),
+        # The clock was ahead, and was set: a segment is not newer than those behind it.
+        ([-4000, 50], None, [0, 1]),
+        ([-4000, 5], None, []),
+        # The clock was not set yet: nobody knows how old it is.
+        ([19_990, 5], None, []),
+        ([19_990, 50], None, [1]),
+    ],
+)
+def test_ages_in_spite_of_clocks(ages: list[int], last: int | None, old: list[int]) -> None:
+    lines = [sealed(number, age) for number, age in enumerate(ages)]
+    if last is not None:
+        for channel in lines[0]["channels"]:
+            channel["first"] = channel["last"] = NOW + last * DAY
+    found = made({"max-age": "30d"}, held("r", *lines))
+    assert [n for one in found.steps for n in one.segments] == old
+    # By room they go all the same, in their order.
+    room = made({"quota": "1MB"}, held("r", *lines), used=1e9)
+    assert [n for one in room.steps for n in one.segments] == [*range(len(ages))]
+
+
+@pytest.mark.parametrize(
+    ("quota", "size"),
+    [("1MB", 4 << 20), ("1GB", 20_000_000), ("200GB", 1 << 30), (None, float("inf"))],
+)
+def test_a_quota_says_how_large_segments_are(quota: str | None, size: float) -> None:
+    assert Rules.of({} if quota is None else {"quota": quota}).segment_size == size
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"quota": "much"},
+        {"quota": [1]},
+        {"max-age": "old"},
+        {"max-age": True},
+        {"min_free": "1GB"},
+        {"topic": ["/camera"]},
+        {"topic": {"/camera": "x"}},
+        {"topic": {"re:(": "7d"}},
+        {"never-tag": "=x"},
+        {"never-tag": 5},
+        {"fields-age": "-1d"},
+    ],
+)
+def test_rules_that_are_none(values: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        Rules.of(values)
+
+
+def test_no_rule_lets_nothing_go() -> None:
+    assert Rules.of({}).is_empty
+    assert Rules.of({"never-tag": ["keep"]}).is_empty
+    assert not Rules.of({"min-free": "1GB"}).is_empty
+    assert made({}, OLD, NEW, used=1e15, free=0).steps == []
