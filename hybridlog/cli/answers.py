@@ -460,11 +460,13 @@ def _write_pictures(
     """
     from hybridlog.arrays.message_arrays import IMAGES
     from hybridlog.query.answers.video import frames_in_front
+    from hybridlog.schema.states import without_payload
 
     before: list[Message] = []
     if OUTPUTS[form].content == "video" and front.latched:
         before = frames_in_front(query.session, query.question)
     written = left_out = 0
+    missing = ""
     refused: HybridlogError | None = None
     images: PictureWriter
     with OUTPUTS[form].open(target) as images:
@@ -476,6 +478,7 @@ def _write_pictures(
                 )
             if message.is_reduced:
                 query.counters.leave_out(1, message.state)
+                missing = without_payload(query.counters.reduced, message.state)
                 continue
             try:
                 images.write(message)
@@ -487,6 +490,8 @@ def _write_pictures(
             progress()
         if refused is not None and not written:
             raise refused
+        if missing and not written and OUTPUTS[form].content == "video":
+            raise PayloadError(f"{missing}: there is no picture")
     query.counters.frames += len(before)
     if refused is not None:
         are = "is" if left_out == 1 else "are"

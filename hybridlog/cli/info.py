@@ -375,7 +375,7 @@ def _channel_row(
         notes.append("fields only" if state is State.REDUCED else "fields only, expired")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
-    if video is not None:
+    if video is not None and video.frames:
         notes.append(_video_text(video, stats.messages))
     skew = "-" if is_decoded else "?"
     if stats.stamped:

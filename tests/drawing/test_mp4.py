@@ -20,6 +20,7 @@ from hybridlog.arrays.video import VideoDecoder
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.writing import Sink
+from hybridlog.maintenance.expiry import expire
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
 from tests.cli.within import answer
@@ -249,6 +250,20 @@ def test_a_lost_frame_of_av1(tmp_path: Path) -> None:
         store.record(path)
         to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
     assert read(tmp_path / "out.mp4")[1] == [BASE + n * STEP for n in (0, 5, 10)]
+
+
+def test_frames_whose_payloads_have_expired(tmp_path: Path) -> None:
+    write(tmp_path / "log.mcap", {"/cam": ("json", [*encoded("h264")])}, "h264")
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        store.record(tmp_path / "log.mcap", name="cam")
+        expire(store.directory, "cam", [0])
+    with (
+        hl.open(tmp_path / "store", mongo="none") as store,
+        pytest.raises(PayloadError, match=r"12 messages have no payload.*there is no picture"),
+    ):
+        to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
+    assert not (tmp_path / "out.mp4").exists()
+    assert "known video" not in answer("info", "cam", store=tmp_path / "store").out
 
 
 def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:

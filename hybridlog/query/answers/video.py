@@ -63,6 +63,8 @@ def summary_of(session: Session, recording: str, topic: str) -> VideoSummary:
     frames = keys = unreadable = 0
     for run in Planner(session, question, Counters()).runs():
         for message in messages_in(run):
+            if message.is_reduced:
+                continue
             frames += 1
             try:
                 form, data = frame_of(message.decode())
