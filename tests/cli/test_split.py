@@ -14,6 +14,7 @@ from hybridlog.formats import OUTPUTS
 from .running import run
 
 TOPICS = {
+    "mp4": "front/image_raw",
     "tum": "odom",
     "ply": "scan",
     "png": "front/image_raw",
