@@ -158,6 +158,7 @@ def _as_dict(
     videos: Mapping[str, VideoSummary],
 ) -> dict[str, Any]:
     from hybridlog.entries import summary_of
+    from hybridlog.schema.states import told_channels
 
     return {
         **recording_dict(summary_of(entry)),
@@ -186,7 +187,7 @@ def _as_dict(
                 "metadata": c.metadata,
                 "video": asdict(videos[c.topic]) if c.topic in videos else None,
             }
-            for c in entry.channels
+            for c in told_channels(entry.channels)
         ],
     }
 
@@ -268,7 +269,9 @@ def _print_recording(
     ]
     if not narrow:
         columns.insert(4, ("payload", "right"))
-    channels = sorted(entry.channels, key=lambda c: c.topic)
+    from hybridlog.schema.states import told_channels
+
+    channels = sorted(told_channels(entry.channels), key=lambda c: c.topic)
 
     def rows_with(*, short: bool) -> list[list[str]]:
         known = entry.is_decoded

@@ -22,7 +22,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import count
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -36,12 +36,14 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, expired_record
+from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE, expired_record
 from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from hybridlog.columns.payload_files import WalkedSegment
     from hybridlog.columns.payload_writer import TopicWriter
@@ -52,6 +54,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
+MIN_BYTES: Final = 256
+"""Stored bytes a message below which payloads stay: what is left would take as much room."""
 _Key = tuple[str, str, bool]
 """A topic, a hash of its definition, and whether its messages are reduced."""
 
@@ -83,6 +87,7 @@ def expire(
     *,
     log: Journal | None = None,
     progress: Progress | None = None,
+    min_bytes: int = MIN_BYTES,
 ) -> Expired:
     """Delete payloads in sealed segments of a recording that this process has locked.
 
@@ -96,13 +101,14 @@ def expire(
             topics in the same chunk keep theirs, and so the chunk stays.
         log: The journal of a running recording, which its recorder appends to; None to open it.
         progress: Called after each chunk.
+        min_bytes: Chunks with fewer stored bytes a message stay.
 
     Raises:
         StoreError: Files cannot be read or written; what was not announced is as before.
         DiskFullError: There is no room for the fields; nothing is deleted.
     """
     path = directory.recording(label)
-    work = _Expiry(path, sorted(segments), topics, log or Journal(path))
+    work = _Expiry(path, sorted(segments), topics, log or Journal(path), min_bytes)
     return work.run(directory, label, progress)
 
 
@@ -110,9 +116,15 @@ class _Expiry:
     """The steps for one recording."""
 
     def __init__(
-        self, path: Path, segments: list[int], topics: Collection[str] | None, log: Journal
+        self,
+        path: Path,
+        segments: list[int],
+        topics: Collection[str] | None,
+        log: Journal,
+        min_bytes: int,
     ) -> None:
         self._path = path
+        self._min_bytes = min_bytes
         self._topics = topics
         self._log = log
         self._state = self._journal()
@@ -146,6 +158,10 @@ class _Expiry:
 
     def _goes(self, place: ChunkPlace, summary: SegmentSummary) -> bool:
         if place.length == EXPIRED_SIZE:
+            return False
+        parts = _parts_of(summary, place)
+        size = place.length if place.length != MOVED_SIZE else int(parts["payload_bytes"].sum())
+        if size < self._min_bytes * int(parts["messages"].sum()):
             return False
         names = {summary.channels[number].topic for number in place.channels}
         return self._topics is None or names <= {*self._topics}
@@ -182,9 +198,7 @@ class _Expiry:
         return (one for one in self._summaries[number].chunks if one.number in chosen)
 
     def _count(self, place: ChunkPlace, summary: SegmentSummary, done: Expired) -> None:
-        bounds = summary.table.part_bounds()
-        parts = summary.table.parts[bounds[place.number] : bounds[place.number + 1]]
-        for part in parts:
+        for part in _parts_of(summary, place):
             topic = summary.channels[int(part["channel"])].topic
             done.messages[topic] = done.messages.get(topic, 0) + int(part["messages"])
 
@@ -299,6 +313,11 @@ class _Expiry:
             self._log.append(line)
             payload_files.publish(self._path, self._journal())
         return sum(file.bytes for file in expired)
+
+
+def _parts_of(summary: SegmentSummary, place: ChunkPlace) -> NDArray[np.void]:
+    bounds = summary.table.part_bounds()
+    return summary.table.parts[bounds[place.number] : bounds[place.number + 1]]
 
 
 def _key_of(channel: Channel) -> _Key:

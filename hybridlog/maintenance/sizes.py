@@ -194,7 +194,8 @@ def _segment_bytes(
     whole: Counter[str] = Counter()
     for channel in entry.channels:
         whole[channel.topic] += round(float(by_channel[channel.id]))
-    whole[""] += max(0, entry.stored_bytes - whole.total())
+    columns = sum(file["bytes"] for file in entry.payloads)
+    whole[""] += max(0, entry.stored_bytes - columns - whole.total())
     return whole
 
 

@@ -6,12 +6,15 @@ answers count messages that are not whole, and name the cause.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.wording import counted, unfit
-from hybridlog_storage.messages import EXPIRED, ORIGINAL_ENCODING, REDUCED
+from hybridlog_storage.messages import EXPIRED, EXPIRED_IDS, ORIGINAL_ENCODING, REDUCED
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import ChannelEntry
 
 
 class State(StrEnum):
@@ -51,6 +54,16 @@ def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:
         metadata: The channel's metadata.
     """
     return encoding if state_of(encoding) is State.WHOLE else metadata.get(ORIGINAL_ENCODING, "")
+
+
+def told_channels(channels: Iterable[ChannelEntry]) -> list[ChannelEntry]:
+    """The channels of a recording that people are told: not those that are empty by expiry."""
+    known = {channel.id: channel for channel in channels}
+    return [
+        channel
+        for number, channel in known.items()
+        if channel.stats.messages or number + EXPIRED_IDS not in known
+    ]
 
 
 def without_payload(messages: int, state: State = State.REDUCED) -> str:

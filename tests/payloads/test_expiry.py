@@ -28,13 +28,18 @@ TOPICS = ["/cloud", "/image", "/number", "/scan"]
 
 
 def expire(
-    store: Path, segments: Collection[int], topics: Collection[str] | None = None
+    store: Path,
+    segments: Collection[int],
+    topics: Collection[str] | None = None,
+    *,
+    is_worth: bool = False,
 ) -> Expired:
     """Delete payloads of the only recording of a store."""
     with hl.open(store) as opened:
         (entry,) = opened.recordings()
         with opened.directory.writing(entry.label, entry.id) as label:
-            found = expiry.expire(opened.directory, label, segments, topics)
+            least = expiry.MIN_BYTES if is_worth else 0
+            found = expiry.expire(opened.directory, label, segments, topics, min_bytes=least)
             put_entry(opened.directory, opened.catalog, label)
     return found
 
@@ -204,6 +209,16 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
         assert store.topic("/scan").count() == COUNT
         store.remove("log")
         assert not store.recordings()
+
+
+def test_payloads_stay_where_that_frees_no_room(copy: Path) -> None:
+    right = answers(copy)
+    done = expire(copy, [0, 1], is_worth=True)
+    assert "/number" not in done.messages
+    assert done.messages["/image"] == COUNT // 10
+    assert done.freed > 0
+    assert answers(copy) == right
+    assert all(isinstance(one, bytes) for one in payloads(copy, "/number"))
 
 
 def test_a_store_says_that_payloads_expire(copy: Path) -> None:

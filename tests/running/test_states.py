@@ -104,7 +104,7 @@ def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -
     with hl.open(copied, mongo=NO_MONGODB) as store:
         entry = store.entry(LABEL)
         with store.directory.writing(entry.label, entry.id) as label:
-            expire(store.directory, label, [*map(int, entry.digests)])
+            expire(store.directory, label, [*map(int, entry.digests)], min_bytes=0)
         store.refresh()
         check_expired(store, known)
     shutil.rmtree(copied / "tables")
@@ -117,13 +117,13 @@ def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
     with begun(tmp_path / "store", "many", 130) as running:
         known = running.flushed()
         sealed = sorted(map(int, running.before.entry(LABEL).digests))
-        expire(running.store.directory, LABEL, sealed[:1])
+        expire(running.store.directory, LABEL, sealed[:1], min_bytes=0)
         check_expired(running.before, known)
-        expire(running.store.directory, LABEL, sealed[:3], ["/cam", "/arm"])
+        expire(running.store.directory, LABEL, sealed[:3], ["/cam", "/arm"], min_bytes=0)
         running.write(30)
         known = running.flushed()
         check_expired(running.before, known)
-        expire(running.store.directory, LABEL, sealed)
+        expire(running.store.directory, LABEL, sealed, min_bytes=0)
         known = running.flushed()
         check_expired(running.before, known)
     with hl.open(tmp_path / "store") as store:

@@ -10,6 +10,7 @@ import numpy as np
 from hybridlog.query.answers.lost import lost_parts
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
+from hybridlog.schema.states import encoding_of, told_channels
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
@@ -148,14 +149,14 @@ def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:
 
 def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    for channel in entry.channels:
+    for channel in told_channels(entry.channels):
         stats = channel.stats
         row = found.setdefault(
             channel.topic,
             {
                 "topic": channel.topic,
                 "type": channel.type,
-                "encoding": channel.message_encoding,
+                "encoding": encoding_of(channel.message_encoding, channel.metadata),
                 "messages": 0,
                 "bytes": 0,
                 "first": None,
