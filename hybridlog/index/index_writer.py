@@ -346,10 +346,14 @@ class IndexWriter:
             places = self._places.get(segment)
             if places is None:
                 places = reader.summary().chunks
-            for group in self._read(reader, places[first:]):
-                self._take(group)
-                if self._is_abandoned:
-                    return
+            with self._noting_failure():
+                for group in self._read(reader, places[first:]):
+                    self._take(group)
+                    if self._is_abandoned:
+                        return
+            if self._sender is None and segment < self._next[0]:
+                segment, first = self._next
+                continue
             if digest is None:
                 break
             if segment == self._next[0]:
@@ -371,6 +375,12 @@ class IndexWriter:
             try:
                 chunk = reader.read_chunk(place)
             except SegmentError as error:
+                if (reader.number, place.number) < self._next:
+                    # It was read before, and has expired meanwhile.
+                    raise DatabaseError(
+                        "MongoDB has lost documents of messages that have expired since; they "
+                        "are made again when the recording has ended."
+                    ) from error
                 self.damage[reader.number, place.number] = str(error)
                 continue
             size += len(chunk.batch.buffer)

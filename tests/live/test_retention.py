@@ -20,9 +20,11 @@ from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog_storage import journal
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.mongo.index_state import NOTHING, IndexState
 from hybridlog_storage.settings import write_settings
 from tests.live.speaker import Speaker
 from tests.some import each
+from tests.test_faults import kill_mongod
 
 CAMERA = Channel("/camera", "ros1", Schema("a/Image", "ros1msg", b"uint32 n\nuint8[] data\n"), {})
 ARM = Channel("/arm", "ros1", Schema("a/Arm", "ros1msg", b"uint32 n\nfloat64 x\n"), {})
@@ -167,3 +169,42 @@ def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:
     assert "nothing else may" in said[0]
     with hl.open(tmp_path / "store", mongo="none") as store:
         assert store.topic("/camera").count() == 1
+
+
+def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_again(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "store"
+    with hl.open(path, create=True) as store:
+        store.directory.change_settings(retention={"quota": "12MB"})
+        speaker = Speaker()
+        recorder = Recorder(store, [speaker], RecorderOptions(reserve_bytes=0), lambda _: None)
+        recorder.start()
+        (folder,) = (path / "recordings").iterdir()
+        sent, until = 0, time.monotonic() + 60
+        while not (state := journal.read(folder)) or not state.retained:
+            assert time.monotonic() < until
+            for _ in range(10):
+                speaker.say(CAMERA, image(sent), sent * 10**9)
+                sent += 1
+            time.sleep(0.1)
+        database = store.connect()
+        while recorder.look().lag:  # or what is sent now would say anew what is there
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        IndexState(database).put_through(state.id[:16], NOTHING)
+        database.checkpoint()
+        kill_mongod(path)
+        failures: set[str] = set()
+        while not any("have expired since" in one for one in failures):
+            assert time.monotonic() < until
+            speaker.say(CAMERA, image(sent), sent * 10**9)
+            sent += 1
+            time.sleep(0.2)
+            failures.add(recorder.look().index_failure)
+        (report,) = recorder.stop()
+        assert report.entry.end["losses"] == []
+    with hl.open(path) as store:
+        assert store.topic("/camera").count() == sent
+        assert len([*store.topic("/camera").documents()]) == sent
+        assert store.verify().findings == []
