@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 _STATE_S = 1.0
+_RECOVERY_POLL_S = 0.05
 _EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
 _SNAPSHOT = re.compile(r"snapshot \S+ because of ")
 """A message of a recorder that is no problem: `--quiet` leaves it out."""
@@ -74,8 +75,8 @@ def _record(choices: RecordChoices) -> None:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
                 with _explain_wait(last):
                     reports = recorder.stop()
-            if not stop.is_set:
-                recovery.join()
+            while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
+                pass
         ending = LiveSummary(reports, recorder, sources, options)
         if options.contract is not None:
             labels = [report.entry.label for report in reports]
@@ -94,7 +95,7 @@ def _begin_recovery(choices: RecordChoices, store: Store) -> threading.Thread:
         try:
             with opened_store(store.directory.path, choices.mongo, quiet=True) as opened:
                 opened.session.database  # noqa: B018 - brings the index up to date
-        except HybridlogError as error:
+        except (HybridlogError, OSError) as error:
             output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
 
     thread = threading.Thread(target=recover, daemon=True)
