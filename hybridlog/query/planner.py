@@ -430,6 +430,21 @@ class Planner:
         engine = self._scan if by_times.cost(part, Need.COUNT) is None else by_times
         return engine.count([part])
 
+    def count_expired(self) -> int:
+        """Number of messages, in the range, whose payloads were deleted to make room.
+
+        Raises:
+            TimeError: as for `parts`.
+            TopicError: as for `parts`.
+        """
+        total = 0
+        for part in self.parts():
+            gone = tuple(one for one in (*part.channels, *part.undecodable) if one.is_expired)
+            if gone:
+                own = replace(part, channels=gone, undecodable=(), predicate=None)
+                total += self._count_stored(own)
+        return total
+
     def count_unindexed(self, parts: Iterable[Part]) -> int:
         """Number of messages of running recordings, in the range, that the index lacks.
 

@@ -122,6 +122,11 @@ class RecordedChannel:
         return self.state is not State.REDUCED
 
     @property
+    def is_expired(self) -> bool:
+        """True if the payloads of its messages were deleted to make room."""
+        return self.state is State.EXPIRED
+
+    @property
     def encoding(self) -> str:
         """The encoding of its payloads, which may be gone."""
         return encoding_of(self.channel.message_encoding, self.channel.metadata)

@@ -20,7 +20,7 @@ from hybridlog.maintenance.expiry import Expired
 from hybridlog.maintenance.opening import put_entry
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import PayloadError
+from hybridlog_storage.errors import IncompleteError, PayloadError
 from tests.format_reader import FormatReader
 from tests.payloads.logs import COUNT
 
@@ -219,6 +219,19 @@ def test_payloads_stay_where_that_frees_no_room(copy: Path) -> None:
     assert done.freed > 0
     assert answers(copy) == right
     assert all(isinstance(one, bytes) for one in payloads(copy, "/number"))
+
+
+def test_strict_answers_need_payloads(copy: Path) -> None:
+    with hl.open(copy, mongo="none") as store:
+        store.topic("/scan").completeness().check(payloads=True)
+    done = expire(copy, [0])
+    with hl.open(copy, mongo="none") as store:
+        query = store.topic("/scan")
+        assert query.completeness().reduced == done.messages["/scan"]
+        with pytest.raises(IncompleteError, match=f"{done.messages['/scan']} messages"):
+            query.completeness().check(payloads=True)
+        query.completeness().check()
+        query.between("-0.1s", "end").completeness().check(payloads=True)
 
 
 def test_a_store_says_that_payloads_expire(copy: Path) -> None:

@@ -213,11 +213,15 @@ def line_of(loss: Mapping[str, Any]) -> str:
 
 def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
     """The completeness of a recording in words: `complete`, or the number of missing messages."""
+    from hybridlog.schema.states import State, state_of, without_payload
+
     found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
     for cause, what in NOT_LOST.items():
         messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
         found += f"; {counted(messages, 'message')} {what}" if messages else ""
-    return found
+    gone = (c for c in entry.channels if state_of(c.message_encoding) is State.EXPIRED)
+    messages = sum(channel.stats.messages for channel in gone)
+    return found + (f"; {without_payload(messages, State.EXPIRED)}" if messages else "")
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:

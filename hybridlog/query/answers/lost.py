@@ -24,6 +24,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog_storage.errors import HybridlogError, TimeError
+from hybridlog_storage.settings import EXPIRED
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
@@ -82,7 +83,8 @@ def completeness_of(
         sum(row["count"] or 0 for row in lost),
         is_exact=not any(row["count"] is None for row in lost)
         and all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows),
-        reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE),
+        reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
+        + _expired(session, question),
         rows=tuple(lost),
         unwritten=unwritten,
         unindexed=unindexed,
@@ -90,6 +92,15 @@ def completeness_of(
         late=tuple(dict.fromkeys(late)),
         sentences=tuple(dict.fromkeys(sentences)),
     )
+
+
+def _expired(session: Session, question: Question) -> int:
+    """Number of messages in the range of a question whose payloads were deleted."""
+    if EXPIRED not in session.directory.settings.requires:
+        return 0
+    with suppress(TimeError):  # nothing is in the range
+        return Planner(session, question, Counters()).count_expired()
+    return 0
 
 
 def _rows_of(session: Session, question: Question) -> list[Mapping[str, Any]]:
