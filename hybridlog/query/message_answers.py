@@ -110,14 +110,12 @@ class MessageAnswers(Steps):
 
         Messages without payload are left out; `counters.reduced` counts them.
         """
-        from hybridlog.index.indexing import rows_by_channel
-
         for run in self._planner().runs():
             whole = np.array([not channel.is_reduced for channel in run.channels], np.bool_)
             batch = run.batch if whole.all() else run.batch.take(whole[run.batch.channel])
-            for number, rows in () if whole.all() else rows_by_channel(run.batch.channel):
-                if not whole[number]:
-                    self.counters.leave_out(len(rows), run.channels[number].state)
+            for number in np.flatnonzero(~whole).tolist():
+                left = int((run.batch.channel == number).sum())
+                self.counters.leave_out(left, run.channels[number].state)
             if len(batch):
                 yield batch, run.channels
 

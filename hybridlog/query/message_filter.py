@@ -12,8 +12,6 @@ from hybridlog.frames.names import is_summary
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.schema.codec import plain_message
-from hybridlog.schema.reduced_codec import ExpiredFields
-from hybridlog.schema.states import State
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -60,7 +58,7 @@ class MessageFilter:
             batch: The messages.
             seq: int64[n], their arrival numbers.
         """
-        if channel.state is State.EXPIRED and channel.codec.indexed:
+        if channel.is_expired and channel.codec.indexed:
             return self._of_expired(channel, batch, seq)
         if channel.is_reduced or not channel.codec.indexed:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
@@ -90,6 +88,8 @@ class MessageFilter:
         self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]
     ) -> Matches:
         """Decide on expired messages; not on those that lack an array that is asked for."""
+        from hybridlog.schema.reduced_codec import ExpiredFields
+
         fields = self._elements
         decoded = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
         assert isinstance(decoded.records, ExpiredFields)

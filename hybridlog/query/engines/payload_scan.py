@@ -9,7 +9,6 @@ import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
 from hybridlog.query.engines.base import MatchColumns, Need, Values
-from hybridlog.schema.reduced_codec import without_lossy
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, MessageRun
@@ -96,8 +95,11 @@ class PayloadScan:
         """The fields of messages; those that cannot be read, or lack some, are counted."""
         found = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
-        found, lacking = without_lossy(found) if channel.is_reduced else (found, 0)
-        self._counters.leave_out(lacking, channel.state)
+        if channel.is_expired:
+            from hybridlog.schema.reduced_codec import without_lossy
+
+            found, lacking = without_lossy(found)
+            self._counters.leave_out(lacking, channel.state)
         return found
 
     def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
