@@ -182,6 +182,28 @@ def test_too_little_may_go(store: Path) -> None:
     assert payloads(store)[0] == image(0)
 
 
+def test_a_damaged_segment_stays_and_the_others_go(store: Path) -> None:
+    with (store / "recordings" / "run" / "000001.mcap").open("r+b") as file:
+        file.seek(20_000)
+        file.write(b"damaged")
+    found = keep("--max-age", "0s", store=store, code=None)
+    assert "000001.mcap" in found.err
+    state = journal.read(store / "recordings" / "run")
+    assert state is not None
+    assert {n for n, topics in state.expired.items() if "/camera" in topics} >= {0, 2, 3}
+    assert 1 not in state.expired
+
+
+def test_columns_count_with_their_segments(store: Path) -> None:
+    before = keep("--max-age", "0s", "--dry-run", "--json", store=store).json
+    answer("compact", "-t", "camera", "--drop-mcap", "-q", store=store)
+    after = keep("--max-age", "0s", "--dry-run", "--json", store=store).json
+    sizes = [sum(s["bytes"] for s in one["plan"]["steps"]) for one in (before, after)]
+    assert sizes[1] > 0.9 * sizes[0]
+    assert keep("--max-age", "0s", "--json", store=store).json["freed_bytes"] > 0.8 * sizes[0]
+    check_answers(store)
+
+
 # Pins.
 
 

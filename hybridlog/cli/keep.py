@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
+from hybridlog.cli.completion import complete_condition, complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.query_options import query_of, recordings_of
@@ -35,6 +36,7 @@ _MAX_PINS = 1000
     "-t",
     multiple=True,
     metavar="TOPIC=AGE",
+    shell_complete=complete_topic,
     help="Payloads of this topic go at this age, and first when room is short; earlier ones "
     "before later ones. With --pin: TOPIC alone, to pin only this topic. Repeatable.",
 )
@@ -57,6 +59,7 @@ _MAX_PINS = 1000
     "--when",
     multiple=True,
     metavar="TOPIC: PREDICATE",
+    shell_complete=complete_condition,
     help="With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around messages "
     "of a topic alone, or of marks. Repeatable.",
 )

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import Event, JournalState
 
+_WHOLE: Final = -1
 _MAX_ROUNDS: Final = 20  # fields take room, too: then a little more has to go
 
 
@@ -90,7 +91,8 @@ class Keeper:
         self._own = own
         self._is_wanted = is_wanted
         self._known: dict[str, tuple[str, Held]] = {}  # by label, with its look
-        self._failed: set[str] = set()  # ids of recordings that this pass could not change
+        # Ids and segments that this pass could not change; -1 for the whole recording.
+        self._failed: set[tuple[str, int]] = set()
 
     def plan(self, rules: Rules) -> Plan:
         """What would go now."""
@@ -135,8 +137,10 @@ class Keeper:
                     held = self._read(label, now)
                 if held is not None and is_settled(look):
                     self._known[label] = look, held
-            if held is None or held.id in self._failed:
+            if held is None or (held.id, _WHOLE) in self._failed:
                 continue
+            left = [s for s in held.segments if (held.id, s.number) not in self._failed]
+            held = replace(held, segments=left)
             if self._own is not None and label == self._own.label:
                 unread = self._own.first_unread()
                 yield replace(held, segments=[s for s in held.segments if s.number < unread])
@@ -160,7 +164,13 @@ class Keeper:
         except DiskFullError:
             raise
         except (StoreError, TopicError) as error:
-            self._failed.add(step.id)
+            is_held = isinstance(error, HeldError | TopicError)
+            if len(step.segments) > 1 and not is_held:  # one of them may be damaged
+                for number in step.segments:
+                    self._do(replace(step, segments=(number,)), found, progress)
+                return
+            numbers = (_WHOLE,) if is_held else step.segments or (_WHOLE,)
+            self._failed.update((step.id, number) for number in numbers)
             found.problems.append(str(error))
 
     @contextmanager
