@@ -94,7 +94,7 @@ def export_command(
     mongo: str | None,
     quiet: bool,
 ) -> None:
-    """Export whole recordings; tables and videos get one file a topic."""
+    """Export whole recordings; tables get one file a topic."""
     form = form or _form(target)
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
