@@ -56,7 +56,7 @@ def bring_up_to_date(
     """Index missing chunks, and remove documents of removed recordings.
 
     Recordings that the catalog knows to be in this index are not looked at, unless the
-    index has another number of recordings than the store. Documents of removed recordings
+    index has another number of recordings than these. Documents of removed recordings
     are removed only if all recordings are wanted.
 
     Args:
@@ -79,21 +79,18 @@ def bring_up_to_date(
     """
     tables.remove_unfinished(directory, snapshot)
     state = IndexState(database)
-    count = state.count()
-    is_other = count != len(snapshot)
-    behind = [
-        one
-        for one in snapshot.summaries
-        if wanted is None or one.id in wanted
-        if is_other or one.indexed_by != index or one.id in stale
-    ]
+    behind = [one for one in snapshot.summaries if one.indexed_by != index or one.id in stale]
+    known = state.of([one.key for one in behind]) if behind else {}
+    is_other = state.count() - len(known) != len(snapshot) - len(behind)
+    if is_other:
+        behind = snapshot.summaries
+    if wanted is not None:
+        behind = [one for one in behind if one.id in wanted]
     has_strangers = wanted is None and (is_other or tables.are_left(directory, snapshot))
     if not behind and not has_strangers:
         return False
-    known = state.of(None if has_strangers else [one.key for one in behind])
-    if wanted is None and not has_strangers and count - len(known) != len(snapshot) - len(behind):
-        has_strangers = True  # as many recordings are gone as have been added
-        known = state.of(None)
+    if is_other or has_strangers:
+        known = state.of(None if has_strangers else [one.key for one in behind])
     has_changed = False
     settled = []
     for summary in behind:

@@ -201,6 +201,24 @@ def test_a_recording_is_imported_without_a_look_at_the_others(
         check_alike(costs)
 
 
+def test_a_recording_is_indexed_without_a_look_at_the_others(
+    stores: dict[int, Path], tmp_path: Path
+) -> None:
+    write_day(tmp_path / "more.mcap", 5_001)
+    costs = {}
+    for count, path in stores.items():
+        with hl.open(path, mongo="none") as store:
+            store.record(tmp_path / "more.mcap")
+        with hl.open(path) as store:
+            costs[count] = cost_of(store, store.connect)
+            assert store.repairs.indexed == {"more": 1}
+            store.remove("more")
+        with hl.open(path) as store:
+            assert not cost_of(store, store.connect).written
+    assert costs[MANY].commands == costs[FEW].commands
+    assert len(costs[MANY].opened) < len(costs[FEW].opened) + MANY  # less than one file of each
+
+
 def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) -> None:
     with hl.open(stores[MANY], mongo="none") as store:
         asked = store.topic("pose").where("data > 4.5")

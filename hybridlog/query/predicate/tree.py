@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
+from hybridlog_storage.lazy import lazy
+
 Value: TypeAlias = bool | int | float | str | None
 """The operand of a comparison; times and durations are integer nanoseconds."""
 Order = Literal["==", "!=", "<", "<=", ">", ">="]
@@ -183,7 +185,7 @@ Condition: TypeAlias = Compare | Member | Exists | Match
 Node: TypeAlias = Condition | And | Or | Not | Opaque
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, repr=False)
 class Predicate:
     """A predicate that was parsed and checked.
 
@@ -222,17 +224,17 @@ class Predicate:
         """The paths in the predicate, as MongoDB writes them, without duplicates."""
         return list(dict.fromkeys(condition.field.path for condition in self.conditions()))
 
-    @property
+    @lazy
     def asks_fields(self) -> bool:
         """True if it is about fields of the message, not only about `_meta`."""
         return self.is_opaque or not all(map(is_meta, self.fields()))
 
-    @property
+    @lazy
     def is_opaque(self) -> bool:
         """True if only MongoDB can answer a part of it."""
         return any(isinstance(node, Opaque) for node in nodes(self.root))
 
-    @property
+    @lazy
     def needs_index(self) -> bool:
         """True if messages alone cannot decide it, without MongoDB."""
         return needs_index(self.root)
