@@ -1254,7 +1254,7 @@ class Store:
         Raises:
             StoreError: It is not a store, or a recording of it is damaged.
         """
-        from hybridlog.maintenance import imports
+        from hybridlog.maintenance import imports, tables
 
         with Store(StoreDirectory(Path(other)), mongo=EMBEDDED) as source:
             chosen: Sequence[RecordingEntry]
@@ -1267,6 +1267,8 @@ class Store:
             present = {one.id: one.label for one in self.session.snapshot().summaries}
             report = imports.run(source.directory, self.directory, chosen, present, progress)
         self.session.catch_up()
+        for entry in self.select(report.imported):  # so that other readers find them
+            tables.make(self.directory, entry, is_new=True)
         return report
 
     def repair(

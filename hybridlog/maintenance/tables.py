@@ -56,6 +56,7 @@ def make(
     topics: Collection[str] | None = None,
     *,
     until: float = math.inf,
+    is_new: bool = False,
 ) -> bool:
     """Create tables of a recording again from its segments.
 
@@ -64,6 +65,7 @@ def make(
         entry: The recording's entry in the catalog.
         topics: Topics of the tables; None for those that are missing.
         until: When this is given up, by `time.monotonic`.
+        is_new: Whether there are no rows of the recording yet, so none are looked for.
 
     Returns:
         True if tables were created; False if the recording is being written, or the store is
@@ -74,7 +76,9 @@ def make(
     """
     if entry.status == "open" or not directory.is_writable:
         return False
-    wanted = missing(directory, entry) if topics is None else set(topics)
+    if topics is None:
+        topics = topics_of(entry) if is_new else missing(directory, entry)
+    wanted = set(topics)
     if not wanted:
         return True
     try:
@@ -82,7 +86,7 @@ def make(
             from hybridlog.columns.table_writer import TableWriter
 
             entry = replace(entry, label=label)
-            writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=False)
+            writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=is_new)
             try:
                 channels = channels_of(entry, wanted)
                 numbers = [number for number, _, _ in entry.spans]

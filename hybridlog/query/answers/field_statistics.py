@@ -123,7 +123,7 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
     counted = Counters()
     planner = Planner(session, question, counted)
-    in_tables = _of_tables(planner) if question.fields is None else {}
+    in_tables = _of_tables(planner)
     counters.add(counted)
     recordings = [row.summary.id for row in RangeResolver(session, question).resolve()]
     found = []
@@ -171,10 +171,15 @@ def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
     found: dict[str, dict[str, _Running]] = {}
     for topic, parts in by_topic.items():
         types = parts[0].field_types or {}
-        fields = _single_numbers(types)
-        if not fields or not all(
-            part.field_types == types and all(channel.is_typed for channel in part.channels)
-            for part in parts
+        numbers = _single_numbers(types)
+        fields = numbers if planner.question.fields is None else [*planner.question.fields]
+        if (
+            not fields
+            or not {*fields} <= {*numbers}
+            or not all(
+                part.field_types == types and all(channel.is_typed for channel in part.channels)
+                for part in parts
+            )
         ):
             continue
         read = planner.values_of_tables(parts, fields)
