@@ -1311,6 +1311,7 @@ class Session:
             from hybridlog.columns.recordings_file import write_recordings_file
 
             with suppress(OSError, HybridlogError):
+                self.catalog.write_kept()
                 present = self.snapshot().by_label.keys() & {*self.directory.names()}
                 write_recordings_file(self.catalog, present)
                 self.catalog.has_changed = False
@@ -1343,6 +1344,7 @@ class Session:
         if "tables" in vars(self):
             self.tables.invalidate()
         self.disconnect()
+        self.catalog.write_kept()
         is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
         if self.catalog.has_changed or is_missing:
             self.write_recordings_file()
