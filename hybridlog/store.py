@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, ParamSpec, Self, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, ParamSpec, Self, TypeAlias, TypeVar, cast
 
 from hybridlog.entries import text
 from hybridlog.index import consent, field_indexes
@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from hybridlog.recordings import Recordings
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
+    from hybridlog.training.lerobot import LerobotReport
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
@@ -611,6 +612,58 @@ class Store:
             clock=clock,
             across_recordings=across_recordings,
         )
+
+    @of_one_moment
+    def to_lerobot(
+        self,
+        query: Query,
+        features: str | Path | Mapping[str, Any],
+        path: str | Path,
+        *,
+        fps: int,
+        episodes_by: str = "recording",
+        task: str = "",
+        task_topic: str | None = None,
+        codec: Literal["h264", "av1"] = "h264",
+        on_gap: Literal["refuse", "drop", "hold"] = "refuse",
+        progress: Callable[[str, int], None] | None = None,
+    ) -> LerobotReport:
+        """Write a training set for robot learning, in the format of LeRobot 3.0.
+
+        Frames are at regular times; each has the last value of a topic that is not later.
+        The same question gives the same bytes. An interrupted export goes on.
+
+        Args:
+            query: The recordings and their range.
+            features: Which fields and images: the path of a map in YAML, or its values.
+            path: Directory of the set.
+            fps: Frames per second.
+            episodes_by: An episode for each `recording`, each `mark`, or each interval in which
+                a predicate holds, such as `"odom: twist.twist.linear.x > 0.1"`.
+            task: What the robot does, in words.
+            task_topic: A topic of texts that say it instead.
+            codec: Codec of the pictures.
+            on_gap: An episode with a gap in a topic is refused, is cut there, or keeps the last
+                value.
+            progress: Called with the name of each episode and the number of its frames.
+
+        Raises:
+            UsageError: The directory has something else, there is a gap, or no episode.
+            TopicError: A recording lacks a topic.
+            PayloadError: No picture can be shown.
+            MissingDependencyError: PyAV is not installed.
+        """
+        from hybridlog.training.feature_map import FeatureMap
+        from hybridlog.training.lerobot import write_lerobot
+        from hybridlog.training.lerobot_episodes import LerobotOptions
+
+        options = LerobotOptions(fps, episodes_by, task, task_topic, codec, on_gap)
+        wanted = (
+            FeatureMap.read(features)
+            if isinstance(features, str | Path)
+            else FeatureMap.of(features)
+        )
+        return write_lerobot(self, query, wanted, path, options, progress=progress)
 
     @of_one_moment
     def sync(

@@ -546,11 +546,12 @@ def documented_classes() -> list[type]:
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.record.recorder import RecordReport
     from hybridlog.recordings import Recordings
+    from hybridlog.training.lerobot import LerobotReport
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
-    checks = [Verification, Finding, Repaired, RepairReport, ImportReport]
+    checks = [Verification, Finding, Repaired, RepairReport, ImportReport, LerobotReport]
     answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]

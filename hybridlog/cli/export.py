@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,6 +19,7 @@ from hybridlog.cli.answers import (
     print_remarks,
     write_answer,
 )
+from hybridlog.cli.lerobot import LEROBOT, check_options, export_set, lerobot_options
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.query_options import parse_fields, query_of
 from hybridlog.cli.signals import if_stopped
@@ -50,13 +51,13 @@ _FILES = formats_of("table", "lines", "video")
     "target",
     type=options.PATH,
     metavar="OUTPUT",
-    help="File (mcap, bag) or directory (rosbag2, mp4, tables).",
+    help="File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).",
 )
 @click.option(
     "--format",
     "-F",
     "form",
-    type=click.Choice([*_LOGS, *_FILES]),
+    type=click.Choice([*_LOGS, LEROBOT, *_FILES]),
     help=f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
 )
 @options.store
@@ -73,6 +74,7 @@ _FILES = formats_of("table", "lines", "video")
 @split_by
 @options.tag_columns
 @options.force
+@lerobot_options
 @options.mongo
 @options.quiet
 def export_command(
@@ -93,9 +95,14 @@ def export_command(
     force: bool,
     mongo: str | None,
     quiet: bool,
+    **training: Any,
 ) -> None:
-    """Export whole recordings; tables get one file a topic."""
+    """Export whole recordings; tables get one file a topic.
+
+    `lerobot` makes a training set for robot learning.
+    """
     form = form or _form(target)
+    check_options(training, form)
     options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
     front = Front(latched=not no_latched, original_times=original_times)
     options.check_tags(tags, form)
@@ -110,6 +117,11 @@ def export_command(
             query = query.between(*between)
         if tags is not None:
             query = query.tags(*parse_fields(tags, "--tags"))
+        if form == LEROBOT:
+            if split is not None:
+                raise UsageError("lerobot has --episodes-by in place of --split-by.")
+            export_set(opened, query, target, training, force=force, quiet=quiet)
+            return
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
             folder = is_directory(form, target) if form in _LOGS else None

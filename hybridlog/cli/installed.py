@@ -16,6 +16,7 @@ from hybridlog_storage.errors import MissingDependencyError
 NEEDED_FOR: Final = {
     "foxglove": "record --foxglove, serve",
     "images": "compressed images, fetch -F jpg",
+    "lerobot": "export -F lerobot",
     "plot": "plot, except as a page",
     "protobuf": "fields of protobuf messages",
     "sql": "sql",

@@ -1,0 +1,149 @@
+"""`hybridlog export --format lerobot`: training sets."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from hybridlog.cli import options, output
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.signals import if_stopped
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+    from hybridlog.training.lerobot import LerobotReport
+
+LEROBOT: Final = "lerobot"
+_FPS: Final = 30
+_OPTIONS: Final = (
+    click.option(
+        "--map", "features", type=options.PATH, help="For lerobot: topics and fields, in YAML."
+    ),
+    click.option(
+        "--propose-map",
+        is_flag=True,
+        help="For lerobot: write a map for the topics that are there to OUTPUT, and nothing else.",
+    ),
+    click.option("--fps", type=click.IntRange(1, 1000), help=f"For lerobot; without, {_FPS}."),
+    click.option(
+        "--episodes-by",
+        metavar="HOW",
+        help="For lerobot: an episode for each `recording`, `mark`, or interval of a predicate.",
+    ),
+    click.option("--task", help="For lerobot: what the robot does, in words."),
+    click.option(
+        "--task-topic",
+        shell_complete=complete_topic,
+        help="For lerobot: a topic of texts that say it, at the begin of each episode.",
+    ),
+    click.option(
+        "--vcodec", type=click.Choice(["h264", "av1"]), help="For lerobot; without, h264."
+    ),
+    click.option(
+        "--on-gap",
+        type=click.Choice(["refuse", "drop", "hold"]),
+        help="For lerobot: refuse an episode with a gap (the default), cut it there, or keep the "
+        "last value.",
+    ),
+)
+
+
+def lerobot_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of training sets."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+def check_options(given: dict[str, Any], form: str) -> None:
+    """Refuse options of training sets with another format."""
+    used = sorted(name for name, value in given.items() if value not in {None, False})
+    if used and form != LEROBOT:
+        name = "--map" if used[0] == "features" else f"--{used[0].replace('_', '-')}"
+        raise UsageError(f"{name} is for lerobot, not for {form}.")
+
+
+def export_set(
+    store: Store, query: Query, target: Path, given: dict[str, Any], *, force: bool, quiet: bool
+) -> None:
+    """Write a training set, or propose a map for one.
+
+    Raises:
+        UsageError: An option does not fit, a gap is refused, or the output exists.
+    """
+    from hybridlog.training.feature_map import proposed
+
+    if given["propose_map"]:
+        _write_map(proposed(query).to_yaml(), target, force=force, quiet=quiet)
+        return
+    if given["features"] is None:
+        raise UsageError(
+            "Name a map with --map FILE. `hybridlog export map.yaml --format lerobot "
+            "--propose-map` writes one to begin with."
+        )
+    if force and target.is_dir() and (target / "meta" / "info.json").exists():
+        shutil.rmtree(target)
+    done = 0
+    again = "The same command goes on with the episodes that are not finished."
+    with if_stopped(lambda: again), progress_bar(target.name, None, quiet=quiet) as bar:
+
+        def tell(name: str, frames: int) -> None:
+            nonlocal done
+            done += frames
+            bar(done, f"{name}: {output.counted(done, 'frame')}")
+
+        report = store.to_lerobot(
+            query,
+            given["features"],
+            target,
+            fps=given["fps"] or _FPS,
+            episodes_by=given["episodes_by"] or "recording",
+            task=given["task"] or "",
+            task_topic=given["task_topic"],
+            codec=given["vcodec"] or "h264",
+            on_gap=given["on_gap"] or "refuse",
+            progress=tell,
+        )
+    _print_report(report, quiet=quiet)
+
+
+def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
+    if target.exists() and not force:
+        raise UsageError(f"{target} exists; name another file, or add --force.")
+    try:
+        target.write_text(text)
+    except OSError as error:
+        raise UsageError(f"{target} cannot be written: {error.strerror}.") from error
+    if not quiet:
+        output.note(f"{target}: look at it, then add --map {target}.")
+
+
+def _print_report(report: LerobotReport, *, quiet: bool) -> None:
+    counted = output.counted
+    resumed = f", {report.resumed} of them from before" if report.resumed else ""
+    if not quiet:
+        output.note(
+            f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
+            f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
+        )
+    if report.held:
+        output.note(
+            f"Values that are older than usual were kept for {counted(report.held, 'frame')}."
+        )
+    if report.missing:
+        output.note(
+            f"{counted(report.missing, 'frame')} show an earlier picture: their own cannot be "
+            "shown, or has no payload."
+        )
+    if report.lost:
+        output.note(
+            f"{counted(report.lost, 'message')} of these topics are lost in the episodes; "
+            "meta/hybridlog.json says in which."
+        )

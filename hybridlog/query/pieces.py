@@ -1,0 +1,99 @@
+"""Parts of a question: each recording, each mark, or each interval in which a predicate holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+
+
+class Piece(NamedTuple):
+    """A part of a question.
+
+    Attributes:
+        name: Its label, number and text, such as `run-002-docking`.
+        query: The question about it.
+    """
+
+    name: str
+    query: Query
+
+
+def pieces(store: Store, query: Query, how: str) -> Iterator[Piece]:
+    """The parts of a question, in the order of recordings and times.
+
+    Args:
+        store: The store.
+        query: The whole question.
+        how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
+
+    Raises:
+        UsageError: A predicate of no topic.
+        WhereError: It cannot be parsed, or does not fit the fields.
+        TopicError: There is no such topic.
+    """
+    if how == "recording":
+        for one in query.summaries():
+            yield Piece(one.label, query.in_recording(one.id))
+        return
+    if how == "mark":
+        yield from _of_intervals(query, _marks(query))
+        return
+    events = query
+    if ": " in how:
+        from hybridlog.query.topics import split_topic
+
+        topic, how = split_topic(how)
+        events = store.recordings(list(query.recordings)).topic(topic)
+    elif len(query.topics) != 1:
+        raise UsageError("Name the topic of the predicate: 'TOPIC: PREDICATE'.")
+    else:
+        events = store.recordings(list(query.recordings)).topic(*query.topics)
+    held = events.where(how).intervals()
+    yield from _of_intervals(query, ((one.recording, one.begin_ns, one.end_ns, "") for one in held))
+
+
+def _marks(query: Query) -> Iterator[tuple[str, int, int, str]]:
+    """Marks as recording, begin, end and text.
+
+    A mark of a moment lasts until the next one of a moment, or to the end of the recording.
+    """
+    from hybridlog.query.answers.marks import marks_in
+    from hybridlog.query.counters import Counters
+
+    ends = {one.id: one.extent[1] for one in query.summaries()}
+    found = sorted(marks_in(query.session, query.recordings, Counters()))
+    for place, one in enumerate(found):
+        moments = (
+            later.begin
+            for later in found[place + 1 :]
+            if later.recording == one.recording and later.end is None and later.begin > one.begin
+        )
+        end = next(moments, ends[one.recording]) if one.end is None else one.end
+        yield one.recording, one.begin, end, one.text
+
+
+def _of_intervals(query: Query, rows: Iterable[tuple[str, int, int, str]]) -> Iterator[Piece]:
+    import numpy as np
+
+    from hybridlog.query.intervals import Intervals
+    from hybridlog_storage.disk.directory import label_of
+
+    labels = {one.id: one.label for one in query.summaries()}
+    number = dict.fromkeys(labels, 0)
+    for recording, begin, end, text in rows:
+        number[recording] += 1
+        words: Sequence[str] = (labels[recording], f"{number[recording]:03d}")
+        name = "-".join([*words, label_of(text)] if text.strip() else words)
+        one = query.in_recording(recording)
+        if query.question.is_unbounded:
+            one = one.between(begin, end)  # with latched messages from before
+        else:
+            span = np.array([[begin, end, 0]], np.int64)
+            one = one.during(Intervals.of([(recording, span)]))
+        yield Piece(name, one)

@@ -1,0 +1,1 @@
+"""Training sets for robot learning, from recordings."""

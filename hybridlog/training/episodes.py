@@ -1,0 +1,323 @@
+"""Episodes of a training set: frames at regular times, with the values that were current."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+import numpy as np
+
+from hybridlog.across.match import match
+from hybridlog.drawing.images import shown_pixels
+from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.counters import Counters
+from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.times import format_duration, format_time
+from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
+    from hybridlog.query.pieces import Piece
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+    from hybridlog.training.feature_map import FeatureMap, Source
+
+OnGap = Literal["refuse", "drop", "hold"]
+"""An episode with a gap in a topic is refused, is cut there, or keeps the last value."""
+MIN_FRAMES: Final = 2
+"""Fewer frames are no episode."""
+
+
+class Values(NamedTuple):
+    """Numbers of a topic over time.
+
+    Attributes:
+        times: int64[n], log times, ns, ascending.
+        numbers: float32[n, width].
+        names: Of the columns.
+    """
+
+    times: NDArray[np.int64]
+    numbers: NDArray[np.float32]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """Frames at regular times in one recording.
+
+    Attributes:
+        name: Its recording and part.
+        recording: Id of the recording.
+        times: int64[n], log times of the frames, ns.
+        vectors: float32[n, width] by name of the feature.
+        names: Names of the columns, by name of the feature.
+        held: Frames whose value is older than usual, by topic.
+    """
+
+    name: str
+    recording: str
+    times: NDArray[np.int64]
+    vectors: dict[str, NDArray[np.float32]]
+    names: dict[str, tuple[str, ...]]
+    held: dict[str, int]
+
+
+def episodes(
+    store: Store, piece: Piece, features: FeatureMap, fps: int, on_gap: OnGap
+) -> Iterator[Episode]:
+    """The episodes of a part of a question: one for each recording and range in it.
+
+    An episode begins when all topics have a value. A frame has the last value of each topic
+    that is not later than it.
+
+    Args:
+        store: The store.
+        piece: The part: its name, recordings and range.
+        features: The features.
+        fps: Frames per second.
+        on_gap: What a gap in a topic does: see `OnGap`.
+
+    Raises:
+        UsageError: There is a gap that is refused, or a field is no number.
+        TopicError: A recording lacks a topic.
+    """
+    from hybridlog.query.ranges import RangeResolver
+
+    name, query = piece
+    for summary, (begin, end) in RangeResolver(query.session, query.question).spans():
+        reader = _Reader(store, summary.id, begin, end)
+        read: dict[Source, Values] = {}
+        times = {topic: reader.times(topic) for topic in features.images.values()}
+        for source in (part for parts in features.vectors.values() for part in parts):
+            read[source] = reader.values(source)
+            times[source.topic] = read[source].times
+        first = max([begin, *(int(own[0]) for own in times.values())])
+        count = max(end - first, 0) * fps // 10**9 + 1
+        grid = first + np.arange(count, dtype=np.int64) * 10**9 // fps
+        grid = grid[grid < end]
+        is_old = {topic: _is_old(grid, own, fps) for topic, own in times.items()}
+        late = np.any([*is_old.values()], axis=0)
+        if late.any() and on_gap == "refuse":
+            _refuse(name, grid, times, is_old)
+        runs = [(0, len(grid))] if on_gap == "hold" else _runs(~late)
+        for number, (low, high) in enumerate(run for run in runs if run[1] - run[0] >= MIN_FRAMES):
+            own_grid = grid[low:high]
+            found = {
+                feature: [_at(own_grid, read[part]) for part in parts]
+                for feature, parts in features.vectors.items()
+            }
+            yield Episode(
+                name if len(runs) == 1 else f"{name}-{number + 1:03d}",
+                summary.id,
+                own_grid,
+                {feature: np.concatenate(parts, axis=1) for feature, parts in found.items()},
+                {
+                    feature: tuple(name for part in parts for name in read[part].names)
+                    for feature, parts in features.vectors.items()
+                },
+                {
+                    topic: int(old[low:high].sum())
+                    for topic, old in is_old.items()
+                    if old[low:high].any()
+                },
+            )
+
+
+def pictures(
+    store: Store, episode: Episode, topic: str
+) -> Iterator[tuple[NDArray[np.uint8] | None, int]]:
+    """The picture of each frame of an episode, and how many frames in turn show it.
+
+    None stands for a picture that cannot be shown, or has no payload.
+
+    Args:
+        store: The store.
+        episode: The episode.
+        topic: The topic of the pictures.
+    """
+    current: Message | None = None
+    place, frames = 0, episode.times.tolist()
+    reader = _Reader(store, episode.recording, frames[0], frames[-1] + 1)
+    for message in reader.messages(topic):
+        shown = place
+        while place < len(frames) and frames[place] < message.log_time_ns:
+            place += 1
+        if place > shown:
+            yield _picture(current), place - shown
+        current = message
+    if place < len(frames):
+        yield _picture(current), len(frames) - place
+
+
+def _picture(message: Message | None) -> NDArray[np.uint8] | None:
+    if message is None:
+        return None
+    try:
+        pixels = shown_pixels(message)
+    except (PayloadError, DefinitionError):
+        return None
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[:, :, None], 3, axis=2)
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+class _Reader:
+    """Reads topics of a recording in a range, and the messages that are current at its begin.
+
+    Args:
+        store: The store.
+        recording: Id of the recording.
+        begin: First log time, ns.
+        end: Last log time, exclusive, ns.
+    """
+
+    def __init__(self, store: Store, recording: str, begin: int, end: int) -> None:
+        self._store = store
+        self._recording = recording
+        self._begin = begin
+        self._end = end
+
+    def _read(self, topic: str) -> tuple[Query, Query | None, Message | None]:
+        """Questions for the messages in the range and for the current one before, and that one."""
+        whole = self._store.topic(topic).in_recording(self._recording)
+        inside = whole.between(self._begin, self._end)
+        try:
+            current = whole.at(self._begin)
+        except TopicError:
+            return inside, None, None
+        if current.log_time_ns == self._begin:
+            return inside, None, None
+        return inside, whole.at_time(self._begin), current
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        """The messages of a topic, by log time."""
+        inside, _, current = self._read(topic)
+        if current is not None:
+            yield current
+        yield from inside
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """Log times of the messages of a topic, ns.
+
+        Raises:
+            TopicError: There are none.
+        """
+        inside, _, current = self._read(topic)
+        found = [np.array([] if current is None else [current.log_time_ns], np.int64)]
+        parts = match_times(inside.session, inside.question, Counters())
+        found += [part.log_time for part in parts]
+        return self._checked(topic, np.concatenate(found))
+
+    def values(self, source: Source) -> Values:
+        """Numbers of a topic; messages without them are left out.
+
+        Raises:
+            TopicError: There are none.
+            UsageError: A field is no number, or an array whose length changes.
+        """
+        import pyarrow as pa
+
+        inside, before, _ = self._read(source.topic)
+        queries = [inside] if before is None else [before, inside]
+        tables = [query.fields(*source.paths).to_arrow() for query in queries]
+        table = pa.concat_tables(tables, promote_options="permissive")
+        kept = [column for column in table.column_names if column in source.paths]
+        if missing := set(source.paths).difference(kept):
+            raise UsageError(f"{source.topic} has no field {min(missing)}.")
+        table = table.filter(_is_known(table, kept))
+        columns, names = [], []
+        for path in source.paths:
+            numbers = _numbers(table[path], source.topic, path)
+            short = f"{source.topic.strip('/')}.{path}"
+            is_array = table[path].type.num_fields > 0
+            names += [f"{short}[{n}]" for n in range(numbers.shape[1])] if is_array else [short]
+            columns.append(numbers)
+        times = table["log_time"].cast(pa.int64()).to_numpy()
+        self._checked(source.topic, times)
+        return Values(times, np.concatenate(columns, axis=1), tuple(names))
+
+    def _checked(self, topic: str, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        if not len(times):
+            label = self._store.entry(self._recording).label
+            raise TopicError(
+                f"Recording {label} has no message of {topic} before "
+                f"{format_time(self._end)}: leave the recording out, or map another topic."
+            )
+        return times
+
+
+def _is_known(table: pa.Table, columns: Sequence[str]) -> pa.ChunkedArray:
+    import pyarrow.compute as pc
+
+    found = pc.is_valid(table[columns[0]])
+    for name in columns[1:]:
+        found = pc.and_(found, pc.is_valid(table[name]))
+    return found
+
+
+def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float32]:
+    """The numbers of a column: float32[n, width]."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    kind = column.type
+    width = 1
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        lengths = pc.unique(pc.list_value_length(column)).to_pylist()
+        if len(lengths) > 1:
+            raise UsageError(
+                f"{topic}: {path} has {min(lengths)} to {max(lengths)} elements; a feature has "
+                f"always as many: name elements, such as {path}[0]."
+            )
+        width = int(lengths[0]) if lengths else 0
+        column, kind = pc.list_flatten(column), kind.value_type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+        raise UsageError(f"{topic}: {path} is {kind}, no number.")
+    flat: NDArray[np.float32] = column.cast(pa.float32(), safe=False).to_numpy()
+    return flat.reshape(-1, width)
+
+
+def _at(times: NDArray[np.int64], values: Values) -> NDArray[np.float32]:
+    return values.numbers[match(times, values.times, "asof", None).before]
+
+
+def _is_old(times: NDArray[np.int64], messages: NDArray[np.int64], fps: int) -> NDArray[np.bool_]:
+    """Where the current message of a topic is older than its usual gaps."""
+    period = usual_period(np.diff(messages))
+    if not period:
+        return np.zeros(len(times), np.bool_)  # a topic that says something once
+    age = times - messages[match(times, messages, "asof", None).before]
+    return age > max(GAP_PERIODS * period, 10**9 / fps)
+
+
+def _runs(is_good: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_good.astype(np.int8), [0]])))
+    return [(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
+
+
+def _refuse(
+    name: str,
+    grid: NDArray[np.int64],
+    times: dict[str, NDArray[np.int64]],
+    is_old: dict[str, NDArray[np.bool_]],
+) -> None:
+    """Say which gap is the first.
+
+    Raises:
+        UsageError: Always.
+    """
+    first = {topic: int(np.argmax(old)) for topic, old in is_old.items() if old.any()}
+    topic = min(first, key=first.__getitem__)
+    own, moment = times[topic], int(grid[first[topic]])
+    place = int(np.searchsorted(own, moment, "right")) - 1
+    begin = int(own[place])
+    end = int(own[place + 1]) if place + 1 < len(own) else int(grid[-1])
+    raise UsageError(
+        f"{name}: {topic} has a gap of {format_duration(end - begin)} at {format_time(begin)}. "
+        "--on-gap drop cuts the episode there, --on-gap hold keeps the last value."
+    )

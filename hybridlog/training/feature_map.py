@@ -1,0 +1,212 @@
+"""Which topics and fields become which features of a training set.
+
+A map is YAML:
+
+    robot_type: turtlebot
+    features:
+      observation.state:
+        - joint_states: position
+        - odom: twist.twist.linear.x
+      action:
+        - cmd_vel: [linear.x, angular.z]
+    images:
+      front: /front/image_raw
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from hybridlog.arrays.message_arrays import IMAGES, plain_type
+from hybridlog.formats.yaml_values import YamlError, parse_yaml
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TopicError, UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.session import Session
+
+IMAGE_PREFIX: Final = "observation.images."
+_MAX_BYTES: Final = 1 << 20
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,63}")
+_OWN = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "task"})
+_STATES: Final = {
+    "sensor_msgs/JointState": ("position",),
+    "nav_msgs/Odometry": ("twist.twist.linear.x", "twist.twist.angular.z"),
+}
+_ACTIONS: Final = {
+    "geometry_msgs/Twist": ("linear.x", "angular.z"),
+    "geometry_msgs/TwistStamped": ("twist.linear.x", "twist.angular.z"),
+    "sensor_msgs/Joy": ("axes",),
+    "std_msgs/Float64MultiArray": ("data",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Fields of a topic that are a part of a feature.
+
+    Attributes:
+        topic: The topic.
+        paths: Numbers, or arrays of numbers.
+    """
+
+    topic: str
+    paths: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureMap:
+    """Features of a training set.
+
+    Attributes:
+        vectors: Parts by name of the feature, such as `action`.
+        images: Topics by name of the camera.
+        robot_type: Name of the robot; empty if unknown.
+    """
+
+    vectors: Mapping[str, tuple[Source, ...]]
+    images: Mapping[str, str]
+    robot_type: str = ""
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """All topics, each once."""
+        parts = (part.topic for parts in self.vectors.values() for part in parts)
+        return tuple(dict.fromkeys([*parts, *self.images.values()]))
+
+    def resolved(self, session: Session) -> FeatureMap:
+        """The map with full names of topics.
+
+        Raises:
+            TopicError: There is no such topic, or several.
+        """
+        full = {name: session.resolve((name,))[0] for name in self.topics}
+        if several := [name for name, found in full.items() if len(found) > 1]:
+            raise TopicError(f"{several[0]} means several topics: {listed(full[several[0]])}.")
+        return FeatureMap(
+            {
+                name: tuple(Source(full[one.topic][0], one.paths) for one in parts)
+                for name, parts in self.vectors.items()
+            },
+            {name: full[topic][0] for name, topic in self.images.items()},
+            self.robot_type,
+        )
+
+    @classmethod
+    def read(cls, path: str | Path) -> FeatureMap:
+        """Read a map from a file.
+
+        Raises:
+            UsageError: It cannot be read, or is no map; says where and what to write.
+        """
+        try:
+            with Path(path).open("rb") as file:
+                text = file.read(_MAX_BYTES + 1)
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
+        if len(text) > _MAX_BYTES:
+            raise UsageError(f"{path} is larger than 1 MiB: no map of features.")
+        try:
+            return cls.of(parse_yaml(text), str(path))
+        except YamlError as error:
+            raise UsageError(f"{path} is no YAML: {error}.") from error
+
+    @classmethod
+    def of(cls, values: object, name: str = "the map") -> FeatureMap:
+        """A map of plain values.
+
+        Raises:
+            UsageError: They are no map; says where and what to write.
+        """
+        root = _mapping(values, name)
+        if unknown := root.keys() - {"robot_type", "features", "images"}:
+            _refuse(name, f"{min(unknown, key=str)!r} is none of robot_type, features, images")
+        vectors = {}
+        for key, parts in _mapping(root.get("features") or {}, f"{name}: features").items():
+            where = f"{name}: {key}"
+            if not _NAME.fullmatch(str(key)) or key in _OWN or str(key).startswith(IMAGE_PREFIX):
+                _refuse(where, "this is no name for a feature; name it like observation.state")
+            rows = parts if isinstance(parts, list) else [parts]
+            vectors[str(key)] = tuple(source for row in rows for source in _sources(row, where))
+        images = {}
+        for key, topic in _mapping(root.get("images") or {}, f"{name}: images").items():
+            if not _NAME.fullmatch(str(key)) or not isinstance(topic, str) or not topic:
+                _refuse(f"{name}: images", "write `front: /camera/image_raw`")
+            images[str(key)] = topic
+        if not vectors and not images:
+            _refuse(name, "it has no features; --propose-map writes a map")
+        return cls(vectors, images, str(root.get("robot_type") or ""))
+
+    def to_yaml(self) -> str:
+        """The map as YAML."""
+        lines = [f"robot_type: {self.robot_type}"] if self.robot_type else []
+        lines += ["features:"] if self.vectors else []
+        for name, parts in self.vectors.items():
+            lines.append(f"  {name}:")
+            lines += [f"    - {_text(one.topic)}: [{', '.join(one.paths)}]" for one in parts]
+        lines += ["images:"] if self.images else []
+        lines += [f"  {name}: {_text(topic)}" for name, topic in self.images.items()]
+        return "\n".join(lines) + "\n"
+
+
+def proposed(query: Query) -> FeatureMap:
+    """A map for the topics of a question, by their types.
+
+    Joint states and odometry become states, commands become actions, images of all encodings
+    and videos become images.
+
+    Raises:
+        UsageError: There are no such topics.
+    """
+    states: list[Source] = []
+    actions: list[Source] = []
+    images: dict[str, str] = {}
+    entries = map(query.session.entry_of, query.summaries())
+    types = {one.topic: plain_type(one.type) for entry in entries for one in entry.channels}
+    for topic in query.topics:
+        kind = types.get(topic, "")
+        if kind in _STATES:
+            states.append(Source(topic, _STATES[kind]))
+        elif kind in _ACTIONS:
+            actions.append(Source(topic, _ACTIONS[kind]))
+        elif kind in IMAGES:
+            words = [word for word in re.split(r"[^A-Za-z0-9]+", topic) if word]
+            plain = [word for word in words if word not in {"image", "raw", "color", "compressed"}]
+            name = "_".join(plain or words)
+            images[name if name not in images else f"{name}_{len(images)}"] = topic
+    named = {"observation.state": tuple(states), "action": tuple(actions)}
+    found = FeatureMap({name: parts for name, parts in named.items() if parts}, images)
+    if not found.topics:
+        raise UsageError(
+            "There are no joint states, odometry, commands or images: write the map by hand."
+        )
+    return found
+
+
+def _sources(row: object, where: str) -> list[Source]:
+    found = []
+    for topic, paths in _mapping(row, where).items():
+        names = paths if isinstance(paths, list) else [paths]
+        if not names or not all(isinstance(name, str) and name for name in names):
+            _refuse(where, f"name the fields of {topic}: `- {topic}: [linear.x, angular.z]`")
+        found.append(Source(str(topic), tuple(names)))
+    return found
+
+
+def _mapping(value: object, where: str) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        _refuse(where, "write `key: value` lines; --propose-map shows how")
+    return value
+
+
+def _text(topic: str) -> str:
+    return topic if re.fullmatch(r"[A-Za-z0-9_/.\-]+", topic) else f'"{topic}"'
+
+
+def _refuse(where: str, what: str) -> NoReturn:
+    raise UsageError(f"{where}: {what}.")

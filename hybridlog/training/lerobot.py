@@ -1,0 +1,469 @@
+"""Writes training sets in the format of LeRobot, version 3.0.
+
+Each episode is a directory until all are there, so an interrupted export goes on with the
+next one. Then they are put together: rows in Parquet files, pictures in MP4 files, and
+descriptions in `meta`. `meta/info.json` is written last.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from hybridlog import __version__
+from hybridlog.arrays.video import pyav
+from hybridlog.formats.slices import fingerprint
+from hybridlog.formats.writing import failures
+from hybridlog.query.pieces import pieces
+from hybridlog.training.episodes import episodes
+from hybridlog.training.feature_map import IMAGE_PREFIX
+from hybridlog.training.lerobot_episodes import WrittenEpisode, write_episode, write_text
+from hybridlog_storage.errors import PayloadError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from hybridlog.query.query import Query
+    from hybridlog.store import Store
+    from hybridlog.training.feature_map import FeatureMap
+    from hybridlog.training.lerobot_episodes import LerobotOptions
+
+_QUANTILES: Final = (0.01, 0.1, 0.5, 0.9, 0.99)
+_CHUNK_FILES: Final = 1000
+_DATA_MB: Final = 100
+_VIDEO_MB: Final = 200
+_UNFINISHED: Final = ".episodes"
+_PLAN: Final = "plan.json"
+_DATA: Final = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
+_VIDEO: Final = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+_EPISODES: Final = "meta/episodes/chunk-000/file-000.parquet"
+_INDEX: Final = {"dtype": "int64", "shape": [1], "names": None}
+
+
+@dataclass(slots=True)
+class LerobotReport:
+    """What was written.
+
+    Attributes:
+        path: Directory of the set.
+        episodes: Number of episodes.
+        frames: Number of frames.
+        resumed: Episodes that an interrupted export had finished.
+        held: Frames whose value of some topic is older than usual.
+        missing: Frames that show an earlier picture, since their own cannot be shown.
+        lost: Messages that are lost in the episodes.
+        bytes: Size of the files.
+    """
+
+    path: Path
+    episodes: int = 0
+    frames: int = 0
+    resumed: int = 0
+    held: int = 0
+    missing: int = 0
+    lost: int = 0
+    bytes: int = 0
+
+
+def write_lerobot(
+    store: Store,
+    query: Query,
+    features: FeatureMap,
+    path: str | Path,
+    options: LerobotOptions,
+    *,
+    progress: Callable[[str, int], None] | None = None,
+) -> LerobotReport:
+    """Write the episodes of a question as a training set.
+
+    Args:
+        store: The store.
+        query: The recordings and their range.
+        features: The features.
+        path: Directory of the set. The same export goes on where it was interrupted.
+        options: How.
+        progress: Called with the name of an episode and the number of its frames.
+
+    Raises:
+        UsageError: The directory has something else, there is a gap, or no episode.
+        TopicError: A topic is missing.
+        PayloadError: No picture can be shown.
+        MissingDependencyError: PyAV is not installed.
+        DiskFullError: No space left.
+    """
+    pyav()
+    features = features.resolved(query.session)
+    asked = query.with_topic(*features.topics)
+    plan = _plan(asked, features, options)
+    root, report = Path(path), LerobotReport(Path(path))
+    unfinished = root / _UNFINISHED
+    if root.exists() and not unfinished.exists():
+        raise UsageError(f"{root} is there already: name another directory, or add --force.")
+    if not _is_same(unfinished, plan):
+        shutil.rmtree(unfinished, ignore_errors=True)  # of another set, which nobody finished
+        unfinished.mkdir(parents=True)
+        write_text(unfinished / _PLAN, plan)
+    made: list[WrittenEpisode] = []
+    for piece in pieces(store, asked, options.episodes_by):
+        for episode in episodes(store, piece, features, options.fps, options.on_gap):
+            place = unfinished / f"{len(made):06d}"
+            written = WrittenEpisode.read(place)
+            report.resumed += written is not None
+            made.append(written or write_episode(store, episode, features, options, place))
+            if progress is not None:
+                progress(episode.name, made[-1].length)
+    if not made:
+        shutil.rmtree(root)
+        raise UsageError("There is no episode in these recordings, so nothing is written.")
+    with failures(str(root)):
+        _Assembly(root, made, features, options, json.loads(plan)).write(report)
+    shutil.rmtree(unfinished)
+    return report
+
+
+def _plan(query: Query, features: FeatureMap, options: LerobotOptions) -> str:
+    """What determines the bytes of a set."""
+    return json.dumps(
+        {
+            "hybridlog": __version__,
+            "question": repr(query),
+            "fingerprint": fingerprint(query),
+            "map": features.to_yaml(),
+            "fps": options.fps,
+            "episodes_by": options.episodes_by,
+            "task": options.task or options.task_topic,
+            "codec": options.codec,
+            "on_gap": options.on_gap,
+        },
+        indent=1,
+    )
+
+
+def _is_same(unfinished: Path, plan: str) -> bool:
+    try:
+        return (unfinished / _PLAN).read_text() == plan
+    except OSError:
+        return False
+
+
+# The set.
+
+
+class _Assembly:
+    """Puts the episodes of a set together.
+
+    Args:
+        root: Directory of the set.
+        made: The episodes.
+        features: The features.
+        options: How.
+        plan: What determines the bytes of the set.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        made: Sequence[WrittenEpisode],
+        features: FeatureMap,
+        options: LerobotOptions,
+        plan: Mapping[str, Any],
+    ) -> None:
+        self._root = root
+        self._made = made
+        self._features = features
+        self._options = options
+        self._plan = plan
+        self._rows: list[dict[str, Any]] = [{} for _ in made]
+        self._tasks = {
+            task: n for n, task in enumerate(dict.fromkeys(m.about["task"] for m in made))
+        }
+        self._check()
+
+    def _check(self) -> None:
+        """All episodes must have the same columns and sizes.
+
+        Raises:
+            UsageError: They differ.
+        """
+        first = self._made[0]
+        for other in self._made[1:]:
+            for what, one, two in (
+                ("sizes of pictures", first.pixels, other.pixels),
+                ("columns", first.about["names"], other.about["names"]),
+            ):
+                if one != two:
+                    raise UsageError(
+                        f"{first.about['name']} and {other.about['name']} have other {what}: "
+                        "choose recordings that are alike."
+                    )
+
+    def write(self, report: LerobotReport) -> None:
+        """Write all files, `meta/info.json` last."""
+        for name in ("data", "videos", "meta"):
+            if (self._root / name).exists():
+                shutil.rmtree(self._root / name)
+        everything = self._write_data()
+        for name in self._features.images:
+            self._write_videos(name)
+        self._write_episodes()
+        self._write_tasks()
+        self._write_stats(everything)
+        self._write_own()
+        self._write_info()
+        report.episodes = len(self._made)
+        report.frames = sum(one.length for one in self._made)
+        report.held = sum(sum(one.about["held"].values()) for one in self._made)
+        report.missing = sum(sum(one.about["missing"].values()) for one in self._made)
+        report.lost = sum(one.about["lost"] for one in self._made)
+        report.bytes = sum(
+            file.stat().st_size
+            for file in self._root.rglob("*")
+            if file.is_file() and _UNFINISHED not in file.parts
+        )
+
+    def _write_data(self) -> dict[str, NDArray[Any]]:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        limit, number, writer = _DATA_MB << 20, -1, None
+        kept: dict[str, list[NDArray[Any]]] = {}
+        begin = size = 0
+        for place, one in enumerate(self._made):
+            values = one.vectors() | self._own_columns(place, one, begin)
+            table = pa.table({name: _column(array) for name, array in values.items()})
+            if writer is None or size + table.nbytes > limit:
+                if writer is not None:
+                    writer.close()
+                number, size = number + 1, 0
+                path = self._root / _DATA.format(
+                    chunk=number // _CHUNK_FILES, file=number % _CHUNK_FILES
+                )
+                path.parent.mkdir(parents=True, exist_ok=True)
+                writer = pq.ParquetWriter(path, table.schema, compression="snappy")
+            writer.write_table(table)
+            size += table.nbytes
+            for name, array in values.items():
+                kept.setdefault(name, []).append(array)
+            self._rows[place] |= {
+                "episode_index": place,
+                "tasks": [one.about["task"]],
+                "length": one.length,
+                "data/chunk_index": number // _CHUNK_FILES,
+                "data/file_index": number % _CHUNK_FILES,
+                "dataset_from_index": begin,
+                "dataset_to_index": begin + one.length,
+            }
+            self._rows[place] |= _flat_stats(
+                {name: _stats(array) for name, array in values.items()}
+            )
+            begin += one.length
+        assert writer is not None
+        writer.close()
+        return {name: np.concatenate(parts) for name, parts in kept.items()}
+
+    def _file(self, form: str, number: int, key: str = "") -> Path:
+        """The path of a file by its number; its folder is made."""
+        chunk, file = divmod(number, _CHUNK_FILES)
+        path = self._root / form.format(key=key, chunk=chunk, file=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def _own_columns(self, place: int, one: WrittenEpisode, begin: int) -> dict[str, NDArray[Any]]:
+        frames = np.arange(one.length, dtype=np.int64)
+        return {
+            "timestamp": (frames / self._options.fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(one.length, place, np.int64),
+            "index": frames + begin,
+            "task_index": np.full(one.length, self._tasks[one.about["task"]], np.int64),
+        }
+
+    def _write_videos(self, name: str) -> None:
+        """Join the videos of the episodes; packets are copied."""
+        av, fps = pyav(), self._options.fps
+        key = f"{IMAGE_PREFIX}{name}"
+        number, size, frames, target, track = -1, 0, 0, None, None
+        for place, one in enumerate(self._made):
+            source = one.place / f"{name}.mp4"
+            if target is None or size + source.stat().st_size > _VIDEO_MB << 20:
+                if target is not None:
+                    target.close()
+                number, size, frames, track = number + 1, 0, 0, None
+                path = self._file(_VIDEO, number, key)
+                target = av.open(str(path), "w", format="mp4")
+            begin = frames
+            with av.open(str(source)) as file:
+                if track is None:
+                    track = target.add_stream_from_template(file.streams.video[0])
+                for packet in file.demux(video=0):
+                    if packet.dts is None:
+                        continue
+                    packet.stream, packet.time_base = track, Fraction(1, fps)
+                    packet.pts = packet.dts = frames
+                    packet.duration = 1
+                    target.mux(packet)
+                    frames += 1
+            size += source.stat().st_size
+            self._rows[place] |= {
+                f"videos/{key}/chunk_index": number // _CHUNK_FILES,
+                f"videos/{key}/file_index": number % _CHUNK_FILES,
+                f"videos/{key}/from_timestamp": begin / fps,
+                f"videos/{key}/to_timestamp": frames / fps,
+            }
+            self._rows[place] |= _flat_stats({key: _colour_stats(one.counts[name])})
+            if frames - begin != one.length:
+                raise PayloadError(f"{source.name} has {frames - begin} frames, not {one.length}")
+        assert target is not None
+        target.close()
+
+    def _write_episodes(self) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        rows = [
+            {**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+            for row in self._rows
+        ]
+        path = self._root / _EPISODES
+        path.parent.mkdir(parents=True)
+        pq.write_table(pa.Table.from_pylist(rows), path, compression="snappy")
+
+    def _write_tasks(self) -> None:
+        """Tasks by number; pandas takes the text as the index."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        table = pa.table(
+            {"task_index": pa.array([*self._tasks.values()], pa.int64()), "task": [*self._tasks]}
+        )
+        columns = [
+            {
+                "name": name,
+                "field_name": name,
+                "pandas_type": kind,
+                "numpy_type": of,
+                "metadata": None,
+            }
+            for name, kind, of in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+        ]
+        pandas = {
+            "index_columns": ["task"],
+            "column_indexes": [],
+            "columns": columns,
+            "creator": {"library": "pyarrow", "version": pa.__version__},
+            "pandas_version": "2.0.0",
+        }
+        table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+        pq.write_table(table, self._root / "meta/tasks.parquet")
+
+    def _write_stats(self, everything: Mapping[str, NDArray[Any]]) -> None:
+        found = {name: _stats(array) for name, array in everything.items()}
+        for name in self._features.images:
+            counts = np.sum([one.counts[name] for one in self._made], axis=0)
+            found[f"{IMAGE_PREFIX}{name}"] = _colour_stats(counts)
+        write_text(self._root / "meta/stats.json", json.dumps(found, indent=1))
+
+    def _write_own(self) -> None:
+        """Where the set comes from, and what was lost there."""
+        own = {**self._plan, "episodes": [one.about for one in self._made]}
+        write_text(self._root / "meta/hybridlog.json", json.dumps(own, indent=1))
+
+    def _write_info(self) -> None:
+        first, fps = self._made[0], self._options.fps
+        features: dict[str, Any] = {}
+        for name, array in first.vectors().items():
+            names = first.about["names"][name]
+            features[name] = {"dtype": "float32", "shape": [array.shape[1]], "names": names}
+        for name, size in first.pixels.items():
+            rows, columns = (number + number % 2 for number in size)
+            features[f"{IMAGE_PREFIX}{name}"] = {
+                "dtype": "video",
+                "shape": [rows, columns, 3],
+                "names": ["height", "width", "channels"],
+                "info": {
+                    "video.fps": fps,
+                    "video.height": rows,
+                    "video.width": columns,
+                    "video.channels": 3,
+                    "video.codec": self._options.codec,
+                    "video.pix_fmt": "yuv420p",
+                    "video.is_depth_map": False,
+                    "has_audio": False,
+                },
+            }
+        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        features |= dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), _INDEX)
+        info = {
+            "codebase_version": "v3.0",
+            "robot_type": self._features.robot_type or "unknown",
+            "total_episodes": len(self._made),
+            "total_frames": sum(one.length for one in self._made),
+            "total_tasks": len(self._tasks),
+            "chunks_size": _CHUNK_FILES,
+            "data_files_size_in_mb": _DATA_MB,
+            "video_files_size_in_mb": _VIDEO_MB,
+            "fps": fps,
+            "splits": {"train": f"0:{len(self._made)}"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+            "features": features,
+        }
+        write_text(self._root / "meta/info.json", json.dumps(info, indent=1))
+
+
+def _column(array: NDArray[Any]) -> Any:
+    import pyarrow as pa
+
+    if array.ndim == 1 or array.shape[1] == 1:
+        return pa.array(array.ravel())
+    return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
+
+
+def _stats(array: NDArray[Any]) -> dict[str, list[Any]]:
+    """Statistics of the columns of an array."""
+    values = np.asarray(array, np.float64).reshape(len(array), -1)
+    found = {
+        "min": values.min(0),
+        "max": values.max(0),
+        "mean": values.mean(0),
+        "std": values.std(0),
+        "count": np.array([len(values)]),
+    }
+    for share, row in zip(_QUANTILES, np.quantile(values, _QUANTILES, axis=0), strict=True):
+        found[_quantile(share)] = row
+    return {name: value.tolist() for name, value in found.items()}
+
+
+def _colour_stats(counts: NDArray[np.int64]) -> dict[str, list[Any]]:
+    """Statistics of colours from 0 to 1, of how often each value occurs in them."""
+    levels, total = np.arange(256) / 255, counts.sum(1)
+    mean = counts @ levels / total
+    rows = {
+        "min": levels[(counts > 0).argmax(1)],
+        "max": levels[255 - (counts[:, ::-1] > 0).argmax(1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
+    }
+    below = np.cumsum(counts, axis=1)
+    for share in _QUANTILES:
+        rows[_quantile(share)] = levels[(below >= share * total[:, None]).argmax(1)]
+    found = {name: row.reshape(3, 1, 1).tolist() for name, row in rows.items()}
+    return {**found, "count": [int(total[0])]}
+
+
+def _quantile(share: float) -> str:
+    return f"q{round(share * 100):02d}"
+
+
+def _flat_stats(found: Mapping[str, Mapping[str, list[Any]]]) -> dict[str, list[Any]]:
+    return {
+        f"stats/{name}/{what}": value for name, own in found.items() for what, value in own.items()
+    }

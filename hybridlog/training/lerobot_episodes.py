@@ -1,0 +1,279 @@
+"""Episodes of a training set as directories, while the set is not complete."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from hybridlog.arrays.video import pyav
+from hybridlog.formats.writing import failures
+from hybridlog.training.episodes import pictures
+from hybridlog_storage.disk.durability import write_new
+from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hybridlog.store import Store
+    from hybridlog.training.episodes import Episode, OnGap
+    from hybridlog.training.feature_map import FeatureMap
+
+Codec = Literal["h264", "av1"]
+CODECS: Final[Mapping[Codec, tuple[str, Mapping[str, str]]]] = {
+    "h264": ("libx264", {"preset": "veryfast", "crf": "23", "g": "2", "bf": "0"}),
+    "av1": ("libsvtav1", {"preset": "10", "crf": "30", "g": "2"}),
+}
+"""Encoders and their options: a key frame in every two, so that any frame is near one."""
+_THREADS: Final = 4  # of an encoder; the bytes depend on it
+_SAMPLED_FRAMES: Final = 100
+"""Pictures of an episode in its statistics, about."""
+_SAMPLED_ROWS: Final = 150
+_ABOUT: Final = "episode.json"
+_VECTORS: Final = "vectors.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class LerobotOptions:
+    """How a training set is made.
+
+    Attributes:
+        fps: Frames per second.
+        episodes_by: `recording`, `mark`, or a predicate.
+        task: What the robot does, in words.
+        task_topic: A topic that says it instead; its text at the begin of an episode counts.
+        codec: Codec of the pictures.
+        on_gap: What a gap in a topic does.
+    """
+
+    fps: int
+    episodes_by: str = "recording"
+    task: str = ""
+    task_topic: str | None = None
+    codec: Codec = "h264"
+    on_gap: OnGap = "refuse"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.fps <= 1000:
+            raise UsageError("Frames per second are 1 to 1000.")
+        if bool(self.task.strip()) == (self.task_topic is not None):
+            raise UsageError("Say what the robot does: --task TEXT or --task-topic TOPIC.")
+
+
+@dataclass(slots=True)
+class WrittenEpisode:
+    """An episode that was written.
+
+    Attributes:
+        place: Its directory.
+        about: Name, recording, begin and end, task, losses.
+        length: Number of frames.
+        counts: int64[3, 256] by camera: how often each value occurs in a colour.
+        pixels: Rows and columns by camera.
+    """
+
+    place: Path
+    about: dict[str, Any]
+    length: int
+    counts: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    pixels: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, place: Path) -> WrittenEpisode | None:
+        """The episode in a directory; None if it is not whole."""
+        if not (place / _ABOUT).exists():
+            return None
+        value = json.loads((place / _ABOUT).read_text())
+        return cls(
+            place,
+            value["about"],
+            value["length"],
+            {name: np.array(rows, np.int64) for name, rows in value["counts"].items()},
+            {name: (size[0], size[1]) for name, size in value["pixels"].items()},
+        )
+
+    def vectors(self) -> dict[str, NDArray[np.float32]]:
+        """The features: float32[n, width] by name."""
+        with np.load(self.place / _VECTORS, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+
+
+def write_episode(
+    store: Store, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
+) -> WrittenEpisode:
+    """Write an episode; its description is written last.
+
+    Args:
+        store: The store.
+        episode: The episode.
+        features: The features.
+        options: Rate, codec, task.
+        place: The directory, which is made anew.
+
+    Raises:
+        UsageError: A picture is missing, or of another size than those before.
+        PayloadError: No picture can be shown.
+        DiskFullError: No space left.
+    """
+    with failures(str(place)):
+        return _write_episode(store, episode, features, options, place)
+
+
+def _write_episode(
+    store: Store, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
+) -> WrittenEpisode:
+    if place.exists():
+        shutil.rmtree(place)
+    place.mkdir()
+    begin, end = int(episode.times[0]), int(episode.times[-1]) + 1
+    query = store.recordings([episode.recording]).topic(*features.topics).between(begin, end)
+    lost = query.completeness()
+    about: dict[str, Any] = {
+        "name": episode.name,
+        "recording": episode.recording,
+        "begin_ns": begin,
+        "end_ns": end,
+        "task": _task(store, episode, options),
+        "names": episode.names,
+        "held": episode.held,
+        "lost": lost.messages,
+        "is_lost_exact": lost.is_exact,
+        "missing": {},
+    }
+    counts, pixels = {}, {}
+    for name, topic in features.images.items():
+        with closing(_Video(place / f"{name}.mp4", options)) as video:
+            for picture, shown in pictures(store, episode, topic):
+                if picture is None:
+                    _refuse_missing(episode, topic, options)
+                    about["missing"][topic] = about["missing"].get(topic, 0) + shown
+                video.add(picture, shown)
+            video.finish(f"{episode.name}: {topic}")
+        counts[name], pixels[name] = video.counts.tolist(), video.size
+    np.savez(place / _VECTORS, **episode.vectors)  # type: ignore[arg-type]
+    length = len(episode.times)
+    value = {"about": about, "length": length, "counts": counts, "pixels": pixels}
+    write_text(place / _ABOUT, json.dumps(value))
+    written = WrittenEpisode.read(place)
+    assert written is not None
+    return written
+
+
+def _refuse_missing(episode: Episode, topic: str, options: LerobotOptions) -> None:
+    if options.on_gap == "refuse":
+        raise UsageError(
+            f"{episode.name}: a picture of {topic} cannot be shown, or has no payload. "
+            "--on-gap hold shows the one before."
+        )
+
+
+def _task(store: Store, episode: Episode, options: LerobotOptions) -> str:
+    if options.task_topic is None:
+        return options.task
+    topic = store.topic(options.task_topic).in_recording(episode.recording)
+    text = getattr(topic.at(int(episode.times[0])).decode(), "data", None)
+    if not isinstance(text, str) or not text.strip():
+        raise UsageError(f"{options.task_topic} has no text in `data`: name another topic.")
+    return text
+
+
+class _Video:
+    """Encodes the pictures of an episode.
+
+    Args:
+        path: The file.
+        options: Rate and codec.
+
+    Attributes:
+        counts: int64[3, 256], how often each value occurs in a colour, of some pictures.
+        size: Rows and columns of a picture.
+    """
+
+    def __init__(self, path: Path, options: LerobotOptions) -> None:
+        self._av = pyav()
+        self._options = options
+        self._file: Any = self._av.open(str(path), "w", format="mp4")
+        self._track: Any = None
+        self._frames = 0
+        self._waiting = 0  # frames before the first picture
+        self._before: NDArray[np.uint8] | None = None
+        self.counts = np.zeros((3, 256), np.int64)
+        self.size = (0, 0)
+
+    def add(self, picture: NDArray[np.uint8] | None, count: int) -> None:
+        """Append a picture, or the one before, for a number of frames."""
+        if picture is None and self._before is None:
+            self._waiting += count
+            return
+        if picture is not None:
+            count, self._waiting = count + self._waiting, 0
+            self._before = self._checked(picture)
+            if self._frames % self._sampled() == 0 or self._frames == 0:
+                self._count(picture)
+        frame = self._av.VideoFrame.from_ndarray(self._before, format="rgb24")
+        frame = frame.reformat(format="yuv420p")
+        for _ in range(count):
+            frame.pts, frame.time_base = self._frames, Fraction(1, self._options.fps)
+            self._mux(frame)
+            self._frames += 1
+
+    def _sampled(self) -> int:
+        return max(self._frames // _SAMPLED_FRAMES, 1)
+
+    def _checked(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if self._track is None:
+            self.size = picture.shape[:2]
+            self._start()
+        if picture.shape[:2] != self.size:
+            before, now = (f"{one[1]} x {one[0]}" for one in (self.size, picture.shape))
+            raise UsageError(f"A camera changes its size from {before} to {now}.")
+        even = [(0, self.size[0] % 2), (0, self.size[1] % 2), (0, 0)]
+        return np.ascontiguousarray(np.pad(picture, even, mode="edge"))
+
+    def _start(self) -> None:
+        name, options = CODECS[self._options.codec]
+        try:
+            track = self._file.add_stream(name, rate=self._options.fps, options=dict(options))
+        except (self._av.FFmpegError, ValueError) as error:
+            raise MissingDependencyError(f"this PyAV has no {name}") from error
+        track.width, track.height = self.size[1] + self.size[1] % 2, self.size[0] + self.size[0] % 2
+        track.pix_fmt = "yuv420p"
+        track.codec_context.thread_count = _THREADS
+        self._track = track
+
+    def _count(self, picture: NDArray[np.uint8]) -> None:
+        step = max(max(picture.shape[:2]) // _SAMPLED_ROWS, 1)
+        for colour in range(3):
+            values = picture[::step, ::step, colour].ravel()
+            self.counts[colour] += np.bincount(values, minlength=256)
+
+    def _mux(self, frame: Any) -> None:
+        for packet in self._track.encode(frame):
+            self._file.mux(packet)
+
+    def finish(self, name: str) -> None:
+        """Complete the file.
+
+        Raises:
+            PayloadError: There is no picture.
+        """
+        if self._track is None:
+            raise PayloadError(f"{name} has no picture that can be shown")
+        self._mux(None)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file that is whole or not there."""
+    write_new(path, text.encode(), depth=1)
