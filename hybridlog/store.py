@@ -663,7 +663,7 @@ class Store:
             if isinstance(features, str | Path)
             else FeatureMap.of(features)
         )
-        return write_lerobot(self, query, wanted, path, options, progress=progress)
+        return write_lerobot(query, wanted, path, options, progress=progress)
 
     @of_one_moment
     def sync(

@@ -79,6 +79,7 @@ ALLOWED = {
         "hybridlog.query",
         "hybridlog.sql",
         "hybridlog.tf",
+        "hybridlog.training",
     ),
     "pymongo": ("hybridlog_storage.mongo.database",),
     "re2": ("hybridlog.query.predicate.regex",),

@@ -125,7 +125,7 @@ def export_command(
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
             folder = is_directory(form, target) if form in _LOGS else None
-            parts = pieces(opened, query, split, target, force=force, is_directory=folder)
+            parts = pieces(query, split, target, force=force, is_directory=folder)
         for path, one in parts:
             to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
             if form in _LOGS:

@@ -167,7 +167,7 @@ def fetch_command(**parameters: Any) -> None:
                 original_times=choices.original_times,
             )
             if choices.split is not None:
-                _write_pieces(store, query, choices, to, front)
+                _write_pieces(query, choices, to, front)
                 return
             query = answer_query(query, to, front=front, strict=choices.strict)
         sys.stdout.flush()
@@ -180,15 +180,13 @@ def fetch_command(**parameters: Any) -> None:
                 print_lost(query, count)
 
 
-def _write_pieces(
-    store: Store, query: Query, choices: _Choices, to: Destination, front: Front
-) -> None:
+def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
     how = choices.split
     assert to.path is not None
     assert how is not None
     folder = is_directory(to.form, to.path)
-    for path, one in pieces(store, query, how, to.path, force=to.force, is_directory=folder):
+    for path, one in pieces(query, how, to.path, force=to.force, is_directory=folder):
         answer_query(one, replace(to, path=path), front=front, strict=choices.strict)
         if not to.quiet:
             counters = one.counters

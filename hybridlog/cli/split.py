@@ -9,7 +9,6 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room
-from hybridlog.query.pieces import pieces as split
 from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.pieces import Piece
     from hybridlog.query.query import Query
-    from hybridlog.store import Store
 
 split_by = click.option(
     "--split-by",
@@ -29,12 +27,11 @@ split_by = click.option(
 
 
 def pieces(
-    store: Store, query: Query, how: str, target: Path, *, force: bool, is_directory: bool | None
+    query: Query, how: str, target: Path, *, force: bool, is_directory: bool | None
 ) -> Iterator[tuple[Path, Query]]:
     """The parts of an answer that have messages, and where to write each; says which have none.
 
     Args:
-        store: The store.
         query: The whole question.
         how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
         target: The output.
@@ -47,7 +44,9 @@ def pieces(
         WhereError: It cannot be parsed, or does not fit the fields.
         TopicError: There is no such topic.
     """
-    there = [*split(store, query, how)]
+    from hybridlog.query.pieces import pieces as split
+
+    there = [*split(query, how)]
     if not there and how != "recording":
         output.note("No mark." if how == "mark" else "No interval.")
     found = [piece for piece in there if _has_messages(piece)]

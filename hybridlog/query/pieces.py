@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from hybridlog.query.question import Question
+from hybridlog.query.topics import split_topic
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
-    from hybridlog.store import Store
 
 
 class Piece(NamedTuple):
@@ -24,11 +25,10 @@ class Piece(NamedTuple):
     query: Query
 
 
-def pieces(store: Store, query: Query, how: str) -> Iterator[Piece]:
+def pieces(query: Query, how: str) -> Iterator[Piece]:
     """The parts of a question, in the order of recordings and times.
 
     Args:
-        store: The store.
         query: The whole question.
         how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
 
@@ -46,14 +46,13 @@ def pieces(store: Store, query: Query, how: str) -> Iterator[Piece]:
         return
     events = query
     if ": " in how:
-        from hybridlog.query.topics import split_topic
-
         topic, how = split_topic(how)
-        events = store.recordings(list(query.recordings)).topic(topic)
+        topics = query.session.resolve_in([topic], query.recordings)
+        events = type(query)(query.session, Question(tuple(topics), query.recordings))
     elif len(query.topics) != 1:
         raise UsageError("Name the topic of the predicate: 'TOPIC: PREDICATE'.")
     else:
-        events = store.recordings(list(query.recordings)).topic(*query.topics)
+        events = type(query)(query.session, Question(query.topics, query.recordings))
     held = events.where(how).intervals()
     yield from _of_intervals(query, ((one.recording, one.begin_ns, one.end_ns, "") for one in held))
 

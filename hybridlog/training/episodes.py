@@ -13,6 +13,8 @@ from hybridlog.drawing.images import shown_pixels
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.query import Query
+from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration, format_time
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
@@ -22,8 +24,7 @@ if TYPE_CHECKING:
 
     from hybridlog.message import Message
     from hybridlog.query.pieces import Piece
-    from hybridlog.query.query import Query
-    from hybridlog.store import Store
+    from hybridlog.session import Session
     from hybridlog.training.feature_map import FeatureMap, Source
 
 OnGap = Literal["refuse", "drop", "hold"]
@@ -67,16 +68,13 @@ class Episode:
     held: dict[str, int]
 
 
-def episodes(
-    store: Store, piece: Piece, features: FeatureMap, fps: int, on_gap: OnGap
-) -> Iterator[Episode]:
+def episodes(piece: Piece, features: FeatureMap, fps: int, on_gap: OnGap) -> Iterator[Episode]:
     """The episodes of a part of a question: one for each recording and range in it.
 
     An episode begins when all topics have a value. A frame has the last value of each topic
     that is not later than it.
 
     Args:
-        store: The store.
         piece: The part: its name, recordings and range.
         features: The features.
         fps: Frames per second.
@@ -90,7 +88,7 @@ def episodes(
 
     name, query = piece
     for summary, (begin, end) in RangeResolver(query.session, query.question).spans():
-        reader = _Reader(store, summary.id, begin, end)
+        reader = _Reader(query.session, summary.id, begin, end)
         read: dict[Source, Values] = {}
         times = {topic: reader.times(topic) for topic in features.images.values()}
         for source in (part for parts in features.vectors.values() for part in parts):
@@ -129,20 +127,20 @@ def episodes(
 
 
 def pictures(
-    store: Store, episode: Episode, topic: str
+    session: Session, episode: Episode, topic: str
 ) -> Iterator[tuple[NDArray[np.uint8] | None, int]]:
     """The picture of each frame of an episode, and how many frames in turn show it.
 
     None stands for a picture that cannot be shown, or has no payload.
 
     Args:
-        store: The store.
+        session: The open store.
         episode: The episode.
         topic: The topic of the pictures.
     """
     current: Message | None = None
     place, frames = 0, episode.times.tolist()
-    reader = _Reader(store, episode.recording, frames[0], frames[-1] + 1)
+    reader = _Reader(session, episode.recording, frames[0], frames[-1] + 1)
     for message in reader.messages(topic):
         shown = place
         while place < len(frames) and frames[place] < message.log_time_ns:
@@ -170,21 +168,21 @@ class _Reader:
     """Reads topics of a recording in a range, and the messages that are current at its begin.
 
     Args:
-        store: The store.
+        session: The open store.
         recording: Id of the recording.
         begin: First log time, ns.
         end: Last log time, exclusive, ns.
     """
 
-    def __init__(self, store: Store, recording: str, begin: int, end: int) -> None:
-        self._store = store
+    def __init__(self, session: Session, recording: str, begin: int, end: int) -> None:
+        self._session = session
         self._recording = recording
         self._begin = begin
         self._end = end
 
     def _read(self, topic: str) -> tuple[Query, Query | None, Message | None]:
         """Questions for the messages in the range and for the current one before, and that one."""
-        whole = self._store.topic(topic).in_recording(self._recording)
+        whole = Query(self._session, Question((topic,), (self._recording,)))
         inside = whole.between(self._begin, self._end)
         try:
             current = whole.at(self._begin)
@@ -243,7 +241,7 @@ class _Reader:
 
     def _checked(self, topic: str, times: NDArray[np.int64]) -> NDArray[np.int64]:
         if not len(times):
-            label = self._store.entry(self._recording).label
+            label = self._session.entry(self._recording).label
             raise TopicError(
                 f"Recording {label} has no message of {topic} before "
                 f"{format_time(self._end)}: leave the recording out, or map another topic."

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.query import Query
-    from hybridlog.store import Store
     from hybridlog.training.feature_map import FeatureMap
     from hybridlog.training.lerobot_episodes import LerobotOptions
 
@@ -74,7 +73,6 @@ class LerobotReport:
 
 
 def write_lerobot(
-    store: Store,
     query: Query,
     features: FeatureMap,
     path: str | Path,
@@ -85,7 +83,6 @@ def write_lerobot(
     """Write the episodes of a question as a training set.
 
     Args:
-        store: The store.
         query: The recordings and their range.
         features: The features.
         path: Directory of the set. The same export goes on where it was interrupted.
@@ -112,12 +109,12 @@ def write_lerobot(
         unfinished.mkdir(parents=True)
         write_text(unfinished / _PLAN, plan)
     made: list[WrittenEpisode] = []
-    for piece in pieces(store, asked, options.episodes_by):
-        for episode in episodes(store, piece, features, options.fps, options.on_gap):
+    for piece in pieces(asked, options.episodes_by):
+        for episode in episodes(piece, features, options.fps, options.on_gap):
             place = unfinished / f"{len(made):06d}"
             written = WrittenEpisode.read(place)
             report.resumed += written is not None
-            made.append(written or write_episode(store, episode, features, options, place))
+            made.append(written or write_episode(query.session, episode, features, options, place))
             if progress is not None:
                 progress(episode.name, made[-1].length)
     if not made:

@@ -14,6 +14,8 @@ import numpy as np
 
 from hybridlog.arrays.video import pyav
 from hybridlog.formats.writing import failures
+from hybridlog.query.query import Query
+from hybridlog.query.question import Question
 from hybridlog.training.episodes import pictures
 from hybridlog_storage.disk.durability import write_new
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.store import Store
+    from hybridlog.session import Session
     from hybridlog.training.episodes import Episode, OnGap
     from hybridlog.training.feature_map import FeatureMap
 
@@ -107,12 +109,12 @@ class WrittenEpisode:
 
 
 def write_episode(
-    store: Store, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
+    session: Session, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
 ) -> WrittenEpisode:
     """Write an episode; its description is written last.
 
     Args:
-        store: The store.
+        session: The open store.
         episode: The episode.
         features: The features.
         options: Rate, codec, task.
@@ -124,24 +126,24 @@ def write_episode(
         DiskFullError: No space left.
     """
     with failures(str(place)):
-        return _write_episode(store, episode, features, options, place)
+        return _write_episode(session, episode, features, options, place)
 
 
 def _write_episode(
-    store: Store, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
+    session: Session, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
 ) -> WrittenEpisode:
     if place.exists():
         shutil.rmtree(place)
     place.mkdir()
     begin, end = int(episode.times[0]), int(episode.times[-1]) + 1
-    query = store.recordings([episode.recording]).topic(*features.topics).between(begin, end)
+    query = Query(session, Question(features.topics, (episode.recording,))).between(begin, end)
     lost = query.completeness()
     about: dict[str, Any] = {
         "name": episode.name,
         "recording": episode.recording,
         "begin_ns": begin,
         "end_ns": end,
-        "task": _task(store, episode, options),
+        "task": _task(session, episode, options),
         "names": episode.names,
         "held": episode.held,
         "lost": lost.messages,
@@ -151,7 +153,7 @@ def _write_episode(
     counts, pixels = {}, {}
     for name, topic in features.images.items():
         with closing(_Video(place / f"{name}.mp4", options)) as video:
-            for picture, shown in pictures(store, episode, topic):
+            for picture, shown in pictures(session, episode, topic):
                 if picture is None:
                     _refuse_missing(episode, topic, options)
                     about["missing"][topic] = about["missing"].get(topic, 0) + shown
@@ -175,10 +177,11 @@ def _refuse_missing(episode: Episode, topic: str, options: LerobotOptions) -> No
         )
 
 
-def _task(store: Store, episode: Episode, options: LerobotOptions) -> str:
+def _task(session: Session, episode: Episode, options: LerobotOptions) -> str:
     if options.task_topic is None:
         return options.task
-    topic = store.topic(options.task_topic).in_recording(episode.recording)
+    topics, _ = session.resolve((options.task_topic,))
+    topic = Query(session, Question(topics, (episode.recording,)))
     text = getattr(topic.at(int(episode.times[0])).decode(), "data", None)
     if not isinstance(text, str) or not text.strip():
         raise UsageError(f"{options.task_topic} has no text in `data`: name another topic.")
