@@ -502,7 +502,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
     return base / "store", *ids
 
 
-SOME_OR_EACH = [5, pytest.param(1, marks=pytest.mark.exhaustive)]
+SOME_OR_EACH = [9, pytest.param(1, marks=pytest.mark.exhaustive)]
 """Steps from one that is tried to the next."""
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Self
 
 from hybridlog.cli.answers import Destination, answer_sql
 from hybridlog.cli.output import note, notes, say
@@ -15,7 +15,7 @@ from hybridlog.index.consent import state_directory
 from hybridlog.sql.completion import DELIMITERS, candidates
 from hybridlog.sql.memory_limit import limited_memory
 from hybridlog_storage.errors import HybridlogError
-from hybridlog_storage.stopping import at_safe_points
+from hybridlog_storage.stopping import at_safe_points, postpone
 
 if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlConnection
@@ -45,12 +45,12 @@ def run_prompt(
     """
     say("Statements end with a semicolon; `show tables;` lists views, Ctrl-D ends.")
     completer = Completer(connection)
-    with _keys(), _line_editing(completer):
-        while (text := _statement(completer)) is not None:
+    with _Keys() as keys, _line_editing(completer):
+        while (text := _statement(completer, keys)) is not None:
             if not text.strip():
                 continue
             try:
-                with at_safe_points(), limited_memory(connection.memory):
+                with keys.heard(), at_safe_points(), limited_memory(connection.memory):
                     check(text)
                     answer = connection.query(text, timeout=timeout)
                     answer_sql(answer, to)
@@ -60,17 +60,17 @@ def run_prompt(
                 for line in str(error).splitlines():
                     note(line)
             except KeyboardInterrupt:
-                with suppress(KeyboardInterrupt):  # pressed again
-                    note("The query was stopped.")
+                note("The query was stopped.")
 
 
-def _statement(completer: Completer) -> str | None:
+def _statement(completer: Completer, keys: _Keys) -> str | None:
     """The next statement; None at the end."""
     lines: list[str] = []
     while True:
         completer.before = "\n".join(lines)
         try:
-            line = input(_MORE if lines else _PROMPT)
+            with keys.heard():
+                line = input(_MORE if lines else _PROMPT)
         except KeyboardInterrupt:
             say()
             lines.clear()
@@ -112,14 +112,43 @@ class Completer:
         return self._found[state] if state < len(self._found) else None
 
 
-@contextmanager
-def _keys() -> Iterator[None]:
-    """Ctrl-C stops a query, not the command."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+class _Keys:
+    """Ctrl-C stops a query or clears what was typed, and never ends the command.
+
+    It is heard in a block, and once: pressed again, or between two blocks, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._is_heard = False
+        self._before: Any = None
+
+    def __enter__(self) -> Self:
+        """Listen."""
+        self._before = signal.signal(signal.SIGINT, self._pressed)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Listen no longer."""
+        signal.signal(signal.SIGINT, self._before)
+
+    def _pressed(self, *_: object) -> None:
+        if self._is_heard:
+            self._is_heard = False
+            if not postpone(_interrupt):
+                raise KeyboardInterrupt
+
+    @contextmanager
+    def heard(self) -> Iterator[None]:
+        """A block in which Ctrl-C raises `KeyboardInterrupt`."""
+        try:
+            self._is_heard = True
+            yield
+        finally:
+            self._is_heard = False
+
+
+def _interrupt() -> NoReturn:
+    raise KeyboardInterrupt
 
 
 @contextmanager

@@ -485,12 +485,14 @@ def test_damaged_foxglove_clouds() -> None:
         ({"point_stride": 0, "fields": []}, "no whole number"),
         ({"data": "no base64!"}, "unusual fields"),
         ({"data": [300]}, "unusual fields"),
-        ({"pose": {"position": {}}}, "unusual fields"),
+        ({"pose": {"position": {"x": "far"}}}, "unusual fields"),
         ({"fields": [{"name": "x", "offset": 0, "type": 0}]}, "unknown type 0"),
     ):
         with pytest.raises(PayloadError, match=message):
             points_of("foxglove.PointCloud", foxglove_cloud(CLOUD_BYTES) | change)
-    # Where nothing was set, protobuf has zeros, which turn nothing.
+    # Where nothing was set, JSON has no fields and protobuf has zeros, which turn nothing.
+    got = points_of("foxglove.PointCloud", foxglove_cloud(CLOUD_BYTES) | {"pose": {"position": {}}})
+    assert got.xyz.tolist() == [[1, 2, 3]]
     nothing = {name: dict.fromkeys(part, 0.0) for name, part in POSE.items()}
     got = points_of("foxglove_msgs/msg/PointCloud", foxglove_cloud(CLOUD_BYTES) | {"pose": nothing})
     assert got.xyz.tolist() == [[1, 2, 3]]

@@ -47,6 +47,7 @@ from hybridlog_storage.catalog_parts import (
     STAMPS,
     SUMMARY,
     TOPICS,
+    VERSION,
     DiskFolder,
     PartContent,
 )
@@ -804,7 +805,8 @@ def test_a_part_of_another_catalog_is_removed(tmp_path: Path, model: Model, old:
     with closing(Catalog(tmp_path, STORE)) as made:
         model.put(made)
     if old == "version":
-        path.write_bytes(path.read_bytes().replace(b"catalog 5", b"catalog 4", 1))
+        now = b"catalog %d" % VERSION
+        path.write_bytes(path.read_bytes().replace(now, b"catalog %d" % (VERSION - 1), 1))
     with closing(Catalog(tmp_path, STORE if old == "version" else "6" * 32)) as other:
         assert rows_of(other) == {}
         assert not other.was_damaged
