@@ -87,7 +87,7 @@ class LiveTable:
 
 
 def changes(before: Sequence[str], after: Sequence[str]) -> str:
-    """What turns the lines of a terminal into others, for a cursor on the last of them.
+    """The text that turns lines of a terminal into others, for a cursor on the last of them.
 
     Args:
         before: The lines on the terminal.

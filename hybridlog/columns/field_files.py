@@ -65,7 +65,7 @@ class FieldColumns:
         self._shape = FieldShape()
 
     def about(self, layout: object) -> dict[str, Any]:
-        """What a file needs besides."""
+        """Further metadata of a file."""
         return {}
 
     def piece(
@@ -183,7 +183,7 @@ def rows_of(columns: pa.StructArray) -> Rows:
 
 
 def expired_messages(parts: Sequence[pa.StructArray]) -> ExpiredMessages:
-    """What is left of the messages of a chunk, in its order.
+    """The remains of the messages of a chunk, in its order.
 
     Args:
         parts: Its rows in each file.

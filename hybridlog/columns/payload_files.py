@@ -220,7 +220,7 @@ class RecordingPayloads:
             raise SegmentError(str(error)) from error
 
     def expired(self, segment: int, chunk: int) -> ExpiredMessages:
-        """What is left of an expired chunk.
+        """The remains of an expired chunk.
 
         Raises:
             SegmentError: It is missing or damaged.

@@ -99,7 +99,7 @@ class TopicColumns:
         self.folder = topic_folder(channel.topic)
 
     def about(self, layout: PointLayout | None) -> dict[str, Any]:
-        """What a file needs besides."""
+        """Further metadata of a file."""
         return {
             "wire": self._wire,
             "order": [array.path for array in self.arrays],

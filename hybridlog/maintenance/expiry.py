@@ -62,7 +62,7 @@ _Key = tuple[str, str, bool]
 
 @dataclass(slots=True)
 class Expired:
-    """What an expiry has deleted.
+    """The result of an expiry.
 
     Attributes:
         label: The recording.

@@ -95,7 +95,7 @@ class Keeper:
         self._failed: set[tuple[str, int]] = set()
 
     def plan(self, rules: Rules) -> Plan:
-        """What would go now."""
+        """The deletions that are due now."""
         path, now = self._directory.path, time.time_ns()
         used, free = disk_bytes(path), shutil.disk_usage(path).free
         return plan(self._held(now), rules, used=used, free=free, now=now)
@@ -127,7 +127,7 @@ class Keeper:
         return found
 
     def _held(self, now: int) -> Iterator[Held]:
-        """What the recordings hold; damaged ones are left alone."""
+        """The content of the recordings; damaged ones are left alone."""
         looks = self._directory.looks(self._directory.names())
         self._known = {label: known for label, known in self._known.items() if label in looks}
         for label, look in looks.items():

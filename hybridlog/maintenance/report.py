@@ -1,4 +1,4 @@
-"""What is repaired in a store, and what is to be."""
+"""Repairs of a store: those made, and those to be made."""
 
 from __future__ import annotations
 

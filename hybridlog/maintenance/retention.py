@@ -54,7 +54,7 @@ class TopicRule:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What may stay in a store; None for no bound.
+    """Rules of retention; None for no bound.
 
     Attributes:
         quota: Bytes that everything below the store may take.
@@ -163,7 +163,7 @@ class HeldSegment:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a recording holds.
+    """The content of a recording.
 
     Attributes:
         id: Its id.
@@ -187,7 +187,7 @@ class Held:
 
 
 def held_of(label: str, state: JournalState, now: int) -> Held:
-    """What a recording holds, by its journal.
+    """The content of a recording, by its journal.
 
     Args:
         label: Its label.
@@ -285,7 +285,7 @@ class Step:
 
 @dataclass(slots=True)
 class Plan:
-    """What goes, in this order.
+    """Deletions, in their order.
 
     Attributes:
         used_bytes: Bytes that the store takes.
@@ -307,7 +307,7 @@ class Plan:
 
 
 def plan(held: Iterable[Held], rules: Rules, *, used: int, free: int, now: int) -> Plan:
-    """What goes, in what order, and why.
+    """Plan deletions: their order, and the reason of each.
 
     Args:
         held: What each recording holds, without segments that another process records.

@@ -139,7 +139,7 @@ def _fields_in(payload: memoryview, head: int = _HEAD.size) -> dict[str, object]
 
 
 def expired_payloads(batch: Batch, decoded: Decoded | None) -> list[bytes]:
-    """What is left of messages whose payloads are deleted.
+    """The remains of messages whose payloads are deleted.
 
     Args:
         batch: The messages.
@@ -233,7 +233,7 @@ class ExpiredCodec(ReducedCodec):
 
 @dataclass(frozen=True, slots=True)
 class _Left:
-    """What is left of an expired message that was readable."""
+    """The remains of an expired message that was readable."""
 
     body: bytes
     flags: int

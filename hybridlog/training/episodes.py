@@ -285,7 +285,7 @@ def _at(times: NDArray[np.int64], values: Values) -> NDArray[np.float32]:
 
 
 def _is_old(times: NDArray[np.int64], messages: NDArray[np.int64], fps: int) -> NDArray[np.bool_]:
-    """Where the current message of a topic is older than its usual gaps."""
+    """True for times whose current message of a topic is older than its usual gaps."""
     period = usual_period(np.diff(messages))
     if not period:
         return np.zeros(len(times), np.bool_)  # a topic that says something once

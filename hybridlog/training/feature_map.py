@@ -1,4 +1,4 @@
-"""Which topics and fields become which features of a training set.
+"""The map from topics and fields to features of a training set.
 
 A map is YAML:
 

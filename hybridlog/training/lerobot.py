@@ -49,7 +49,7 @@ _INDEX: Final = {"dtype": "int64", "shape": [1], "names": None}
 
 @dataclass(slots=True)
 class LerobotReport:
-    """What was written.
+    """A training set that was written.
 
     Attributes:
         path: Directory of the set.
@@ -127,7 +127,7 @@ def write_lerobot(
 
 
 def _plan(query: Query, features: FeatureMap, options: LerobotOptions) -> str:
-    """What determines the bytes of a set."""
+    """Everything that determines the bytes of a set."""
     return json.dumps(
         {
             "hybridlog": __version__,
@@ -369,7 +369,7 @@ class _Assembly:
         write_text(self._root / "meta/stats.json", json.dumps(found, indent=1))
 
     def _write_own(self) -> None:
-        """Where the set comes from, and what was lost there."""
+        """Write the question, the origin of each episode, and losses there."""
         own = {**self._plan, "episodes": [one.about for one in self._made]}
         write_text(self._root / "meta/hybridlog.json", json.dumps(own, indent=1))
 

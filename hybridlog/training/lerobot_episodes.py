@@ -45,7 +45,7 @@ _VECTORS: Final = "vectors.npz"
 
 @dataclass(frozen=True, slots=True)
 class LerobotOptions:
-    """How a training set is made.
+    """Options of a training set.
 
     Attributes:
         fps: Frames per second.

@@ -303,7 +303,7 @@ class JournalState:
 
 
 def _written(line: Event) -> int:
-    """When a line was written, ns; 0 if it does not say that."""
+    """Time at which a line was written, ns; 0 if it does not say that."""
     try:
         return int(_time(line.get("at")))
     except ValueError:

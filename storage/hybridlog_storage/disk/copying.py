@@ -88,7 +88,7 @@ def joined(batches: Sequence[Batch]) -> Batch:
 
 
 def _places(batches: Sequence[Batch]) -> NDArray[np.int64] | None:
-    """Where the payloads were, if some have expired."""
+    """Places of the payloads, if some have expired."""
     if all(batch.place is None for batch in batches):
         return None
     return np.concatenate([np.stack(batch.places, axis=1) for batch in batches])

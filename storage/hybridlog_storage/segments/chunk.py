@@ -111,7 +111,7 @@ def pack(
 
 
 class ExpiredMessages(NamedTuple):
-    """What is left of the messages of an expired chunk.
+    """The remains of the messages of an expired chunk.
 
     Attributes:
         batch: The messages; `channel` holds ids of channels of expired messages.

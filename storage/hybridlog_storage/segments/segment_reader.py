@@ -168,7 +168,7 @@ class _Records:
 
 
 class Contents(Protocol):
-    """Where the content of chunks lies that is not in the segment. The caller checks it."""
+    """Finds the content of chunks that is not in the segment. The caller checks it."""
 
     def __call__(self, segment: int, chunk: int, size: int) -> Buffer:
         """The content of a moved chunk.
@@ -178,7 +178,7 @@ class Contents(Protocol):
         """
 
     def expired(self, segment: int, chunk: int) -> ExpiredMessages:
-        """What is left of an expired chunk.
+        """The remains of an expired chunk.
 
         Raises:
             SegmentError: It is missing or damaged.
@@ -488,7 +488,7 @@ class SegmentReader:
         return found
 
     def _expired(self, place: ChunkPlace, record: memoryview) -> ExpiredMessages:
-        """What is left of an expired chunk: as many messages as it has, of its channels."""
+        """The remains of an expired chunk: as many messages as it has, of its channels."""
         opcode, length, *_ = CHUNK_HEAD.unpack_from(record)
         if opcode != EXPIRED_OPCODE or length + RECORD_HEAD.size != len(record):
             raise SegmentError("no chunk record is there")
