@@ -6,12 +6,14 @@ import fcntl
 import os
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.cli.open_store import _print_left
+from hybridlog_storage.catalog import Catalog
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
@@ -77,10 +79,28 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     assert not died.repairs.noted
     assert died.repairs.recovered.keys() == {LABEL}
     assert died.entry(LABEL).status == "recovered"
+    assert not died.session._running
     assert not any(name.endswith(".mcap.open") for name in files_in(died))
     check(died, known)
     died.mend()
     check(died, known)
+
+
+def status_in_catalog(store: hl.Store) -> str:
+    (summary,) = store.summaries()
+    settings = store.directory.settings
+    with closing(Catalog(store.directory.path, settings.store_id, in_memory=False)) as catalog:
+        row = catalog.recording(summary.id)
+    assert row is not None
+    return row[1].status
+
+
+def test_what_was_read_anew_is_written_after_the_answer(died: hl.Store) -> None:
+    died.refresh()
+    assert died.entry(LABEL).status == "unfinished"
+    assert status_in_catalog(died) == "open"
+    died.mend(0)
+    assert status_in_catalog(died) == "unfinished"
 
 
 def test_a_store_that_stays_open_is_repaired_meanwhile(died: hl.Store, known: Known) -> None:

@@ -192,6 +192,13 @@ def test_every_frame_is_that_of_the_log(plain: Path, tmp_path: Path) -> None:
     assert info["features"]["observation.state"]["names"] == ["arm.q[0]", "arm.q[1]", "arm.load"]
     assert info["features"]["observation.images.front"]["shape"] == [HEIGHT, WIDTH, 3]
     assert not (path / ".episodes").exists()
+    spans = [(one["dataset_from_index"], one["dataset_to_index"]) for one in episodes_of(path)]
+    assert spans == [(0, 80), (80, 120)]
+    key = "videos/observation.images.front"
+    times = [
+        (one[f"{key}/from_timestamp"], one[f"{key}/to_timestamp"]) for one in episodes_of(path)
+    ]
+    assert times == [(0, 4), (4, 6)]
     own = about(path)
     assert [one["name"] for one in own["episodes"]] == ["one", "two"]
     assert own["hybridlog"] == hl.__version__
@@ -220,6 +227,7 @@ def test_statistics_are_those_of_the_values(plain: Path, tmp_path: Path) -> None
     assert np.shape(shown["mean"]) == (3, 1, 1)
     assert np.ravel(shown["min"]).tolist() == pytest.approx([min(greys)] * 3)
     assert np.ravel(shown["max"]).tolist() == pytest.approx([max(greys)] * 3)
+    assert np.ravel(shown["mean"])[0] == pytest.approx(np.mean([*greys, *greys[:20]]), abs=0.01)
     (first, _) = episodes_of(tmp_path / "set")
     assert first["stats/action/max"] == [max(row["action"] for row in rows[:80])]
 
@@ -332,6 +340,16 @@ def test_what_does_not_fit_is_refused(make: Make, tmp_path: Path) -> None:
         refused({"features": {"action": {"arm": "none"}}}, UsageError, "no field none")
         refused({"images": {"front": "arm"}}, (PayloadError, UsageError), "picture")  # type: ignore[arg-type]
         refused({"features": {"action": {"nowhere": "x"}}}, TopicError, "nowhere")
+        refused({"features": {"action": {"*": "x"}}}, TopicError, "means several topics")
+
+
+def test_the_first_pictures_may_be_missing(make: Make, tmp_path: Path) -> None:
+    with make(Log(broken=0)) as store:
+        report = export(store, tmp_path / "set", on_gap="hold")
+    assert (report.frames, report.missing) == (80, 2)
+    shown = [one for _, one in greys_of(tmp_path / "set")]
+    assert len(shown) == 80
+    assert [abs(one - grey(CAMERA_STEP)) < 3 for one in shown[:4]] == [True] * 4
 
 
 @pytest.mark.parametrize(
