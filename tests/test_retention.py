@@ -181,6 +181,11 @@ def test_what_a_pin_touches_never_goes(
     assert [one.segments for one in made({"max-age": "1d"}, without).steps] == [(0, 1, 2)]
 
 
+def test_nothing_pinned_is_no_reason() -> None:
+    (warning,) = made({"quota": "0kB"}, NEW, used=100 * MB).warnings
+    assert "nothing else may" in warning
+
+
 def test_a_tag_keeps_a_recording_and_is_told_like_pins() -> None:
     tagged = held("old", sealed(0, 50), event(TAGGED, key="keep", value="yes"))
     for tag in ("keep=yes", "keep"):
@@ -257,6 +262,14 @@ def test_a_quota_says_how_large_segments_are(quota: str | None, size: float) -> 
         {"never-tag": "=x"},
         {"never-tag": 5},
         {"fields-age": "-1d"},
+        {"quota": 200},
+        {"quota": "200"},
+        {"min-free": "1.5"},
+        {"max-age": 30},
+        {"max-age": "30"},
+        {"max-age": "30M"},
+        {"max-age": "1d12"},
+        {"topic": {"/camera": 7}},
     ],
 )
 def test_rules_that_are_none(values: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.query.times import parse_duration
 from hybridlog.query.topics import matcher
 from hybridlog.wording import listed, parse_size, size
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
@@ -32,6 +32,7 @@ _TOPICS_BELOW: Final = 1.25  # times the free space below which segments go
 _STEP_BYTES: Final = 256 << 20  # that go together, so that a recorder can stop soon
 _WARN_FROM: Final = 0.8  # share of the quota that pins may take without a warning
 _CLOCK_WAS_SET: Final = 1_577_836_800 * 10**9  # 2020: earlier times are of a clock not set yet
+_LEAST_BARE: Final = 1 << 16  # bytes that a size without a unit has; less is meant as gigabytes
 _KEYS: Final = ("quota", "min-free", "max-age", "topic", "never-tag", "fields-age")
 
 
@@ -121,19 +122,35 @@ class Rules:
 
 def _size(values: Mapping[str, Any], key: str) -> int | None:
     value = values.get(key)
-    return None if value is None else parse_size(str(value))
+    if value is None:
+        return None
+    found, text = parse_size(str(value)), str(value).strip()
+    if text[-1:].isdigit() and found < _LEAST_BARE:
+        raise UsageError(f"{key} {text} would be bytes: write a unit, such as {text}GB")
+    return found
 
 
 def _age(values: Mapping[str, Any], key: str) -> str | None:
     value = values.get(key)
     if value is not None:
-        parse_duration(value)
+        _age_ns(value)
     return None if value is None else str(value)
+
+
+def _age_ns(value: object) -> int:
+    """An age, ns. Elsewhere 30 is seconds and 30M minutes; here days or months may be meant."""
+    text = str(value).strip()
+    if not isinstance(value, str) or text[-1:].isdigit() or "M" in text:
+        raise UsageError(f"{value!r} is no age: write it with a unit, such as 12h, 30d or 2y")
+    try:
+        return parse_duration(text)
+    except TimeError as error:
+        raise UsageError(f"{value!r} is no age: write 12h, 30d or 2y") from error
 
 
 def _topic_rule(topic: str, topics: Mapping[str, Any]) -> TopicRule:
     age = topics[topic]
-    return TopicRule(topic, matcher([topic]), parse_duration(age), str(age))
+    return TopicRule(topic, matcher([topic]), _age_ns(age), str(age))
 
 
 @dataclass(frozen=True, slots=True)
@@ -483,9 +500,10 @@ class _Planning:
 
     def _warn(self) -> None:
         plan_, quota = self._plan, self._rules.quota
-        if quota is not None and plan_.pinned_bytes >= _WARN_FROM * quota:
+        pinned = plan_.pinned_bytes
+        if quota is not None and 0 < pinned >= _WARN_FROM * quota:
             plan_.warnings.append(
-                f"What is pinned takes {size(plan_.pinned_bytes)} of the quota of {size(quota)}: "
+                f"What is pinned takes {size(pinned)} of the quota of {size(quota)}: "
                 "`hybridlog keep --pins` lists the pins, --unpin removes one."
             )
         left = self._short(_SEGMENTS_FROM, 1.0)
@@ -493,5 +511,6 @@ class _Planning:
         if left > 0:
             plan_.warnings.append(
                 f"{size(left)} more should go, and nothing else may: what is left is pinned, "
-                "being recorded, or fields, tables and the index."
+                "being recorded, small messages, or fields, tables and the index. Whole "
+                "recordings go with --fields-age or `hybridlog rm`."
             )

@@ -209,7 +209,7 @@ class TopicOfRecording:
         gone = {(c.segment, c.number) for c in left if c.place.length == EXPIRED_SIZE}
         if gone:
             fields = self.session.expired_fields(self.entry, self.topic, gone)
-            found += [_TableRows(self, fields, part) for part in fields.parts]
+            found += [_FieldRows(self, fields, part) for part in fields.parts]
         return sorted(found, key=lambda one: (one.first is not None, one.first or 0))
 
     def reader(self, segment: int) -> SegmentReader:
@@ -284,7 +284,10 @@ class _TableRows:
         try:
             return [self._table.fields(paths)]
         except StoreError as error:
-            raise DamagedTableError(self._source, str(error)) from error
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: StoreError) -> StoreError:
+        return DamagedTableError(self._source, str(error))
 
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.add_group(self._part.file.path, self._part.group)
@@ -296,10 +299,17 @@ class _TableRows:
                 self._part, paths, {*wanted, "ref"} if len(expired) else wanted
             )
         except StoreError as error:
-            raise DamagedTableError(self._source, str(error)) from error
+            raise self._damaged(error) from error
         if len(expired):
             ours["state"] = _with_expired(ours["state"], ours["ref"], expired)
         yield Rows(ours, records, self._part.rows)
+
+
+class _FieldRows(_TableRows):
+    """A row group of what is left of expired messages; it is never made again."""
+
+    def _damaged(self, error: StoreError) -> StoreError:
+        return StoreError(f"{error} Restore the file from a copy.")
 
 
 class _ChunkRows:

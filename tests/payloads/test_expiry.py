@@ -20,7 +20,7 @@ from hybridlog.maintenance.expiry import Expired
 from hybridlog.maintenance.opening import put_entry
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import IncompleteError, PayloadError
+from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
 from tests.format_reader import FormatReader
 from tests.payloads.logs import COUNT
 
@@ -200,6 +200,10 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
         path.write_bytes(whole[:900] + bytes([whole[900] ^ 1]) + whole[901:])
         places = [one.place for one in store.verify().findings]
         assert f"payloads/fields=scan/{path.name}" in places
+        shutil.rmtree(other / "tables")
+    with hl.open(other, mongo="none") as store:
+        with pytest.raises(StoreError, match="Restore the file from a copy"):
+            store.sql("select angle_min from scan").rows()
         path.unlink()
     with hl.open(other, mongo="none") as store:
         (entry,) = store.recordings()
