@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from hybridlog.query.choice import Choice
+    from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -152,12 +153,34 @@ def mark_command(
         labels = _mark_running(text, tags, recording, store)
     elif len(recording) == 1:
         with opened_store(store, None, quiet=quiet) as opened:
+            _check_begun(opened, recording[0], at)
             labels = iter([opened.mark(recording[0], at, text, tags, until=until).label])
     else:
         raise UsageError("A mark at a time needs one recording: name it with --recording.")
     for label in labels:
         if not quiet:
             output.note(f"Marked in {label}.")
+
+
+def _check_begun(store: Store, recording: str, at: str) -> None:
+    """Refuse a mark before its recording, of which it would become the beginning.
+
+    Relative times count from there, and `--at 10` is a second of 1970.
+
+    Raises:
+        UsageError: The recording has not begun at this time.
+    """
+    from hybridlog.query.times import format_time, parse_time
+    from hybridlog.record.losses import extent_of
+
+    (entry,) = store.select([recording])
+    start, end = extent_of(entry)
+    time = parse_time(at, start=start, end=end)
+    if start < end and time < start:
+        raise UsageError(
+            f"{at} is {format_time(time)}, and {entry.label} begins at {format_time(start)}: "
+            "ten seconds from its beginning are +10s, ten before its end -10s."
+        )
 
 
 def _mark_running(

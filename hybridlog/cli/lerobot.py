@@ -137,6 +137,10 @@ def _print_report(report: LerobotReport, *, quiet: bool) -> None:
         output.note(
             f"Values that are older than usual were kept for {counted(report.held, 'frame')}."
         )
+    if report.dropped:
+        output.note(
+            f"{counted(report.dropped, 'frame')} left out, because a topic has a gap there."
+        )
     if report.missing:
         output.note(
             f"{counted(report.missing, 'frame')} show an earlier picture: their own cannot be "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
@@ -68,7 +69,13 @@ class Episode:
     held: dict[str, int]
 
 
-def episodes(piece: Piece, features: FeatureMap, fps: int, on_gap: OnGap) -> Iterator[Episode]:
+def episodes(
+    piece: Piece,
+    features: FeatureMap,
+    fps: int,
+    on_gap: OnGap,
+    dropped: Counter[str] | None = None,
+) -> Iterator[Episode]:
     """The episodes of a part of a question: one for each recording and range in it.
 
     An episode begins when all topics have a value. A frame has the last value of each topic
@@ -79,6 +86,7 @@ def episodes(piece: Piece, features: FeatureMap, fps: int, on_gap: OnGap) -> Ite
         features: The features.
         fps: Frames per second.
         on_gap: What a gap in a topic does: see `OnGap`.
+        dropped: Collects the number of frames that are in no episode because of gaps, by part.
 
     Raises:
         UsageError: There is a gap that is refused, or a field is no number.
@@ -103,7 +111,10 @@ def episodes(piece: Piece, features: FeatureMap, fps: int, on_gap: OnGap) -> Ite
         if late.any() and on_gap == "refuse":
             _refuse(name, grid, times, is_old)
         runs = [(0, len(grid))] if on_gap == "hold" else _runs(~late)
-        for number, (low, high) in enumerate(run for run in runs if run[1] - run[0] >= MIN_FRAMES):
+        kept = [(low, high) for low, high in runs if high - low >= MIN_FRAMES]
+        if dropped is not None and late.any():
+            dropped[name] += len(grid) - sum(high - low for low, high in kept)
+        for number, (low, high) in enumerate(kept):
             own_grid = grid[low:high]
             found = {
                 feature: [_at(own_grid, read[part]) for part in parts]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -57,6 +58,7 @@ class LerobotReport:
         frames: Number of frames.
         resumed: Episodes that an interrupted export had finished.
         held: Frames whose value of some topic is older than usual.
+        dropped: Frames in no episode, since a topic has a gap there.
         missing: Frames that show an earlier picture, since their own cannot be shown.
         lost: Messages that are lost in the episodes.
         bytes: Size of the files.
@@ -67,6 +69,7 @@ class LerobotReport:
     frames: int = 0
     resumed: int = 0
     held: int = 0
+    dropped: int = 0
     missing: int = 0
     lost: int = 0
     bytes: int = 0
@@ -109,8 +112,9 @@ def write_lerobot(
         unfinished.mkdir(parents=True)
         write_text(unfinished / _PLAN, plan)
     made: list[WrittenEpisode] = []
+    dropped: Counter[str] = Counter()
     for piece in pieces(asked, options.episodes_by):
-        for episode in episodes(piece, features, options.fps, options.on_gap):
+        for episode in episodes(piece, features, options.fps, options.on_gap, dropped):
             place = unfinished / f"{len(made):06d}"
             written = WrittenEpisode.read(place)
             report.resumed += written is not None
@@ -120,6 +124,7 @@ def write_lerobot(
     if not made:
         shutil.rmtree(root)
         raise UsageError("There is no episode in these recordings, so nothing is written.")
+    report.dropped = dropped.total()
     with failures(str(root)):
         _Assembly(root, made, features, options, json.loads(plan)).write(report)
     shutil.rmtree(unfinished)

@@ -100,3 +100,16 @@ def test_nothing_leaves_no_file(store: Path, tmp_path: Path) -> None:
     ):
         assert why in run(*fetch, *more, store=store, code=2).err
     assert "name them with -o" in run(*fetch[:3], "--split-by", "mark", store=store, code=2).err
+
+
+@pytest.mark.parametrize("time", ["3", "-10s", "2025-06-03"])
+def test_no_mark_before_the_recording(store: Path, time: str) -> None:
+    done = run("mark", "x", "-r", "one", "--at", time, store=store, code=2)
+    assert f"{time} is " in done.err
+    assert "one begins at 2025-06-03T08:00:00" in done.err
+
+
+def test_a_first_question_about_a_mark_tells_no_damage(store: Path) -> None:
+    run("mark", "x", "-r", "one", "--at", "+1s", store=store)
+    for _ in range(2):
+        assert "damaged" not in run("fetch", "-t", "marks", "--count", store=store).err

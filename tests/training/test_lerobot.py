@@ -309,10 +309,11 @@ def test_a_gap_is_refused_cut_or_held(make: Make, tmp_path: Path) -> None:
         report = export(store, tmp_path / "set2", on_gap="drop")
         assert [one["length"] for one in episodes_of(tmp_path / "set2")] == [25, 40]
         check(tmp_path / "set2", {0: 30 * MS, 1: 2_030 * MS}, [25, 40], is_silent=True)
+        assert report.dropped == 15
         report = export(store, tmp_path / "set3", on_gap="hold")
         assert (report.episodes, report.frames) == (1, 80)
         assert about(tmp_path / "set3")["episodes"][0]["held"] == {"/go": report.held}
-        assert report.held == 15
+        assert (report.held, report.dropped) == (15, 0)
         actions = [row["action"] for row in rows_of(tmp_path / "set3")]
         assert actions[19:40] == [980.0] * 21
 
