@@ -263,18 +263,19 @@ class ChunkScan:
                 return
             check_wanted()
             task, chunk = loading.popleft()
-            run, size, unreadable = chunk.result()
+            run, size, unreadable, expired = chunk.result()
             counters.chunks_read += 1
             counters.bytes_read += size
             counters.unreadable += unreadable
+            counters.unasked += expired
             yield task, run, loading[0][0] if loading else None
 
     def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
         reader = self._reader_of(task.scan.recording.id, task.chunk.segment)
         chunk = reader.read_chunk(task.chunk.place)
         run = self._wanted(task, chunk, selection)
-        run, unreadable = self._filtered(run)
-        return run, chunk.length + chunk.trailer, unreadable
+        run, unreadable, expired = self._filtered(run)
+        return run, chunk.length + chunk.trailer, unreadable, expired
 
     def _wanted(
         self, task: ChunkTask, chunk: StoredChunk, selection: RowSelection | None
@@ -307,13 +308,13 @@ class ChunkScan:
         own.channel = channel[rows]
         return MessageRun(own, seq[rows], self._plan.channels)
 
-    def _filtered(self, run: MessageRun) -> tuple[MessageRun, int]:
-        """The messages that satisfy the predicate, and the number of unreadable ones."""
+    def _filtered(self, run: MessageRun) -> tuple[MessageRun, int, int]:
+        """The messages that satisfy the predicate, and numbers as in `Matches`."""
         filters = self._plan.filters
         if not filters or not len(run.batch):
-            return run, 0
+            return run, 0, 0
         holds = np.ones(len(run.batch), np.bool_)
-        unreadable = 0
+        unreadable = expired = 0
         for index in distinct(run.batch.channel).tolist():
             if index in filters:
                 rows = np.flatnonzero(run.batch.channel == index)
@@ -321,7 +322,8 @@ class ChunkScan:
                 found = filters[index].matches(channel, run.batch.take(rows), run.seq[rows])
                 holds[rows] = found.holds
                 unreadable += found.unreadable
-        return (run if holds.all() else run.take(holds)), unreadable
+                expired += found.expired
+        return (run if holds.all() else run.take(holds)), unreadable, expired
 
     def _inside(
         self,
@@ -372,8 +374,8 @@ class ChunkScan:
         return ready, rest
 
 
-_Loaded = tuple[MessageRun, int, int]
-"""Messages, bytes read, messages unreadable for the predicate."""
+_Loaded = tuple[MessageRun, int, int, int]
+"""Messages, bytes read, messages unreadable for the predicate, those of them that expired."""
 
 
 class _Loading(Protocol):

@@ -28,11 +28,13 @@ class Matches(NamedTuple):
     Attributes:
         holds: bool[n], True where the predicate holds.
         unreadable: Number of messages of which the predicate could not be asked, because they
-            do not fit their definition.
+            do not fit their definition, or lack arrays.
+        expired: Number of those that lack arrays, since their payloads were deleted.
     """
 
     holds: NDArray[np.bool_]
     unreadable: int
+    expired: int = 0
 
 
 class MessageFilter:
@@ -96,7 +98,7 @@ class MessageFilter:
         lacking = decoded.rows[decoded.records.lacking()] if fields else decoded.rows[:0]
         asked = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
         found = self._one_by_one(channel, batch, seq, asked)
-        return Matches(found.holds, found.unreadable + len(lacking))
+        return Matches(found.holds, found.unreadable + len(lacking), len(lacking))
 
     def _one_by_one(
         self,
