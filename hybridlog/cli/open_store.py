@@ -119,8 +119,6 @@ def _print_rebuilt(store: Store, doing: str) -> None:
         store: The store.
         doing: The consequence; empty if that was said before.
     """
-    from hybridlog.record.marks import MARKS
-
     repairs = store.repairs
     if store.catalog.was_damaged:
         note("The catalog was damaged, and was made again.")
@@ -131,10 +129,13 @@ def _print_rebuilt(store: Store, doing: str) -> None:
             "Another process keeps the catalog locked, so the files answer, more slowly. If it "
             f"does not end by itself, end it: `fuser -v {path}` shows which one it is."
         )
-    # A mark is set without its table, which the first question makes: nothing was damaged.
-    tables = [topic for _, topic in repairs.tables if topic != MARKS]
-    if tables:
-        note(f"{counted(len(tables), 'table')} made again: missing or damaged.")
+    if repairs.tables:
+        from hybridlog.record.marks import MARKS
+
+        # A mark is set without its table, which the first question makes: nothing was damaged.
+        tables = [topic for _, topic in repairs.tables if topic != MARKS]
+        if tables:
+            note(f"{counted(len(tables), 'table')} made again: missing or damaged.")
     indexed = {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}
     added = f"{counted(sum(indexed.values()), 'chunk')} added to the index"
     if repairs.damage:
