@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.formats.yaml_values import YamlError, parse_yaml
+from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.query.periods import GAP_PERIODS
 from hybridlog.query.predicate.across import names_topics
 from hybridlog.query.predicate.parser import parse
@@ -21,8 +21,6 @@ from hybridlog_storage.errors import HybridlogError, UsageError
 if TYPE_CHECKING:
     from hybridlog.query.answers.regularity import TopicCheck
 
-MAX_BYTES: Final = 1 << 20
-"""Size of a contract."""
 MAX_RULES: Final = 1000
 """Predicates and offsets of a contract: each is a question."""
 _REGULAR_FROM: Final = 10  # messages from which a rate is a rule
@@ -84,14 +82,7 @@ class Contract:
         Raises:
             UsageError: It cannot be read, or breaks the schema; names line and cure.
         """
-        try:
-            with Path(path).open("rb") as file:
-                text = file.read(MAX_BYTES + 1)
-        except OSError as error:
-            raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
-        if len(text) > MAX_BYTES:
-            raise UsageError(f"{path} is larger than 1 MiB: no contract.")
-        return cls.parse(text, str(path))
+        return cls.parse(read_yaml(path, "contract"), str(path))
 
     @classmethod
     def parse(cls, text: str | bytes, name: str = "contract") -> Contract:

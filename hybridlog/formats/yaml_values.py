@@ -7,11 +7,16 @@ share one value, and merge keys are ordinary keys, so nothing grows beyond the t
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+MAX_BYTES: Final = 1 << 20
+"""Most bytes of a file that a user writes by hand."""
 MAX_EVENTS = 2_000_000
 """Most keys, values, and starts and ends of lists and mappings; parsed in about 2 s."""
 
@@ -22,6 +27,26 @@ _NO_KEY = object()
 
 class YamlError(ValueError):
     """The text is not YAML, or too much of it; the message is the reason."""
+
+
+def read_yaml(path: str | Path, what: str) -> bytes:
+    """Read a small file of a user that is to be parsed.
+
+    Args:
+        path: The file.
+        what: What it should be, for messages.
+
+    Raises:
+        UsageError: It cannot be read, or is larger than `MAX_BYTES`.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
+    if len(text) > MAX_BYTES:
+        raise UsageError(f"{path} is larger than 1 MiB: no {what}.")
+    return text
 
 
 def parse_yaml(

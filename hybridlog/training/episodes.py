@@ -191,24 +191,18 @@ class _Reader:
         self._begin = begin
         self._end = end
 
-    def _read(self, topic: str) -> tuple[Query, Query | None, Message | None]:
-        """Questions for the messages in the range and for the current one before, and that one."""
+    def _query(self, topic: str) -> Query:
+        """The question for the messages in the range, and for the current one before it."""
         whole = Query(self._session, Question((topic,), (self._recording,)))
-        inside = whole.between(self._begin, self._end)
         try:
-            current = whole.at(self._begin)
+            begin = whole.at(self._begin).log_time_ns
         except TopicError:
-            return inside, None, None
-        if current.log_time_ns == self._begin:
-            return inside, None, None
-        return inside, whole.at_time(self._begin), current
+            begin = self._begin
+        return whole.between(begin, self._end)
 
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages of a topic, by log time."""
-        inside, _, current = self._read(topic)
-        if current is not None:
-            yield current
-        yield from inside
+        yield from self._query(topic)
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Log times of the messages of a topic, ns.
@@ -216,11 +210,10 @@ class _Reader:
         Raises:
             TopicError: There are none.
         """
-        inside, _, current = self._read(topic)
-        found = [np.array([] if current is None else [current.log_time_ns], np.int64)]
-        parts = match_times(inside.session, inside.question, Counters())
-        found += [part.log_time for part in parts]
-        return self._checked(topic, np.concatenate(found))
+        query = self._query(topic)
+        parts = match_times(query.session, query.question, Counters())
+        found = [part.log_time for part in parts]
+        return self._checked(topic, np.concatenate([np.empty(0, np.int64), *found]))
 
     def values(self, source: Source) -> Values:
         """Numbers of a topic; messages without them are left out.
@@ -231,10 +224,7 @@ class _Reader:
         """
         import pyarrow as pa
 
-        inside, before, _ = self._read(source.topic)
-        queries = [inside] if before is None else [before, inside]
-        tables = [query.fields(*source.paths).to_arrow() for query in queries]
-        table = pa.concat_tables(tables, promote_options="permissive")
+        table = self._query(source.topic).fields(*source.paths).to_arrow()
         kept = [column for column in table.column_names if column in source.paths]
         if missing := set(source.paths).difference(kept):
             raise UsageError(f"{source.topic} has no field {min(missing)}.")

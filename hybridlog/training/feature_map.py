@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
-from hybridlog.formats.yaml_values import YamlError, parse_yaml
+from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 IMAGE_PREFIX: Final = "observation.images."
-_MAX_BYTES: Final = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,63}")
 _OWN = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "task"})
 _STATES: Final = {
@@ -104,13 +103,7 @@ class FeatureMap:
         Raises:
             UsageError: It cannot be read, or is no map; says where and what to write.
         """
-        try:
-            with Path(path).open("rb") as file:
-                text = file.read(_MAX_BYTES + 1)
-        except OSError as error:
-            raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
-        if len(text) > _MAX_BYTES:
-            raise UsageError(f"{path} is larger than 1 MiB: no map of features.")
+        text = read_yaml(path, "map of features")
         try:
             return cls.of(parse_yaml(text), str(path))
         except YamlError as error:

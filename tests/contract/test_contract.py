@@ -12,8 +12,9 @@ from xml.etree import ElementTree as ET
 import pytest
 
 import hybridlog as hl
-from hybridlog.contract.contract import MAX_BYTES, MAX_RULES, Contract, contract_of
+from hybridlog.contract.contract import MAX_RULES, Contract, contract_of
 from hybridlog.contract.judge import broken
+from hybridlog.formats.yaml_values import MAX_BYTES
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import UsageError
