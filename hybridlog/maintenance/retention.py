@@ -386,8 +386,9 @@ class _Planning:
         age = self._rules.fields_age
         if age is None:
             return
+        age_ns = parse_duration(age)
         for one in others:
-            if one.is_ended and not one.pins and self._is_older(one.written, parse_duration(age)):
+            if one.is_ended and not one.pins and self._is_older(one.written, age_ns):
                 self._gone.add(one.id)
                 count, reason = sum(s.size for s in one.segments), f"fields older than {age}"
                 self._step(Step(one.label, one.id, (), (), count, reason, one.written))
@@ -395,9 +396,8 @@ class _Planning:
     def _by_age(self) -> None:
         age = self._rules.max_age
         if age is not None:
-            old = (
-                p for p in self._pieces if self._is_older(p.segment.written, parse_duration(age))
-            )
+            age_ns = parse_duration(age)
+            old = (p for p in self._pieces if self._is_older(p.segment.written, age_ns))
             self._segments(old, f"older than {age}", math.inf)
         for rule in self._rules.topics:
             old = (p for p in self._pieces if self._is_older(p.segment.written, rule.age_ns))

@@ -267,7 +267,7 @@ class ChunkScan:
             counters.chunks_read += 1
             counters.bytes_read += size
             counters.unreadable += unreadable
-            counters.unasked += expired
+            counters.without_arrays += expired
             yield task, run, loading[0][0] if loading else None
 
     def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:

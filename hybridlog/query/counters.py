@@ -30,7 +30,8 @@ class Counters:
         lacking: Messages in the answer whose arrays are null, since only summaries are left.
         unreadable: Messages of the predicate's topics that do not fit their definition, or lack
             arrays that it asks for.
-        unasked: Those of them that lack arrays, since their payloads were deleted to make room.
+        without_arrays: Those of them that lack arrays, since their payloads were deleted to make
+            room.
         unindexed: Messages of running recordings that the index lacks, if it has answered.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
             the number of messages; several.
@@ -48,7 +49,7 @@ class Counters:
     expired: int = 0
     lacking: int = 0
     unreadable: int = 0
-    unasked: int = 0
+    without_arrays: int = 0
     unindexed: int = 0
     no_transform: tuple[tuple[str, int], ...] = ()
     elapsed_s: float = 0.0

@@ -135,13 +135,13 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     """Messages that an answer could not read or has no payload of."""
     from hybridlog.schema.states import State, without_fields, without_payload
 
-    if counters.unreadable > counters.unasked:
-        yield _unreadable(counters.unreadable - counters.unasked, question)
-    if counters.unasked:
-        its = "its payload was" if counters.unasked == 1 else "their payloads were"
+    if counters.unreadable > counters.without_arrays:
+        yield _unreadable(counters.unreadable - counters.without_arrays, question)
+    if counters.without_arrays:
+        its = "its payload was" if counters.without_arrays == 1 else "their payloads were"
         yield (
-            f"{counted(counters.unasked, 'message')} could not be asked: {its} deleted to make "
-            "room; of long arrays only summaries are left."
+            f"{counted(counters.without_arrays, 'message')} could not be asked: {its} deleted to "
+            "make room; of long arrays only summaries are left."
         )
     gone = {
         State.REDUCED: counters.reduced - counters.expired,

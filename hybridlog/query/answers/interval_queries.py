@@ -253,11 +253,11 @@ class IntervalQueries:
     def _beside(self, ask: Callable[[Part], Iterator[_T]], part: Part) -> Iterator[_T]:
         """Items of a part outside of the asked time, where unreadable messages do not count."""
         counters = self._planner.counters
-        before = counters.unreadable, counters.unasked
+        before = counters.unreadable, counters.without_arrays
         for item in ask(part):
-            counters.unreadable, counters.unasked = before
+            counters.unreadable, counters.without_arrays = before
             yield item
-        counters.unreadable, counters.unasked = before
+        counters.unreadable, counters.without_arrays = before
 
     def _check(self, subject: str) -> None:
         question = self._question

@@ -68,7 +68,7 @@ class PayloadScan:
                     )
                     holds[rows] = found.holds
                     self._counters.unreadable += found.unreadable
-                    self._counters.unasked += found.expired
+                    self._counters.without_arrays += found.expired
             yield MatchColumns(run.batch.log_time, run.seq, holds)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:

@@ -109,7 +109,7 @@ class RunningTables:
                         batch = chunk.batch.take(rows)
                         matches = decide.matches(channel, batch, chunk.seq[rows])
                         self._counters.unreadable += matches.unreadable
-                        self._counters.unasked += matches.expired
+                        self._counters.without_arrays += matches.expired
                         rest[task.key].append(batch.places[0][matches.holds])
         found |= {key: np.sort(np.concatenate(offsets)) for key, offsets in rest.items()}
         return RowSelection(found)
