@@ -60,6 +60,7 @@ ALLOWED = {
         "hybridlog_storage.segments.segment_writer",
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
+    "obstore": ("hybridlog_storage.remote.bucket",),
     "pandas": ("hybridlog.frames",),
     "polars": ("hybridlog.frames.polars",),
     "pyarrow": (

@@ -19,6 +19,7 @@ NEEDED_FOR: Final = {
     "lerobot": "export -F lerobot",
     "plot": "plot, except as a page",
     "protobuf": "fields of protobuf messages",
+    "remote": "stores in buckets: s3://, gs://, az://",
     "sql": "sql",
     "video": "pictures of video topics, and mp4",
     "view": "view",

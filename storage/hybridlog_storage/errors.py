@@ -111,6 +111,20 @@ class SegmentError(StoreError):
     """A segment of the store that cannot be read."""
 
 
+class BucketError(HybridlogError):
+    """A bucket that does not answer, refuses access, or ignores conditions of writers."""
+
+    exit_code = 5
+
+
+class ObjectExistsError(BucketError):
+    """An object of this name exists, with other content."""
+
+
+class ObjectChangedError(BucketError):
+    """An object is not the version any more that was read. Ask again."""
+
+
 class CatalogError(StoreError):
     """The catalog is damaged or incomplete. It is rebuilt from the files."""
 

@@ -1,0 +1,472 @@
+"""Objects in a bucket, by way of obstore (extra `remote`).
+
+A bucket has no locks and no renames. What it has are conditions: an object is created only if
+its name is free, or replaced only if it is still the version that was read. A server that
+ignores conditions would lose data in silence, so it is refused before the first write.
+
+Credentials and the address of a server of one's own come from the environment, as obstore
+reads them (`AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL`, `AWS_ALLOW_HTTP`, `GOOGLE_…`, `AZURE_…`).
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import secrets
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeVar, cast
+
+from hybridlog_storage.errors import (
+    BucketError,
+    MissingDependencyError,
+    ObjectChangedError,
+    ObjectExistsError,
+    UsageError,
+)
+from hybridlog_storage.lazy import lazy
+
+if TYPE_CHECKING:
+    from obstore import GetOptions, GetResult, PutMode
+    from obstore.store import ObjectStore
+
+SCHEMES: Final = ("s3://", "gs://", "az://")
+"""How the address of a store in a bucket begins."""
+JOINED_GAP: Final = 1 << 20
+"""Bytes between two ranges that cost less than another request."""
+PART_BYTES: Final = 64 << 20
+"""Size from which an object is uploaded in parts of this size."""
+_PAGE: Final = 1000  # names that servers list at once
+_PARALLEL: Final = 8
+_TRIES: Final = 4
+_READ_S: Final = 60
+_WRITE_S: Final = 900
+_RETRY_S: Final = 60
+_CUT = re.compile(r"(?i)body|reset|closed|incomplete|timed? ?out|eof|sending request")
+_SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
+
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class Object:
+    """An object as a list or an answer describes it.
+
+    Attributes:
+        name: Its name below the address of the bucket.
+        size: Its bytes.
+        version: The entity tag; another one after every change.
+        modified: When it was written, by the server's clock, ns.
+    """
+
+    name: str
+    size: int
+    version: str
+    modified: int
+
+
+def is_bucket(address: object) -> bool:
+    """True for the address of a place in a bucket, such as `s3://lab/store`."""
+    return isinstance(address, str) and address.startswith(SCHEMES)
+
+
+class Bucket:
+    """The objects below an address.
+
+    Args:
+        address: Such as `s3://lab/store`.
+
+    Raises:
+        UsageError: It is not the address of a bucket.
+        MissingDependencyError: obstore is not installed.
+    """
+
+    def __init__(self, address: str) -> None:
+        if not is_bucket(address) or not address.partition("://")[2].strip("/"):
+            raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
+        self.address = address.rstrip("/")
+        self._pid = os.getpid()
+        self._has_conditions = False
+        self._reading = _opened(self.address, _READ_S)
+
+    @lazy
+    def _writing(self) -> ObjectStore:
+        return _opened(self.address, _WRITE_S)
+
+    def objects(self, prefix: str = "", *, after: str | None = None) -> Iterator[Object]:
+        """All objects whose names begin with a folder's name, in order; 1,000 a request.
+
+        Args:
+            prefix: Whole parts of names: `recordings/` has what is below it.
+            after: Only names behind this one.
+
+        Raises:
+            BucketError: The server does not answer, or refuses.
+        """
+        while True:
+            page, is_last = self._again(prefix, partial(self._page, prefix, after))
+            yield from page
+            if is_last:
+                return
+            after = page[-1].name
+
+    def _page(self, prefix: str, after: str | None) -> tuple[list[Object], bool]:
+        import obstore
+
+        pages = iter(obstore.list(self._reading, prefix or None, offset=after, chunk_size=_PAGE))
+        found = [_object(about, str(about["path"])) for about in next(pages, ())]
+        return found, len(found) < _PAGE
+
+    def first(self, prefix: str) -> Object | None:
+        """The first object of a folder, in one request; None if there is none."""
+        return next(self.objects(prefix), None)
+
+    def read(
+        self, name: str, ranges: Sequence[tuple[int, int]], version: str | None = None
+    ) -> list[bytes]:
+        """Parts of an object; ranges are joined where the gap costs less than a request.
+
+        Args:
+            name: The object.
+            ranges: Begin and end of each part, in any order.
+            version: The version it must have, if one is known.
+
+        Raises:
+            FileNotFoundError: It does not exist.
+            ObjectChangedError: It has another version, or is too short.
+            BucketError: The server does not answer, or refuses.
+        """
+        joined = joined_ranges(ranges)
+        if len(joined) > 1:
+            with ThreadPoolExecutor(min(len(joined), _PARALLEL)) as pool:
+                found = list(pool.map(lambda r: self._range(name, r, version), joined))
+        else:
+            found = [self._range(name, one, version) for one in joined]
+        parts = []
+        for begin, end in ranges:
+            place = next(n for n, (low, high) in enumerate(joined) if low <= begin and end <= high)
+            low = joined[place][0]
+            parts.append(bytes(memoryview(found[place])[begin - low : end - low]))
+        return parts
+
+    def _range(self, name: str, wanted: tuple[int, int], version: str | None) -> bytes:
+        begin, end = wanted
+        if begin == end:
+            return b""
+        _, data = self._get(name, {"range": (begin, end)}, version)
+        if len(data) != end - begin:
+            raise ObjectChangedError(f"{self._place(name)} is shorter than it was.")
+        return data
+
+    def tail(self, name: str, size: int) -> tuple[Object, bytes]:
+        """The last bytes of an object, all of a shorter one, and what it is.
+
+        Raises:
+            FileNotFoundError: It does not exist.
+            BucketError: The server does not answer, or refuses.
+        """
+        return self._get(name, {"range": {"suffix": size}}, None)
+
+    def read_whole(self, name: str, most: int) -> tuple[Object, bytes]:
+        """A small object, and what it is; of a larger one than expected only one byte more.
+
+        Raises:
+            FileNotFoundError: It does not exist.
+            BucketError: The server does not answer, or refuses.
+        """
+        return self._get(name, {}, None, most)
+
+    def _get(
+        self, name: str, options: dict[str, Any], version: str | None, most: int | None = None
+    ) -> tuple[Object, bytes]:
+        import obstore
+
+        if version is not None:
+            options = {**options, "if_match": version}
+
+        def read() -> tuple[Object, bytes]:
+            answer = obstore.get(self._reading, name, options=cast("GetOptions", options))
+            return _object(answer.meta, name), _content(answer, most)
+
+        return self._again(name, read)
+
+    def head(self, name: str) -> Object | None:
+        """What an object is; None if it does not exist.
+
+        Raises:
+            BucketError: The server does not answer, or refuses.
+        """
+        import obstore
+
+        try:
+            return self._again(name, lambda: _object(obstore.head(self._reading, name), name))
+        except FileNotFoundError:
+            return None
+
+    def create(self, name: str, content: bytes | BinaryIO) -> str:
+        """Create an object of a free name. One of this very content counts as created.
+
+        A file of more than `PART_BYTES` goes in parts, and only the check before it keeps
+        another writer of the same name away: give it a name that only this content has.
+
+        Args:
+            name: The object.
+            content: Its bytes, or a file at its beginning.
+
+        Returns:
+            Its version.
+
+        Raises:
+            ObjectExistsError: The name is taken, by other content.
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        from obstore.exceptions import AlreadyExistsError
+
+        self.check_conditions()
+        size = _size_of(content)
+        if size <= PART_BYTES and not isinstance(content, bytes):
+            content = content.read()
+        try:
+            if isinstance(content, bytes):
+                return self._put(name, content, "create")
+            if self.head(name) is None:
+                return self._put(name, content, "overwrite")
+        except AlreadyExistsError:
+            pass  # by another writer, or by this one whose connection broke
+        found = self._same(name, content, size)
+        if found is None:
+            raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
+        return found
+
+    def replace(self, name: str, data: bytes, version: str) -> str:
+        """Replace an object, if it is still the version that was read.
+
+        Returns:
+            Its new version.
+
+        Raises:
+            ObjectChangedError: It has another version, or was deleted.
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        self.check_conditions()
+        try:
+            return self._put(name, data, {"e_tag": version})
+        except (ObjectChangedError, FileNotFoundError):
+            pass  # by another writer, or by this one whose connection broke
+        found = self._same(name, data, len(data))
+        if found is None:
+            raise ObjectChangedError(f"{self._place(name)} was changed by another process.")
+        return found
+
+    def delete(self, names: Iterable[str]) -> None:
+        """Delete objects; those that do not exist are left out.
+
+        Raises:
+            BucketError: The server does not answer, or refuses.
+        """
+        import obstore
+
+        for name in names:
+            try:
+                self._again(name, partial(obstore.delete, self._writing, name))
+            except FileNotFoundError:
+                continue
+
+    def check_conditions(self) -> None:
+        """Try once, before the first write, whether the server honours conditions.
+
+        Raises:
+            BucketError: It ignores them: writers would overwrite each other in silence.
+        """
+        from obstore.exceptions import AlreadyExistsError, NotSupportedError
+
+        if self._has_conditions:
+            return
+        name = f"probe-{secrets.token_hex(8)}"
+
+        def is_refused(mode: PutMode) -> bool:
+            try:
+                self._put(name, b"other", mode)
+            except (AlreadyExistsError, ObjectChangedError):
+                return True
+            except NotSupportedError:
+                pass
+            return False
+
+        try:
+            stale = self._put(name, b"hybridlog", "overwrite")
+            self._put(name, b"hybridlog 2", "overwrite")
+            is_safe = is_refused("create") and is_refused({"e_tag": stale})
+        finally:
+            self.delete([name])
+        if not is_safe:
+            raise BucketError(
+                f"The server of {self.address} ignores conditions of writers (If-None-Match, "
+                "If-Match), so two writers would lose data in silence. Use a server that honours "
+                "them, or copy to a directory."
+            )
+        self._has_conditions = True
+
+    def _same(self, name: str, content: bytes | BinaryIO, size: int) -> str | None:
+        """The version of an object, if it has this content."""
+        about = self.head(name)
+        if about is None or about.size != size:
+            return None
+        if isinstance(content, bytes):
+            pieces: Iterator[bytes] = iter([content])
+        else:
+            file = content
+            file.seek(0)
+            pieces = iter(lambda: file.read(PART_BYTES // 4), b"")
+        begin = 0
+        for piece in pieces:
+            end = begin + len(piece)
+            if self._range(name, (begin, end), about.version) != piece:
+                return None
+            begin = end
+        return about.version
+
+    def _put(self, name: str, content: bytes | BinaryIO, mode: PutMode) -> str:
+        import obstore
+
+        def put() -> str:
+            if isinstance(content, bytes):
+                done = obstore.put(self._writing, name, content, mode=mode, use_multipart=False)
+            else:
+                content.seek(0)
+                done = obstore.put(
+                    self._writing,
+                    name,
+                    content,
+                    use_multipart=True,
+                    chunk_size=PART_BYTES // 4,
+                    max_concurrency=4,
+                )
+            return _version(done)
+
+        return self._again(name, put)
+
+    def _again(self, name: str, work: Callable[[], _T]) -> _T:
+        """Do something again if the connection broke.
+
+        The library repeats requests that change nothing, but not what was cut while it was
+        read. Writers have conditions, and see what a request did whose answer was lost.
+        """
+        from obstore.exceptions import GenericError
+
+        for attempt in range(_TRIES):
+            with self._explained(name):
+                try:
+                    return work()
+                except GenericError as error:
+                    if attempt + 1 == _TRIES or _CUT.search(str(error)) is None:
+                        raise
+        raise AssertionError
+
+    def _place(self, name: str) -> str:
+        return f"{self.address}/{name}"
+
+    @contextmanager
+    def _explained(self, name: str) -> Iterator[None]:
+        """Raise errors of the library as errors of this program."""
+        from obstore import exceptions
+
+        if os.getpid() != self._pid:
+            raise BucketError(
+                f"{self.address} was opened before this process was forked. Open it here again."
+            )
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                errno.ENOENT, "there is no such object", self._place(name)
+            ) from error
+        except exceptions.PreconditionError as error:
+            raise ObjectChangedError(f"{self._place(name)} was changed meanwhile.") from error
+        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
+            raise BucketError(
+                f"{self.address}: the server refuses access. Credentials come from the "
+                "environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY."
+            ) from error
+        except (exceptions.AlreadyExistsError, exceptions.NotSupportedError):
+            raise
+        except (exceptions.BaseError, ValueError) as error:
+            raise BucketError(f"{self._place(name)}: {_reason(error)}") from error
+
+
+def joined_ranges(
+    ranges: Iterable[tuple[int, int]], gap: int = JOINED_GAP
+) -> list[tuple[int, int]]:
+    """Ranges in order, joined where the gap between two is small."""
+    joined: list[tuple[int, int]] = []
+    for begin, end in sorted(ranges):
+        if joined and begin - joined[-1][1] <= gap:
+            joined[-1] = joined[-1][0], max(joined[-1][1], end)
+        else:
+            joined.append((begin, end))
+    return joined
+
+
+def _opened(address: str, timeout_s: int) -> ObjectStore:
+    try:
+        from obstore.exceptions import BaseError
+        from obstore.store import from_url
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Buckets need obstore: pip install 'hybridlog[remote]'"
+        ) from error
+    try:
+        return from_url(
+            address,
+            client_options={"timeout": timedelta(seconds=timeout_s), "allow_http": _allows_http()},
+            retry_config={"max_retries": 6, "retry_timeout": timedelta(seconds=_RETRY_S)},
+        )
+    except (BaseError, ValueError) as error:
+        raise UsageError(f"{address} cannot be opened: {_reason(error)}") from error
+
+
+def _allows_http() -> bool:
+    """Whether the environment allows a server without TLS, under the name that obstore reads."""
+    names = ("AWS_ALLOW_HTTP", "GOOGLE_ALLOW_HTTP", "AZURE_ALLOW_HTTP", "ALLOW_HTTP")
+    return any(os.environ.get(name, "").lower() in {"1", "true"} for name in names)
+
+
+def _content(answer: GetResult, most: int | None) -> bytes:
+    if most is None:
+        return bytes(answer.bytes())
+    found = bytearray()
+    for piece in answer.stream(1 << 20):
+        found += piece
+        if len(found) > most:
+            return bytes(found[: most + 1])
+    return bytes(found)
+
+
+def _object(about: Any, name: str) -> Object:
+    modified = int(about["last_modified"].timestamp() * 1e9)
+    return Object(name, int(about["size"]), _version(about), modified)
+
+
+def _version(about: Any) -> str:
+    version = about["e_tag"]
+    if not isinstance(version, str) or not version:
+        raise ValueError("the server gives no entity tags")
+    return version
+
+
+def _size_of(content: bytes | BinaryIO) -> int:
+    return len(content) if isinstance(content, bytes) else os.fstat(content.fileno()).st_size
+
+
+def _reason(error: Exception) -> str:
+    """What an error of the library says, in one line and without what may be secret."""
+    lines = str(error).partition("Debug source")[0].split("\n")
+    text = " ".join(" ".join(lines).split())
+    printable = "".join(one for one in text if one.isprintable())
+    return _SECRETS.sub(r"\1=…", printable)[:400]

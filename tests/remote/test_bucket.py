@@ -1,0 +1,108 @@
+"""The client of buckets, against a server that fails."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from hybridlog_storage.errors import (
+    BucketError,
+    ObjectChangedError,
+    ObjectExistsError,
+    UsageError,
+)
+from hybridlog_storage.remote import bucket as bucket_module
+from hybridlog_storage.remote.bucket import Bucket, joined_ranges
+from tests.remote.server import Proxy
+
+DATA = random.Random(1).randbytes(300_000)
+
+
+def test_create_replace_read_delete(address: str, proxy: Proxy, tmp_path: Path) -> None:
+    bucket = Bucket(address)
+    version = bucket.create("a/one", DATA)
+    assert bucket.create("a/one", DATA) == version
+    with pytest.raises(ObjectExistsError):
+        bucket.create("a/one", DATA[1:])
+    other = bucket.replace("a/one", DATA[::-1], version)
+    with pytest.raises(ObjectChangedError):
+        bucket.replace("a/one", DATA, version)
+    with pytest.raises(ObjectChangedError):
+        bucket.read("a/one", [(0, 1)], version)
+    with pytest.raises(ObjectChangedError):
+        bucket.replace("a/none", DATA, version)
+    bucket.create("a/two", b"2")
+    bucket.create("b", b"3")
+    assert [(o.name, o.size) for o in bucket.objects("a")] == [("a/one", len(DATA)), ("a/two", 1)]
+    assert [o.name for o in bucket.objects()] == ["a/one", "a/two", "b"]
+    proxy.reset()
+    ranges = [(10, 20), (200_000, 200_010), (5, 12)]
+    assert bucket.read("a/one", ranges, other) == [DATA[::-1][b:e] for b, e in ranges]
+    about, tail = bucket.tail("a/one", 100)
+    assert (about.size, about.version, tail) == (len(DATA), other, DATA[::-1][-100:])
+    assert len(proxy.requests) == 2
+    assert bucket.read_whole("a/one", 1000)[1] == DATA[::-1][:1001]
+    bucket.delete(["a/one", "a/one"])
+    assert bucket.head("a/one") is None
+    with pytest.raises(FileNotFoundError):
+        bucket.read("a/one", [(0, 1)])
+
+
+def test_far_ranges_are_read_apart() -> None:
+    assert joined_ranges([(50, 60), (0, 10), (5, 20)], gap=29) == [(0, 20), (50, 60)]
+    assert joined_ranges([(50, 60), (0, 20)], gap=30) == [(0, 60)]
+
+
+def test_large_files_go_in_parts(
+    address: str, proxy: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bucket_module, "PART_BYTES", 20 << 20)  # parts of 5 MiB, the least
+    path = tmp_path / "large"
+    path.write_bytes(DATA * 80)
+    bucket = Bucket(address)
+    with path.open("rb") as file:
+        bucket.create("large", file)
+    assert sum("uploadId" in name for _, name, _ in proxy.requests) > 3
+    assert bucket.head("large").size == path.stat().st_size  # type: ignore[union-attr]
+    with path.open("rb") as file:
+        bucket.create("large", file)
+    path.write_bytes(DATA * 79 + DATA[::-1])
+    with path.open("rb") as file, pytest.raises(ObjectExistsError):
+        bucket.create("large", file)
+
+
+@pytest.mark.parametrize("what", ["reset", "lost", "503", "cut", "slow"])
+def test_spoiled_requests_are_repeated(address: str, proxy: Proxy, what: str) -> None:
+    proxy.spoil = lambda number: what if number % 3 == 0 else ""
+    bucket = Bucket(address)
+    versions = [bucket.create(f"a/{n}", DATA[n:]) for n in range(3)]
+    versions[1] = bucket.replace("a/1", DATA, versions[1])
+    assert [o.version for o in bucket.objects("a")] == versions
+    for _ in range(3):
+        assert bucket.read("a/2", [(0, 1000), (200_000, 250_000)], versions[2]) == [
+            DATA[2:1002],
+            DATA[200_002:250_002],
+        ]
+    assert bucket.read_whole("a/1", 1 << 20)[1] == DATA
+
+
+def test_a_server_without_conditions_is_refused(address: str, proxy: Proxy) -> None:
+    proxy.without_conditions = True
+    bucket = Bucket(address)
+    with pytest.raises(BucketError, match="ignores conditions"):
+        bucket.create("a", b"1")
+    assert [o.name for o in bucket.objects()] == []
+
+
+def test_addresses_and_refusals(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    for wrong in ("s3://", "http://lab/store", "/a"):
+        with pytest.raises(UsageError):
+            Bucket(wrong)
+    with pytest.raises(FileNotFoundError):
+        Bucket("s3://nobody-has-this/store").read("a", [(0, 1)])
+    proxy.spoil = lambda _: "503"
+    monkeypatch.setattr(bucket_module, "_RETRY_S", 0)
+    with pytest.raises(BucketError, match="nobody-has-this/store/a"):
+        Bucket("s3://nobody-has-this/store").read("a", [(0, 1)])
