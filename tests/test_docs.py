@@ -547,13 +547,14 @@ def documented_classes() -> list[type]:
     from hybridlog.record.recorder import RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.training.lerobot import LerobotReport
+    from hybridlog.training.windows import Windows
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, ImportReport, LerobotReport]
     answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
-    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
+    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, Windows, *answers]
     recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 
@@ -574,6 +575,8 @@ def test_every_public_name_is_described(thing: type) -> None:
         members |= {"rows": None}
     if thing.__name__ == "Synced":
         members |= dict.fromkeys(("topics", "recordings", "times", "counters", "left_out"))
+    if thing.__name__ == "Windows":
+        members |= dict.fromkeys(("names", "episodes", "left_out", "counters"))
     if thing.__name__ == "Recordings":
         conditions = inspect.signature(hl.Store.recordings).parameters
         members |= dict.fromkeys(("summaries", *(name for name in conditions if name != "self")))

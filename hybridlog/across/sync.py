@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from hybridlog.across.approximate_time import approximate_sets
+from hybridlog.across.opens_again import OpensAgain
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import completeness_of
@@ -28,17 +29,10 @@ from hybridlog_storage.times import span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.across.opens_again import OpenedStore
     from hybridlog.message import Message
     from hybridlog.query.question import Clock, Question
     from hybridlog.session import Session
-
-
-class OpenedStore(Protocol):
-    """A store that a process has opened for itself."""
-
-    @property
-    def session(self) -> Session:
-        """Its state."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +52,7 @@ class _Topic:
     is_alone: NDArray[np.bool_]
 
 
-class Synced(Sequence[tuple["Message", ...]]):
+class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
     """Sets of messages with about the same time, one of each topic.
 
     A map-style data set: `len`, `[n]`, slices and iteration. Only times have been read; the
@@ -87,10 +81,8 @@ class Synced(Sequence[tuple["Message", ...]]):
             raise UsageError("Sets use all messages: leave out limit, every and reverse.")
         if any(q.frame is not None for q in questions):
             raise UsageError("Sets are of messages as they came: leave out in_frame.")
+        super().__init__(session, open_again)
         self.topics = tuple(question.topics[0] for question in questions)
-        self.counters = Counters()
-        self._open_again = open_again
-        self._session: Session | None = session
         limit = None if tolerance is None else parse_duration(tolerance)
         snapshot = session.look()
         shared = [set(session.chosen(question).tolist()) for question in questions]
@@ -160,18 +152,6 @@ class Synced(Sequence[tuple["Message", ...]]):
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
         """The sets, one after the other."""
         return (self[n] for n in range(len(self)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the open store."""
-        state = vars(self).copy()
-        state.update(_session=None, counters=Counters())
-        return state
-
-    def _opened(self) -> Session:
-        """The store, opened by this process."""
-        if self._session is None:
-            self._session = self._open_again().session
-        return self._session
 
     def _read(self, session: Session, topic: _Topic, recording: str, row: int) -> Message:
         time, number = int(topic.log_time[row]), int(topic.number[row])

@@ -97,6 +97,15 @@ class FeatureMap:
         )
 
     @classmethod
+    def given(cls, features: str | Path | Mapping[str, Any]) -> FeatureMap:
+        """A map of plain values, or from a file.
+
+        Raises:
+            UsageError: It cannot be read, or is no map.
+        """
+        return cls.read(features) if isinstance(features, str | Path) else cls.of(features)
+
+    @classmethod
     def read(cls, path: str | Path) -> FeatureMap:
         """Read a map from a file.
 

@@ -68,7 +68,7 @@ class Log:
     camera: tuple[int, int] = (HEIGHT, WIDTH)
     broken: int = -1  # a picture that is too short
 
-    def write(self, store: hl.Store, name: str) -> None:
+    def write(self, store: hl.Store, name: str, **options: Any) -> None:
         said: list[tuple[int, Channel, bytes]] = []
         for time in range(0, self.length, ARM_STEP):
             q = arm(time)
@@ -82,7 +82,7 @@ class Log:
             said.append((time, CAMERA, image(pixels)[: 60 if number == self.broken else None]))
         for time, words in ((0, b"first"), (2 * SECOND, b"second")):
             said.append((time, SAY, len(words).to_bytes(4, "little") + words))
-        with store.start(name) as recording:
+        with store.start(name, **options) as recording:
             for time, channel, payload in sorted(said, key=lambda one: one[0]):
                 recording.write(channel, payload, log_time=self.start + time)
 
