@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +14,16 @@ from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.query_options import recordings_of
-from hybridlog.cli.signals import if_stopped
-from hybridlog_storage.errors import UsageError
+from hybridlog.cli.signals import Stopped, if_stopped
+from hybridlog_storage.errors import DatabaseError, StoreError, UsageError
+from hybridlog_storage.stopping import at_safe_points, pause
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.query.choice import Choice
+    from hybridlog.store import Store
 
 
 _FIELDS = click.argument(
@@ -193,6 +196,75 @@ def rebuild(
             f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
             f"{output.without_documents(without)}"
         )
+
+
+@index_command.command()
+@click.option(
+    "--every",
+    default="2s",
+    show_default=True,
+    metavar="DURATION",
+    help="Time between two looks at the store.",
+)
+@_options
+def watch(*, every: str, store: Path | None, mongo: str | None, as_json: bool, quiet: bool) -> None:
+    """Index recordings as they come into the store, until Ctrl-C.
+
+    For a server into whose store robots copy. While MongoDB is unavailable, it tries again.
+    Several may watch one store.
+    """
+    from hybridlog.query.times import parse_duration
+
+    pause_s = parse_duration(every) / 1e9
+    if pause_s <= 0:
+        raise UsageError(f"--every {every} is no time to wait. Give a duration such as 2s.")
+    with (
+        opened_store(store, mongo, needs_database=True, quiet=quiet, is_lasting=True) as opened,
+        at_safe_points(),
+    ):
+        try:
+            if not quiet:
+                output.note(f"Watching {opened.directory.path}. Ctrl-C ends it.")
+            told: set[str] = set()
+            while True:
+                _look(opened, told, as_json=as_json, quiet=quiet)
+                pause(pause_s)
+        except Stopped:
+            return
+
+
+def _look(store: Store, told: set[str], *, as_json: bool, quiet: bool) -> None:
+    """Index what has come since the last look, and report it.
+
+    Args:
+        store: The store.
+        told: Problems that were reported and are not over; changed.
+        as_json: A line of JSON a recording.
+        quiet: Problems only.
+    """
+    if store.session.snapshot().is_open.any() or store.session.has_changed():
+        store.refresh()
+    problems = set()
+    try:
+        store.connect()
+    except (DatabaseError, StoreError) as error:
+        problems.add(str(error))
+    repairs = store.repairs
+    for label, problem in [*repairs.unreadable.items()]:
+        problems.add(f"Recording {label} cannot be read: {problem}")
+    for label in [*repairs.indexed]:
+        chunks = repairs.indexed.pop(label)
+        if not chunks:  # another process was faster
+            continue
+        if as_json:
+            output.print_json_line({"recording": label, "chunks": chunks})
+        elif not quiet:
+            output.say(f"{label}  {output.counted(chunks, 'chunk')}")
+            sys.stdout.flush()
+    for problem in sorted(problems - told):
+        output.note(problem)
+    told.clear()
+    told.update(problems)
 
 
 def _print(found: list[FieldIndex], *, as_json: bool, quiet: bool) -> None:
