@@ -45,6 +45,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
+    NONE,
     cache_mb_from_environment,
     checked_cache_mb,
     is_uri,
@@ -105,6 +106,7 @@ def open_store(
     progress: Progress | None = None,
     cache_mb: int | None = None,
     recover: bool = True,
+    read_only: bool = False,
 ) -> Store:
     """Open a store; recover first after a crash.
 
@@ -123,6 +125,8 @@ def open_store(
             MongoDB that runs already is not changed.
         recover: False to leave recordings that a crash has cut, and what the index lacks of
             others, to the next opening: a recorder need not wait for them.
+        read_only: Never write a byte in it, as if this user could not: nothing is repaired, and
+            no MongoDB is used.
 
     Raises:
         UsageError: MongoDB does not accept such a cache.
@@ -130,7 +134,7 @@ def open_store(
         DatabaseError: MongoDB does not answer and `require_database` is set.
     """
     where = store_path(path)
-    wanted = mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
+    wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
     if cache_mb is not None:
         checked_cache_mb(cache_mb, "The size of the cache")
     cache = cache_mb or cache_mb_from_environment()
@@ -143,7 +147,7 @@ def open_store(
             with suppress(StoreError):  # without a home directory, each command must name it again
                 consent.remember(directory.settings.store_id, own)
     else:
-        directory = StoreDirectory(where)
+        directory = StoreDirectory(where, read_only=read_only)
     store = Store(directory, mongo=wanted, progress=progress, cache_mb=cache, recover=recover)
     try:
         if require_database:

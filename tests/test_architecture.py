@@ -93,6 +93,8 @@ ALLOWED = {
         "hybridlog.schema",
     ),
     "sqlite3": ("hybridlog.formats.rosbag2.sqlite", "hybridlog.formats.rosbag2.writer"),
+    "mcp": ("hybridlog.view.tool_server",),
+    "pydantic": ("hybridlog.view.tool_server",),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
     "websockets": (

@@ -78,6 +78,7 @@ COMMANDS: Final = {
     "view": "view",
     "export": "export",
     "serve": "serve",
+    "mcp": "mcp",
     "open": "open",
     "attachments": "attachments",
     "index": "index",

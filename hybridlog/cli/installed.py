@@ -17,6 +17,7 @@ NEEDED_FOR: Final = {
     "foxglove": "record --foxglove, serve",
     "images": "compressed images, fetch -F jpg",
     "lerobot": "export -F lerobot",
+    "mcp": "mcp",
     "plot": "plot, except as a page",
     "protobuf": "fields of protobuf messages",
     "remote": "stores in buckets: s3://, gs://, az://",

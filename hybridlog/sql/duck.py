@@ -29,7 +29,9 @@ _SETTINGS: Final = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "enable_external_access": False,
+    "extension_directory": "none",
     "python_enable_replacements": False,
+    "secret_directory": "none",
     "temp_directory": "",
 }
 _SHORTAGES: Final = ("Out of Memory", "Cannot allocate memory", "start new thread")

@@ -10,6 +10,7 @@ from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import send_handle
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from hybridlog_storage.errors import ResourceError
@@ -78,9 +79,11 @@ class SqlProcess:
     def _send(self, theirs: Connection[Any, Any]) -> None:
         if self._control is None:
             self._control, control = Pipe()
+            places = [str(Path(place).absolute()) for place in sys.path]
             with control:
                 child = subprocess.Popen(  # noqa: S603 - our own module
-                    [sys.executable, "-c", _START.format(sys.path, control.fileno())],
+                    [sys.executable, "-c", _START.format(places, control.fileno())],
+                    cwd="/",  # nothing in an answer says where this one runs
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     pass_fds=[control.fileno()],
@@ -88,5 +91,6 @@ class SqlProcess:
                 )
             threading.Thread(target=child.wait, daemon=True).start()
             mongo = self._store.session.connection.wanted
-            self._control.send((str(self._store.directory.path), mongo))
+            directory = self._store.directory
+            self._control.send((str(directory.path.absolute()), mongo, directory.read_only))
         send_handle(self._control, theirs.fileno(), None)

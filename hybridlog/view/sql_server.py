@@ -35,7 +35,8 @@ def serve(handle: int) -> None:
         handle: The descriptor that connections come through.
     """
     with Connection(handle) as control, suppress(EOFError):
-        context = _opened(*control.recv())
+        path, mongo, read_only = control.recv()
+        context = _opened(path, mongo, read_only=read_only)
         with limited_memory(SQL_MEMORY) as most:
             while True:
                 asked = Connection(recv_handle(control))
@@ -46,10 +47,10 @@ def serve(handle: int) -> None:
                     break  # the next process may be able to open it
 
 
-def _opened(path: str, mongo: str | None) -> Context | HybridlogError:
+def _opened(path: str, mongo: str | None, *, read_only: bool) -> Context | HybridlogError:
     """The open store with all that a query loads, or why there is none."""
     try:
-        store = hybridlog.open(path, mongo=mongo)
+        store = hybridlog.open(path, mongo=mongo, read_only=read_only)
         store.sql_engine.connect(SQL_MEMORY).query("select 1").to_arrow()
     except HybridlogError as error:
         return error

@@ -417,6 +417,7 @@ EXEMPT: dict[str, str] = {
     "import": "it copies recordings that have ended, from a store",
     "view": "it serves until it is stopped; see tests/view",
     "serve": "it serves until it is stopped; see tests/view/playback",
+    "mcp": "it serves until it is stopped; see tests/view/test_tools.py",
     "open": "it opens a program with a slice, which `fetch -o` makes",
     "trust": "it is about servers",
     "demo": "it makes a recording",

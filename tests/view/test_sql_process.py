@@ -109,6 +109,12 @@ def test_a_query_takes_no_more_than_it_may(client: TestClient, demo_store: hl.St
     assert psutil.Process().memory_info().rss - before < 200 << 20
 
 
+def test_rows_with_a_recording_and_no_time(client: TestClient) -> None:
+    found = client.get("sql", params={"text": "select recording, id from recordings"}).json()
+    assert [row[0] for row in found["rows"]] == ["robot"]
+    assert found["at"] == found["recordings"] == []
+
+
 def test_all_questions_share_one_process(process: SqlProcess) -> None:
     number = process.ask(pid)
     stopped = threading.Event()

@@ -187,6 +187,8 @@ def _moments(
     It is the only one of the topics that were read at a time that the row may be of. Without a
     column `recording`, the recording is known if a single one was read.
     """
+    if not times:
+        return [], []
     read = [entry.label for entry in remarks.recordings.values()]
     named = labels or [read[0] if len(read) == 1 else None] * len(times)
     found: list[str | None] = [None] * len(times)

@@ -95,12 +95,17 @@ class Listing:
 class StoreDirectory:
     """A store's directory.
 
+    Args:
+        path: The directory.
+        read_only: Behave as if this user could not write it.
+
     Raises:
         StoreError: It is not a store, has another format, or cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
+        self.read_only = read_only
         self.settings = read_settings(path)
 
     @classmethod
@@ -163,6 +168,8 @@ class StoreDirectory:
     @property
     def is_writable(self) -> bool:
         """True if this user may change the store."""
+        if self.read_only:
+            return False
         return os.access(self.path / _RECORDINGS, os.W_OK | os.X_OK) and os.access(
             self.path, os.W_OK | os.X_OK
         )

@@ -1,0 +1,262 @@
+"""Answers for programs that ask by tools: plain values and pictures, in bounds.
+
+They are worked out in the process for SQL, whose memory is limited. Names and texts in them
+are data of the robot.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain, islice
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from hybridlog.arrays.message_arrays import IMAGES, plain_type
+from hybridlog.query.answers.completeness import coverage
+from hybridlog.query.answers.infer_fields import infer_fields
+from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.counters import Counters
+from hybridlog.query.times import format_duration, format_time
+from hybridlog.record.losses import losses_of
+from hybridlog.view.context import SQL_MEMORY
+from hybridlog_storage.errors import PayloadError, TimeError, TopicError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from hybridlog.query.query import Query
+    from hybridlog.view.context import Context
+
+MAX_ROWS: Final = 200
+"""Rows of an answer."""
+MAX_MESSAGES: Final = 20
+MAX_PICTURES: Final = 4
+MAX_BYTES: Final = 128 << 10
+"""Bytes of the text of an answer."""
+MAX_PICTURE_BYTES: Final = 2 << 20
+"""Bytes of one picture."""
+_PLOT: Final = (1000, 320)
+
+
+class Picture(NamedTuple):
+    """A picture of an answer: its media type and its file."""
+
+    media_type: str
+    data: bytes
+
+
+class Answer(NamedTuple):
+    """An answer: JSON text and pictures."""
+
+    text: str
+    pictures: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The messages of a topic that are asked about.
+
+    Attributes:
+        topic: Its name, full or short.
+        recording: Label or name of a recording, or a glob; None for all.
+        where: A predicate; None for all messages.
+        within: Greatest distance in time of conditions on other topics.
+        begin: First log time; None for the beginning.
+        end: Log time after the last one; None for the end.
+    """
+
+    topic: str
+    recording: str | None = None
+    where: str | None = None
+    within: str | None = None
+    begin: str | None = None
+    end: str | None = None
+
+    def query(self, context: Context) -> Query:
+        """The question.
+
+        Raises:
+            TopicError: There is no such recording or topic.
+            WhereError: The predicate cannot be parsed, or does not fit.
+            TimeError: The range is none.
+        """
+        query = context.store.recordings(self.recording).topic(self.topic)
+        if self.begin is not None or self.end is not None:
+            query = query.between(self.begin, self.end)
+        return query if self.where is None else query.where(self.where, within=self.within)
+
+
+def recordings(context: Context, name: str | None) -> Answer:
+    """The latest recordings, and how complete they are."""
+    chosen = context.store.recordings(name)
+    found = list(chosen)[-MAX_ROWS:]
+    rows = [
+        {
+            "recording": one.label,
+            "begin": None if one.span is None else format_time(one.span[0]),
+            "end": None if one.span is None else format_time(one.span[1]),
+            "status": one.status,
+            "tags": one.tags,
+            "messages": one.messages,
+            "topics": len({channel.topic for channel in one.channels}),
+            "completeness": coverage(one, losses_of(one)),
+        }
+        for one in reversed(found)
+    ]
+    return _answer({"recordings": rows}, "recordings", is_cut=len(chosen) > len(found))
+
+
+def schema(context: Context, topic: str | None, recording: str | None) -> Answer:
+    """The topics of recordings with their types, or the fields of one topic."""
+    chosen = context.store.recordings(recording).check()
+    if topic is None:
+        rows: dict[str, dict[str, Any]] = {}
+        for channel in chain.from_iterable(entry.channels for entry in chosen):
+            row = rows.setdefault(
+                channel.topic, {"topic": channel.topic, "type": channel.type, "messages": 0}
+            )
+            row["messages"] += channel.stats.messages
+        listed = [rows[name] for name in sorted(rows)]
+        return _answer({"topics": listed[:MAX_ROWS]}, "topics", is_cut=len(listed) > MAX_ROWS)
+    query = chosen.topic(topic)
+    known = query.field_types()
+    if known is None:
+        known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
+    fields = [{"field": path, "type": kind} for path, kind in known.items()]
+    values = {"topics": query.topics, "lacks": query.remarks(topic, is_empty=False)}
+    return _answer({**values, "fields": fields[:MAX_ROWS]}, "fields", is_cut=len(fields) > MAX_ROWS)
+
+
+def ask(context: Context, asked: Asked, at_least: str | None) -> Answer:
+    """The number of messages that satisfy a predicate, when it holds, and the first of them."""
+    query = asked.query(context)
+    count = query.count()
+    values: dict[str, Any] = {"count": count, **_lacks(query, asked.topic, count)}
+    with suppress(TimeError):  # the range is outside all recordings
+        times = match_times(query.session, query.question, Counters())
+        values["first_times"] = [format_time(one) for one in islice(_each(times), 10)]
+    rows = []
+    is_cut = False
+    if asked.where is not None and len(query.topics) == 1:
+        held = query.intervals(at_least=at_least)
+        values["interval_count"] = len(held)
+        is_cut = len(held) > MAX_ROWS
+        labels = {one.id: one.label for one in query.summaries()}
+        rows = [
+            {
+                "recording": labels[one.recording],
+                "begin": format_time(one.begin_ns),
+                "length": format_duration(one.end_ns - one.begin_ns),
+                "messages": one.messages,
+            }
+            for one in islice(held, MAX_ROWS)
+        ]
+    return _answer({**values, "intervals": rows}, "intervals", is_cut=is_cut)
+
+
+def _each(found: Any) -> Iterator[int]:
+    for part in found:
+        yield from part.log_time.tolist()
+
+
+def sql(context: Context, text: str, seconds: float) -> Answer:
+    """The first rows of a query in SQL."""
+    connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
+    try:
+        answer = connection.query(text, timeout=seconds)
+        table, is_cut = answer.first(MAX_ROWS, MAX_BYTES)
+        values = [one.to_pylist(maps_as_pydicts="strict") for one in table.columns]
+        rows = [*map(list, zip(*values, strict=True))]
+        found = {"columns": table.column_names, "lacks": answer.told(), "rows": rows}
+        return _answer(found, "rows", is_cut=is_cut)
+    finally:
+        connection.close()
+
+
+def fetch(context: Context, asked: Asked, fields: list[str], most: int, pictures: int) -> Answer:
+    """Some messages with their fields, long arrays as summaries, and pictures of images.
+
+    Args:
+        context: The store.
+        asked: The messages.
+        fields: Paths of the fields wanted; all without.
+        most: Greatest number of messages.
+        pictures: Greatest number of pictures.
+    """
+    query = asked.query(context)
+    if fields:
+        query = query.fields(*fields)
+    limited = query.limit(min(most, MAX_MESSAGES))
+    rows: list[Any] = []
+    shown: list[Picture] = []
+    problems: list[str] = []
+    if fields:
+        rows = [json.loads(line) for lines in limited.to_json_lines() for line in lines]
+    for message in limited if pictures or not fields else ():
+        if not fields:
+            rows.append(
+                {
+                    "log_time": format_time(message.log_time_ns),
+                    "topic": message.topic,
+                    "state": str(message.state),
+                    "fields": json.loads(json.dumps(message.fields, default=str)),
+                }
+            )
+        if len(shown) < pictures and plain_type(message.type) in IMAGES:
+            try:
+                shown.append(_picture(message))
+            except PayloadError as error:
+                problems.append(f"{format_time(message.log_time_ns)}: {error}")
+    count = query.count()
+    values = {"count": count, **_lacks(limited, asked.topic, count), "not_shown": problems}
+    return _answer({**values, "messages": rows}, "messages", tuple(shown), is_cut=count > len(rows))
+
+
+def _picture(message: Any) -> Picture:
+    from hybridlog.drawing.images import picture
+
+    found = picture(message, raw=False, form="jpg")
+    if len(found.data) > MAX_PICTURE_BYTES:
+        raise PayloadError(f"a picture of {len(found.data)} bytes is too large for an answer")
+    return Picture(found.media_type, found.data)
+
+
+def plot(context: Context, asked: Asked, fields: list[str]) -> Answer:
+    """Fields over time as a picture."""
+    from hybridlog.drawing.figure import figure
+    from hybridlog.drawing.lines import lines
+
+    query = asked.query(context)
+    found = lines(query, fields, pixels=_PLOT[0])
+    if not found:
+        raise TopicError("There is no message to draw.")
+    drawn = figure(found, size=_PLOT, form="png")
+    lacks = _lacks(query, asked.topic, query.counters.messages)
+    return _answer(
+        {**lacks, "lines": [f"{one.topic} {one.series.field} in {one.recording}" for one in found]},
+        "lines",
+        (Picture("image/png", drawn),),
+    )
+
+
+def _lacks(query: Query, name: str, count: int) -> dict[str, Any]:
+    """What the last answer of a query lacks, in words."""
+    found = query.completeness()
+    return {
+        "lost": found.describe(count) if found.has_losses else None,
+        "lacks": query.remarks(name, is_empty=not count),
+    }
+
+
+def _answer(
+    values: dict[str, Any], rows: str, pictures: tuple[Picture, ...] = (), *, is_cut: bool = False
+) -> Answer:
+    """An answer whose rows fit into it; `more` says whether some were left out."""
+    while True:
+        text = json.dumps({**values, "more": is_cut}, ensure_ascii=False, default=str)
+        if len(text.encode()) <= MAX_BYTES:
+            return Answer(text, pictures)
+        if len(values[rows]) < 2:
+            raise PayloadError("a row is too large for an answer: name fewer columns or fields")
+        values[rows], is_cut = values[rows][: len(values[rows]) // 2], True
