@@ -39,6 +39,7 @@ from hybridlog_storage.errors import (
     HybridlogError,
     ResourceError,
     StoreError,
+    TimeError,
     TopicError,
     UsageError,
 )
@@ -1197,15 +1198,17 @@ class Store:
             The name of the pin.
 
         Raises:
-            TimeError: A time is invalid, or the range is empty.
+            TimeError: A time is invalid, or the range is empty or outside of the recording.
         """
-        from hybridlog.maintenance.keep import append_pins, pin_of
+        from hybridlog.maintenance.keep import append_pins, may_hold, pin_of
 
         (entry,) = self.select([recording])
         start, stop = extent_of(entry)
         if begin is not None or end is not None:
             parse_range(begin, end, start=start, end=stop)
         times = [None if t is None else parse_time(t, start=start, end=stop) for t in (begin, end)]
+        if not may_hold(entry, *times):
+            raise TimeError(f"Nothing to pin: recording {entry.label!r} has no message then.")
         name = secrets.token_hex(4)
         line = pin_of(name, (times[0], times[1]), topics, text(reason))
         append_pins(self.directory, entry.label, entry.id, [line])

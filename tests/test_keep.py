@@ -22,7 +22,7 @@ from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
+from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError, TimeError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.running import run
@@ -178,7 +178,7 @@ def test_too_little_may_go(store: Path) -> None:
     keep("--pin", "-r", "run", store=store)
     found = run("keep", "--quota", "1kB", "--mongo", "none", store=store, code=1)
     assert "What is pinned takes" in found.err
-    assert "nothing else may" in found.err
+    assert "all that is left must stay" in found.err
     assert payloads(store)[0] == image(0)
 
 
@@ -188,10 +188,38 @@ def test_a_damaged_segment_stays_and_the_others_go(store: Path) -> None:
         file.write(b"damaged")
     found = keep("--max-age", "0s", store=store, code=None)
     assert "000001.mcap" in found.err
+    assert "stay until the file is restored from a copy" in found.err
     state = journal.read(store / "recordings" / "run")
     assert state is not None
     assert {n for n, topics in state.expired.items() if "/camera" in topics} >= {0, 2, 3}
     assert 1 not in state.expired
+
+
+def test_a_rule_that_fits_no_topic_is_told(store: Path) -> None:
+    found = keep("--topic", "/camara=0s", "--topic", "camera=9y", "--dry-run", store=store)
+    assert "No topic matches /camara" in found.err
+    assert "camera=" not in found.err
+
+
+def test_a_plan_promises_what_goes(store: Path) -> None:
+    words = ("--max-age", "0s", "--json")
+    plan = keep(*words, "--dry-run", store=store).json["plan"]
+    (step,) = plan["steps"]
+    done = keep(*words, store=store).json
+    # What is left of a message takes some room, and the segment of the mark stays.
+    assert 0.85 < done["freed_bytes"] / step["bytes"] <= 1
+    segments = sorted(journal.read(store / "recordings" / "run").sealed)  # type: ignore[union-attr]
+    assert step["segments"] == segments[:-1]
+
+
+def test_an_import_says_where_payloads_are(store: Path, recorded: Path, tmp_path: Path) -> None:
+    whole = Path(shutil.copytree(recorded, tmp_path / "whole"))
+    keep("--max-age", "0s", store=store)
+    assert answer("import", store, store=whole).out == "run is here already\n"
+    assert payloads(whole)[0] == image(0)
+    assert "deleted here to make room were not copied" in answer("import", whole, store=store).out
+    answer("import", store, store=tmp_path / "copy")
+    assert payloads(tmp_path / "copy") == payloads(store)
 
 
 def test_columns_count_with_their_segments(store: Path) -> None:
@@ -257,6 +285,8 @@ def test_what_is_pinned(store: Path, words: list[str], right: list[Any]) -> None
         ["--pin", "--pins", "-r", "run"],
         ["--pin", "-r", "run", "--dry-run"],
         ["--pin", "-r", "run", "--at", "yesterday"],
+        ["--pin", "-r", "run", "--at", "2020-01-01"],
+        ["--pin", "-r", "run", "--at", "+200s", "--before", "80s"],
         ["--pin", "-r", "run", "--when", "arm: x > 1000"],
         ["--pin", "-r", "run", "--when", "nothing: x > 1"],
         ["--pin", "-r", "other"],
@@ -279,6 +309,15 @@ def test_usage_that_is_refused(store: Path, words: list[str]) -> None:
 def files_of(path: Path) -> dict[str, bytes]:
     names = [p for p in (path / "recordings").rglob("*") if p.is_file() and p.name != "writer.lock"]
     return {str(p): p.read_bytes() for p in [*names, path / "hybridlog.toml"]}
+
+
+def test_a_pin_outside_of_its_recording_is_refused(store: Path) -> None:
+    with hl.open(store, mongo="none") as opened:
+        after = BEGIN + COUNT * SECOND
+        for begin, end in ((BEGIN - SECOND, BEGIN), (after, after + SECOND)):
+            with pytest.raises(TimeError, match="has no message then"):
+                opened.pin("run", begin, end)
+        opened.pin("run", BEGIN + (COUNT - 1) * SECOND, None)
 
 
 def test_the_options_are_those_of_the_table() -> None:

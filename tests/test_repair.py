@@ -122,6 +122,20 @@ def test_a_segment_whose_messages_are_damaged_stays_as_it_is(store: Path) -> Non
     assert (status, messages + lost) == ("damaged", COUNT)
 
 
+def test_damage_that_only_a_copy_mends_is_said(store: Path) -> None:
+    data = bytearray(file(store, 1).read_bytes())
+    data[1400] ^= 4
+    file(store, 1).write_bytes(data)
+    ((where, is_cured),) = repair(store).items()
+    assert where[0] == "one"
+    assert where[1].startswith("000001.mcap byte ")
+    assert not is_cured
+    with closing(hl.open(store, mongo=NOWHERE)) as opened:
+        (finding,) = opened.verify().findings
+        assert (finding.recording, finding.place) == where
+        assert finding.cure == "restore the file from a copy"
+
+
 def test_a_missing_segment_is_said_again_and_again(store: Path) -> None:
     file(store, 2).unlink()
     for _ in range(2):

@@ -183,7 +183,7 @@ def test_what_a_pin_touches_never_goes(
 
 def test_nothing_pinned_is_no_reason() -> None:
     (warning,) = made({"quota": "0kB"}, NEW, used=100 * MB).warnings
-    assert "nothing else may" in warning
+    assert "all that is left must stay" in warning
 
 
 def test_a_tag_keeps_a_recording_and_is_told_like_pins() -> None:

@@ -159,6 +159,8 @@ def fetch_command(**parameters: Any) -> None:
             query.completeness().check(payloads=not choices.count)
         if choices.count:
             count = query.count()
+            if choices.strict:
+                query.completeness().check()
             output.say(str(count))
         else:
             front = Front(

@@ -183,6 +183,8 @@ def _answer(
             strict=choices.strict,
         )
         found = answer(query)
+        if choices.strict:
+            query.completeness().check()
         labels = {recording.id: recording.label for recording in store.summaries()}
         if choices.count:
             output.say(str(len(found)))

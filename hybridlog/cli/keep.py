@@ -21,7 +21,7 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.keep import Kept
-    from hybridlog.maintenance.retention import Step
+    from hybridlog.maintenance.retention import Rules, Step
     from hybridlog.store import Store
 
 _MAX_PINS = 1000
@@ -150,7 +150,8 @@ def _pin(store: Store, choice: Choice, given: dict[str, Any]) -> list[str]:
             "with --before and --after."
         )
     if not spans:
-        raise UsageError("Nothing to pin: the predicate never held.")
+        why = "the predicate never held" if given["when"] else "no recording has messages then"
+        raise UsageError(f"Nothing to pin: {why}.")
     reason = given["reason"] or "; ".join(given["when"])
     return [store.pin(name, begin, end, topics, reason) for name, begin, end in spans]
 
@@ -159,6 +160,7 @@ def _spans(
     store: Store, choice: Choice, given: dict[str, Any]
 ) -> Iterator[tuple[str, int | None, int | None]]:
     """Id of a recording, begin and end of what is to be pinned of it; None for all."""
+    from hybridlog.maintenance.keep import may_hold
     from hybridlog.query.times import parse_duration, parse_time
     from hybridlog.query.topics import split_topic
     from hybridlog.record.losses import extent_of
@@ -168,7 +170,9 @@ def _spans(
         for entry in recordings_of(store, choice):
             start, end = extent_of(entry)
             at = parse_time(given["at"], start=start, end=end)
-            yield entry.id, at - parse_duration(before), at + parse_duration(after) + 1
+            span = at - parse_duration(before), at + parse_duration(after) + 1
+            if may_hold(entry, *span):
+                yield entry.id, *span
     elif not given["when"]:
         yield from ((one.id, None, None) for one in recordings_of(store, choice).summaries)
     for condition in given["when"]:
@@ -233,10 +237,18 @@ def _keep(
     elif not quiet:
         for line in _lines(found, dry_run=dry_run):
             output.say(line)
-    for problem in (*found.problems, *found.plan.warnings):
+    for problem in (*found.problems, *found.plan.warnings, *_useless(store, Rules.of(wanted))):
         output.note(problem)
     if found.problems or found.plan.is_short:
         raise click.exceptions.Exit(1)
+
+
+def _useless(store: Store, rules: Rules) -> Iterator[str]:
+    """Sentences about rules that fit no topic of the store."""
+    topics = store.topics() if rules.topics else []
+    for rule in rules.topics:
+        if not any(map(rule.fits, topics)):
+            yield f"No topic matches {rule.pattern}, so its rule deletes nothing."
 
 
 def _lines(found: Kept, *, dry_run: bool) -> Iterator[str]:

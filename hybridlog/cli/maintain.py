@@ -249,7 +249,9 @@ def import_command(
         for label in report.imported:
             output.say(f"imported {label}")
         for label in report.known:
-            output.say(f"{label} is here already")
+            lacks = label in report.lacking
+            more = "; payloads that were deleted here to make room were not copied" if lacks else ""
+            output.say(f"{label} is here already{more}")
     if report.refused:
         sys.stdout.flush()
         raise StoreError(" ".join(report.refused.values()))

@@ -68,6 +68,8 @@ def stats_command(
     with opened_store(store, mongo, quiet=quiet or as_json) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
         found = query.stats(*([] if fields is None else parse_fields(fields)))
+        if strict:
+            query.completeness().check()
         if as_json:
             from hybridlog.schema.plain import without_nan
 
@@ -127,7 +129,8 @@ def rate_command(
     started = time.monotonic()
     with opened_store(store, mongo, quiet=quiet) as opened:
         query = asked(opened, topic, choice, between=between, where=where, strict=strict)
-        answer_tables([query.rate(window)], lambda: None, to)
+        completeness = query.completeness if strict else None
+        answer_tables([query.rate(window)], lambda: None, to, completeness)
         sys.stdout.flush()
         if not quiet:
             print_cost(query.counters, time.monotonic() - started, count=True)

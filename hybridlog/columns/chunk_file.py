@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.journal import PayloadFile
 
-_RESTORE = "Restore it from a copy; `hybridlog verify` shows what is affected."
+RESTORE = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
 class Place(NamedTuple):
@@ -55,10 +55,10 @@ class ChunkFile(ColumnFile):
         try:
             super().__init__(path, depth=IN_PAYLOADS)
         except FileNotFoundError as error:
-            raise StoreError(f"The payload file {path} is missing. {_RESTORE}") from error
+            raise StoreError(f"The payload file {path} is missing.{RESTORE}") from error
         if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
             raise StoreError(
-                f"The payload file {path} is not the one that the journal lists. {_RESTORE}"
+                f"The payload file {path} is not the one that the journal lists.{RESTORE}"
             )
         try:
             self._take(self.about.payloads)

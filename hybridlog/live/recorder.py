@@ -506,7 +506,7 @@ class Recorder:
                 if not stored:
                     self._lose_for_room(recorded, begin)
             except HybridlogError as error:
-                self._lose(recorded, Cause.QUEUE, str(error), begin)
+                self._lose(recorded, _cause_of(error), str(error), begin)
 
     def fire(self, reason: str) -> None:
         """Start a snapshot.
@@ -592,7 +592,7 @@ class Recorder:
             else:
                 self._lose_for_room(recorded, received)
         except HybridlogError as error:
-            cause = Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
+            cause = _cause_of(error)
             self._refuse(cause, str(error))
             self._lose(recorded, cause, str(error), received)
 
@@ -870,6 +870,11 @@ class Recorder:
         while self._clock_marks and self._recorded_by_content and not self._over.is_set():
             text, tags, at = self._clock_marks.pop(0)
             self.mark(text, tags, begin=at)
+
+
+def _cause_of(error: HybridlogError) -> Cause:
+    """The cause of the loss of a message that could not be written."""
+    return Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
 
 
 def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> None:

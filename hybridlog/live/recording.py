@@ -157,6 +157,8 @@ class LiveRecording:
         self._ids: dict[Channel, int] = {}
         self._channels: list[Channel] = []
         self._taken: list[int] = []  # messages, by index of the channel
+        self._first: list[int] = []  # log time of the first one
+        self._last: list[int] = []  # log time of the last one
         self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
         self._worth_waking = min(_WAKE_BYTES, options.budget_bytes // 4)
@@ -304,8 +306,11 @@ class LiveRecording:
                 index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
                 self._taken.append(0)
+                self._first.append(now)
+                self._last.append(now)
             message = _Message(index, now, sent, sequence, payload)
             self._taken[index] += 1
+            self._last[index] = now
             self._taken_bytes += size
             if not at_once:
                 self._inbox.append(message)
@@ -434,17 +439,22 @@ class LiveRecording:
 
     def _cut_off(self) -> list[dict[str, Any]]:
         """Rows of the ledger, with the messages that were taken but not written."""
-        now = time.time_ns()
-        for channel, taken in zip(self._channels, self._taken, strict=True):
-            count = taken - self._capture.writer.written_of(channel)
+        writer = self._capture.writer
+        for index, channel in enumerate(self._channels):
+            count = self._taken[index] - writer.written_of(channel)
             if count:
                 self.cut_off[channel.topic] += count
+                written = writer.last_time_of(channel)
+                # The clock may have been set back since.
+                first, last = sorted(
+                    (self._first[index] if written is None else written, self._last[index])
+                )
                 self.ledger.note(
                     channel.topic,
                     Cause.DISK,
                     count,
-                    first=min(self._capture.writer.last_log_time, now),
-                    last=now,
+                    first=first,
+                    last=last,
                     detail="the disk was full",
                 )
         return self.ledger.take(everything=True)

@@ -38,12 +38,14 @@ class ImportReport:
     Attributes:
         imported: Labels in this store of the copied recordings.
         known: Labels of recordings that were here already.
+        lacking: Those of them whose payloads were deleted here, and are there.
         refused: Why recordings that have not ended were not copied, by their labels there.
         bytes_copied: Bytes copied now, without those copied by an interrupted import.
     """
 
     imported: list[str] = field(default_factory=list)
     known: list[str] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
     bytes_copied: int = 0
 
@@ -77,6 +79,8 @@ def run(
     for entry in entries:
         if entry.id in present:
             report.known.append(present[entry.id])
+            if _lacks(target.recording(present[entry.id]), source.recording(entry.label)):
+                report.lacking.append(present[entry.id])
             continue
         if entry.status == "open":
             report.refused[entry.label] = (
@@ -122,6 +126,18 @@ def _present(directory: StoreDirectory, known: Mapping[str, str]) -> dict[str, s
         with suppress(StoreError):
             found[ids.get(label) or directory.id_of(label)] = label
     return found
+
+
+def _lacks(here: Path, there: Path) -> bool:
+    """True if payloads of a recording that are there were deleted here to make room."""
+    with suppress(StoreError):
+        ours, theirs = journal.read(here), journal.read(there)
+        if ours is not None and theirs is not None:
+            return any(
+                not topics <= theirs.expired.get(number, frozenset())
+                for number, topics in ours.expired.items()
+            )
+    return False
 
 
 @contextmanager

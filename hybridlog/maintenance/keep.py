@@ -24,13 +24,21 @@ from hybridlog.maintenance.retention import (
     plan,
 )
 from hybridlog.maintenance.sizes import disk_bytes
+from hybridlog.record.losses import extent_of
 from hybridlog_storage import journal
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_settled
-from hybridlog_storage.errors import DiskFullError, HeldError, StoreError, TopicError
+from hybridlog_storage.errors import (
+    DiskFullError,
+    HeldError,
+    SegmentError,
+    StoreError,
+    TopicError,
+)
 from hybridlog_storage.journal import Journal
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import Event, JournalState
 
@@ -171,7 +179,10 @@ class Keeper:
                 return
             numbers = (_WHOLE,) if is_held else step.segments or (_WHOLE,)
             self._failed.update((step.id, number) for number in numbers)
-            found.problems.append(str(error))
+            cure = ""
+            if isinstance(error, SegmentError):
+                cure = ". Its payloads stay until the file is restored from a copy"
+            found.problems.append(f"{error}{cure}")
 
     @contextmanager
     def _locked(self, step: Step) -> Iterator[str]:
@@ -195,6 +206,13 @@ class Keeper:
         said = {} if topics is None else {"topics": [*topics]}
         log.append(journal.event(journal.RETAINED, segments=[*step.segments], **said))
         return done.freed
+
+
+def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
+    """Whether a recording may have messages from a time to another; a running one, later ones."""
+    start, stop = extent_of(entry)
+    is_over = entry.status not in {"open", "unfinished"}
+    return (end is None or end > start) and not (is_over and begin is not None and begin >= stop)
 
 
 def append_pins(

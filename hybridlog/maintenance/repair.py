@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -12,12 +12,14 @@ from hybridlog.entries import journal_from_segments, take_inventory, unlisted_li
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, rebuild
 from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
+from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import LOCK_WAIT_S
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, PAYLOADS
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.recovery import rebuild_summary
+from hybridlog_storage.segments.segment_check import SegmentCheck
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -102,7 +104,20 @@ def _repair_one(directory: StoreDirectory, label: str) -> list[Repaired]:
         what = f"{misfit.reason}; restore it from a copy, if there is one"
         place = misfit.file or f"segment {misfit.segment}"
         done.append(Repaired(label, place, what, is_cured=False))
-    return done
+    return [*done, *_damage(directory.recording(label), inventory)]
+
+
+def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
+    """Read every byte of segments and columns; damage in them can only be restored."""
+    for file, problem in damaged_files(path, inventory):
+        what = f"{problem}; {RESTORE}"
+        yield Repaired(inventory.label, f"{PAYLOADS}/{file}", what, is_cured=False)
+    for number in inventory.summaries:
+        name = inventory.listing.sealed[number]
+        with SegmentCheck(path / name) as check:
+            for offset, problem in check.problems():
+                what = f"{problem}; {RESTORE}"
+                yield Repaired(inventory.label, f"{name} byte {offset}", what, is_cured=False)
 
 
 def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:

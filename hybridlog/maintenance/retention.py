@@ -13,6 +13,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from hybridlog.maintenance.expiry import MIN_BYTES
 from hybridlog.query.choice import Choice
 from hybridlog.query.times import parse_duration
 from hybridlog.query.topics import matcher
@@ -161,8 +162,9 @@ class HeldSegment:
         number: Its number.
         written: When it was written, or the time of its last message if that is later, ns.
         size: Bytes of its file.
-        topics: Payload bytes of each topic that has not expired.
+        topics: Payload bytes of each topic that may go: that of small messages stay.
         pinned: Topics of which a pin keeps messages.
+        small: Payload bytes of topics of small messages.
     """
 
     number: int
@@ -170,10 +172,11 @@ class HeldSegment:
     size: int
     topics: Mapping[str, int]
     pinned: frozenset[str] = frozenset()
+    small: int = 0
 
     def share(self, topics: AbstractSet[str]) -> int:
         """About the bytes of the file that payloads of some topics take."""
-        whole = sum(self.topics.values())
+        whole = sum(self.topics.values()) + self.small
         part = sum(self.topics[topic] for topic in topics)
         return round(self.size * part / whole) if whole else self.size
 
@@ -222,7 +225,8 @@ def held_of(label: str, state: JournalState, now: int) -> Held:
         last = max(last, written)
         expired = state.retained.get(number, frozenset())
         if channels and expired is not None:
-            found.append(_segment(sealed, later, state, expired, columns))
+            segment = _segment(sealed, later, state, expired, columns)
+            found += [segment] if segment.topics or not segment.small else []
     found.reverse()
     tags, created = state.tags, int(state.begun.get("created", 0))
     return Held(state.id, label, created, last, tags, found, state.end is not None, len(state.pins))
@@ -249,13 +253,19 @@ def _segment(
     columns: Mapping[str, float],
 ) -> HeldSegment:
     topics: Counter[str] = Counter()
+    messages: Counter[str] = Counter()
     for channel in sealed.channels:
         if channel["messages"] and channel["topic"] not in expired:
             topics[channel["topic"]] += channel["payload_bytes"]
+            messages[channel["topic"]] += channel["messages"]
+    # Chunks with few stored bytes a message stay. How well each is compressed, nobody knows yet.
+    packed = min(sealed.bytes / max(sum(c["payload_bytes"] for c in sealed.channels), 1), 1)
+    small = [t for t, count in topics.items() if count * packed < MIN_BYTES * messages[t]]
+    stays = sum(topics.pop(topic) for topic in small)
     _, held = state.thinned.get(sealed.segment, [("", sealed.bytes)])[-1]
     held += round(sum(columns.get(topic, 0) * count for topic, count in topics.items()))
     pinned = frozenset(pinned_topics(sealed, state))
-    return HeldSegment(sealed.segment, written, held, topics, pinned)
+    return HeldSegment(sealed.segment, written, held, topics, pinned, stays)
 
 
 def pinned_topics(sealed: SealedSegment, state: JournalState) -> set[str]:
@@ -464,7 +474,8 @@ class _Planning:
             if topics:
                 gone |= topics
                 share = segment.share(topics)
-                names = () if topics == segment.topics.keys() else tuple(sorted(topics))
+                is_whole = topics == segment.topics.keys() and not segment.small
+                names = () if is_whole else tuple(sorted(topics))
                 by_topics.setdefault(names, []).append((piece, share))
                 need -= share
         for names, chosen in by_topics.items():
@@ -510,7 +521,7 @@ class _Planning:
         plan_.is_short = left > 0
         if left > 0:
             plan_.warnings.append(
-                f"{size(left)} more should go, and nothing else may: what is left is pinned, "
-                "being recorded, small messages, or fields, tables and the index. Whole "
-                "recordings go with --fields-age or `hybridlog rm`."
+                f"{size(left)} more should be deleted, but all that is left must stay: it is "
+                "pinned, being recorded, small messages, or fields, tables and the index. "
+                "--fields-age and `hybridlog rm` delete whole recordings."
             )

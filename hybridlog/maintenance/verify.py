@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from hybridlog.columns import chunk_file
 from hybridlog.columns.payload_files import RecordingPayloads, walk
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
@@ -21,6 +22,8 @@ from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_check import SegmentCheck
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -32,8 +35,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import ChunkPlace
 
 _REPAIR = "run `hybridlog repair`"
-_RESTORE = "restore the file from a copy; `hybridlog losses` lists the lost messages"
-_RESTORE_COLUMNS = "restore the file from a copy"
+RESTORE = "restore the file from a copy"
+_RESTORE_LOST = f"{RESTORE}; `hybridlog losses` lists the lost messages"
 _NOTING_S = 2.0  # that a recorder may take to note a segment that it has sealed
 _KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})
 
@@ -115,6 +118,16 @@ def verify(
             cure = "restore its files, or remove its directory"
             result.findings.append(Finding(label, "recording", str(error), cure))
     return result
+
+
+def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[str, str]]:
+    """Read every byte of the columns of payloads; yield damaged files and their problems."""
+    payloads = RecordingPayloads(path, list(inventory.payloads.values()))
+    for file in inventory.payloads.values():
+        try:
+            payloads.reader(file).check()
+        except StoreError as error:
+            yield file.file, str(error).removesuffix(chunk_file.RESTORE)
 
 
 class _Index:
@@ -268,7 +281,7 @@ class _Check:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
             can_mend = misfit.is_unlisted or misfit.belongs is not None
-            self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE)
+            self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE_LOST)
         for name in inventory.listing.open.values():
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
@@ -281,13 +294,11 @@ class _Check:
         listed = inventory.payloads
         if not listed and PAYLOADS not in inventory.listing.others:
             return
-        payloads = RecordingPayloads(self._path, list(listed.values()))
-        for file in listed.values():
-            try:
-                payloads.reader(file).check()
-                self._result.bytes_read += file.bytes
-            except StoreError as error:
-                self.found(f"{PAYLOADS}/{file.file}", str(error), _RESTORE_COLUMNS)
+        for file, problem in damaged_files(self._path, inventory):
+            # A chunk whose content lies there cannot be read, either.
+            self._is_damaged = True
+            self.found(f"{PAYLOADS}/{file}", problem, RESTORE)
+        self._result.bytes_read += sum(file.bytes for file in listed.values())
         for name in inventory.listing.payloads:
             if name not in listed:
                 cure = "move it out of the store"
@@ -306,7 +317,7 @@ class _Check:
             with SegmentCheck(self._path / name) as check:
                 for offset, problem in check.problems(tell):
                     self._is_damaged = True
-                    cure = _RESTORE if check.summary is not None else _REPAIR
+                    cure = RESTORE if check.summary is not None else _REPAIR
                     self.found(f"{name} byte {offset}", problem, cure)
             if summary is None:
                 return
@@ -316,7 +327,7 @@ class _Check:
                 self._result.bytes_read += segment.reader.bytes_read
         except SegmentError as error:
             self._is_damaged = True
-            self.found(name, str(error), _RESTORE)
+            self.found(name, str(error), RESTORE)
 
     def _chunk(
         self,
@@ -327,7 +338,7 @@ class _Check:
     ) -> None:
         if isinstance(chunk, SegmentError):
             if not self._is_damaged:
-                self.found(f"{name} byte {place.offset}", str(chunk), _RESTORE)
+                self.found(f"{name} byte {place.offset}", str(chunk), RESTORE)
             return
         self._result.chunks += 1
         self._result.messages += len(chunk.batch)

@@ -27,7 +27,7 @@ class Matches(NamedTuple):
 
     Attributes:
         holds: bool[n], True where the predicate holds.
-        unreadable: Number of messages of which the predicate could not be asked, because they
+        unreadable: Number of messages that the predicate could not test, because they
             do not fit their definition, or lack arrays.
         expired: Number of those that lack arrays, since their payloads were deleted.
     """

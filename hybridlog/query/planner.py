@@ -410,7 +410,7 @@ class Planner:
             self.counters.unreadable += self.index.count(group, own)
 
     def _count_unreadable(self, parts: Sequence[Part]) -> None:
-        """Count, once, the messages of which the predicate cannot be asked for want of fields.
+        """Count, once, the messages that the predicate cannot test for want of fields.
 
         Engines count the messages that they find to be unreadable.
         """

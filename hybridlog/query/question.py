@@ -149,7 +149,7 @@ class Part:
         clock: The clock of `bounds`.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
         predicate: Condition on the fields; None for no condition.
-        undecodable: Further channels of the topic, of whose messages the predicate cannot be asked
+        undecodable: Further channels of the topic, whose messages the predicate cannot test
             because they have no fields.
     """
 

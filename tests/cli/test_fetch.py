@@ -458,12 +458,12 @@ def test_pandas_is_not_loaded(form: str, store: Path, tmp_path: Path) -> None:
 
 def test_remarks_follow_the_closing_line(store: Path) -> None:
     done = run("fetch", "-t", "/long", "--where", "data > 0", "--count", store=store)
-    assert "messages could not be asked: they do not fit their definition" in done.err
+    assert "messages could not be tested: they do not fit their definition" in done.err
     silent = run("fetch", "-t", "/long", "--where", "data > 0", "--count", "-q", store=store)
     assert (silent.out, silent.err) == (done.out, "")
     events = ("--where", "/long: data > 9", "--before", "1s")
     done = run("fetch", "-t", "/json", *events, "--count", store=store)
-    assert "messages could not be asked" in done.err
+    assert "messages could not be tested" in done.err
     assert "No time is asked for: there are no events" in done.err
     done = run("fetch", "-t", "odom", "-r", "odd", "--count", store=store, code=2)
     assert "there is no topic 'odom'" in done.err
@@ -476,4 +476,4 @@ def test_what_summaries_leave_out_is_said(store: Path) -> None:
     assert left_out in run("resample", "-t", "/long", "--step", "1s", store=store).err
     asked = run("resample", "-t", "/long", "--step", "1s", "--where", "data > 9", store=store)
     assert left_out not in asked.err
-    assert "messages could not be asked" in asked.err
+    assert "messages could not be tested" in asked.err

@@ -166,7 +166,7 @@ def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:
         while not said and time.monotonic() < until:
             time.sleep(0.05)
         recorder.stop()
-    assert "nothing else may" in said[0]
+    assert "all that is left must stay" in said[0]
     with hl.open(tmp_path / "store", mongo="none") as store:
         assert store.topic("/camera").count() == 1
 

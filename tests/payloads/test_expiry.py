@@ -21,6 +21,7 @@ from hybridlog.maintenance.opening import put_entry
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
+from tests.cli.within import answer
 from tests.format_reader import FormatReader
 from tests.payloads.logs import COUNT
 
@@ -235,7 +236,14 @@ def test_strict_answers_need_payloads(copy: Path) -> None:
         with pytest.raises(IncompleteError, match=f"{done.messages['/scan']} messages"):
             query.completeness().check(payloads=True)
         query.completeness().check()
+        asked = query.where("ranges[3] > 0")
+        asked.count()
+        with pytest.raises(IncompleteError, match=f"{done.messages['/scan']} messages could not"):
+            asked.completeness().check()
         query.between("-0.1s", "end").completeness().check(payloads=True)
+    words = ("--count", "--strict", "--mongo", "none", "--where")
+    answer("fetch", "-t", "/scan", *words, "ranges.min > 0", store=copy)
+    answer("fetch", "-t", "/scan", *words, "ranges[3] > 0", store=copy, code=11)
 
 
 def test_a_store_says_that_payloads_expire(copy: Path) -> None:

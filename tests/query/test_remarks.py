@@ -72,8 +72,8 @@ def test_an_answer_that_lacks_nothing_has_no_remarks(store: hl.Store) -> None:
 @pytest.mark.parametrize(
     ("topic", "predicate", "words"),
     [
-        ("/n", "n > 1", "1 message could not be asked: it does not fit its definition, or has"),
-        ("/opaque", "n > 1", "6 messages could not be asked: they do not fit their definition"),
+        ("/n", "n > 1", "1 message could not be tested: it does not fit its definition, or has"),
+        ("/opaque", "n > 1", "6 messages could not be tested: they do not fit their definition"),
         ("/j", "speed > 1", "No message of /j has a field 'speed'."),
         ("/j", "list.dep == 1", "No message of /j has a field 'list.dep'; did you mean list.deep?"),
     ],
@@ -97,7 +97,7 @@ def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
     absent = store.topic("/n", "/near").where("n missing")
     assert absent.count() == 6
     assert absent.remarks() == [
-        "1 message could not be asked: it does not fit its definition, or has none."
+        "1 message could not be tested: it does not fit its definition, or has none."
     ]
 
 

@@ -89,7 +89,7 @@ def check_expired(store: hl.Store, known: Known) -> None:
     gone = sum(message.is_reduced for message in store.topic("arm"))
     for query, told in (
         (store.topic("arm"), "no long arrays: their payloads were deleted to make room; "),
-        (store.topic("arm").where("ranges[3:7].min >= 4"), "could not be asked: their"),
+        (store.topic("arm").where("ranges[3:7].min >= 4"), "could not be tested: their"),
     ):
         query.to_arrow()
         assert any(told in one for one in query.completeness().sentences) == bool(gone)

@@ -41,6 +41,8 @@ class Completeness:
             lost; None for an unknown number.
         unindexed: Messages that the index lacks, where MongoDB must answer.
         untransformed: Messages whose points or poses are not in the frame asked for.
+        untested: Messages that lack what the predicate asks for, since their payloads were
+            deleted; known after the answer.
         late: Sentences about messages that are not written or not indexed yet.
         sentences: Everything that the answer lacks, in sentences, those of `late` included.
     """
@@ -52,6 +54,7 @@ class Completeness:
     unwritten: int | None = 0
     unindexed: int = 0
     untransformed: int = 0
+    untested: int = 0
     late: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
 
@@ -92,7 +95,7 @@ class Completeness:
     def check(self, *, payloads: bool = False) -> None:
         """Check that no message of the range is lost, or not written or indexed yet.
 
-        Nor may any lack a transform to the frame asked for.
+        Nor may any lack a transform to the frame asked for, or arrays that the predicate needs.
 
         Args:
             payloads: True to check that no payload is missing, too.
@@ -111,6 +114,11 @@ class Completeness:
             raise IncompleteError(
                 f"{counted(self.untransformed, 'message')} without a transform. Without --strict "
                 "the rest is given."
+            )
+        if self.untested:
+            raise IncompleteError(
+                f"{counted(self.untested, 'message')} could not be tested: arrays were deleted "
+                "to make room. Without --strict the rest is given."
             )
         if payloads and self.reduced:
             raise IncompleteError(
@@ -140,7 +148,7 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     if counters.without_arrays:
         its = "its payload was" if counters.without_arrays == 1 else "their payloads were"
         yield (
-            f"{counted(counters.without_arrays, 'message')} could not be asked: {its} deleted to "
+            f"{counted(counters.without_arrays, 'message')} could not be tested: {its} deleted to "
             "make room; of long arrays only summaries are left."
         )
     gone = {
@@ -176,7 +184,7 @@ def _unreadable(messages: int, question: Question) -> str:
         why = "it does not fit its definition, or has none"
     else:
         why = "they do not fit their definition, or have none"
-    return f"{counted(messages, 'message')} could not be asked: {why}."
+    return f"{counted(messages, 'message')} could not be tested: {why}."
 
 
 def about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -174,7 +174,7 @@ def _checked(question: Question) -> Question:
     word = str(stop).strip().lower()
     for is_asked, problem in (
         (question.reverse, "has no last message to begin with"),
-        (question.during is not None, "cannot be asked for intervals, which are of one moment"),
+        (question.during is not None, "has no intervals to follow: they are those of one moment"),
         (question.predicate and question.predicate.needs_index, "is not in MongoDB yet"),
         (word.startswith("-"), f"has no end to count {stop} from"),
     ):

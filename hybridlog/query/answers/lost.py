@@ -89,6 +89,7 @@ def completeness_of(
         unwritten=unwritten,
         unindexed=unindexed,
         untransformed=sum(n for _, cost in asked if cost for _, n in cost.no_transform),
+        untested=sum(cost.without_arrays for _, cost in asked if cost),
         late=tuple(dict.fromkeys(late)),
         sentences=tuple(dict.fromkeys(sentences)),
     )

@@ -180,7 +180,7 @@ class _Checker:
         types = self._types
         path = asked.names
         if asked.parts[0] == "_id":
-            raise self._fail(asked, "_id cannot be asked for; use _meta.t, _meta.rec and _meta.seq")
+            raise self._fail(asked, "_id is no field; use _meta.t, _meta.rec and _meta.seq")
         if asked.parts[0] != "_meta" and not types.known:
             return "other"
         if path in types.types:

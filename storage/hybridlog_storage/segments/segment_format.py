@@ -325,6 +325,11 @@ def entries_of(index: bytes) -> int:
     return (len(index) - INDEX_HEAD.size) // _INDEX_ENTRY.itemsize
 
 
+def last_time_of(index: bytes) -> int:
+    """Log time of the last message in a message index record, ns."""
+    return int(np.frombuffer(index, _INDEX_ENTRY, offset=len(index) - _INDEX_ENTRY.itemsize)[0][0])
+
+
 def definitions_chunk(content: bytes) -> bytes:
     """A chunk record with definitions alone: compressed they have a fifth of the bytes."""
     packed = checked_frame(content)

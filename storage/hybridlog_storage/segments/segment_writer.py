@@ -30,7 +30,7 @@ from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.segment_file import OnSealing, SegmentFile
-from hybridlog_storage.segments.segment_format import entries_of
+from hybridlog_storage.segments.segment_format import entries_of, last_time_of
 from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
@@ -156,8 +156,7 @@ class RecordingWriter:
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
         """Number of messages in the files, by channel id."""
-        self.last_log_time = 0
-        """Greatest log time in the files, ns; 0 without messages."""
+        self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory
         self._recording = recording
         self._on_chunk = on_chunk
@@ -339,6 +338,11 @@ class RecordingWriter:
         """Number of messages of a channel in the files."""
         known = self._known.get(channel)
         return 0 if known is None else self.written[known.channel_id]
+
+    def last_time_of(self, channel: Channel) -> int | None:
+        """Log time of the last message of a channel in the files, ns; None without any."""
+        known = self._known.get(channel)
+        return None if known is None else self._last_times.get(known.channel_id)
 
     def abort(self) -> None:
         """Stop at once; sealed segments and flushed chunks stay."""
@@ -546,7 +550,7 @@ class RecordingWriter:
         self.totals.chunks += 1
         for channel_id, data in chunk.indexes.items():
             self.written[channel_id] += entries_of(data)
-        self.last_log_time = max(self.last_log_time, chunk.last)
+            self._last_times[channel_id] = last_time_of(data)
         self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
         self._stored_bytes += chunk.uncompressed_size

@@ -1,0 +1,307 @@
+"""Half an hour of a robot that is left alone; then every message is accounted for.
+
+It is recorded within a quota, with pins, marks, a contract and a trigger. It is killed twice, its
+clock is set, and its disk is full. The robot writes down what it sends before it sends it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import struct
+import subprocess
+import sys
+import time
+from collections import Counter, defaultdict
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.contract.contract import Contract, TopicRules
+from hybridlog.live.recorder import Recorder, RecorderOptions
+from hybridlog.live.snapshots import SnapshotOptions, Trigger
+from hybridlog.maintenance.retention import MIN_SEGMENT
+from hybridlog.maintenance.sizes import disk_bytes
+from hybridlog.record.marks import MARKS
+from hybridlog_storage.errors import DiskFullError, PayloadError
+from hybridlog_storage.messages import Channel, Schema
+from tests.live.speaker import Speaker
+from tests.live.test_killed import FLUSH_S, SLACK_S
+from tests.live.test_machine_clock import BOOT, NOW, Clock
+from tests.live.test_retention import NOISE, store_with
+from tests.test_faults import wait_for
+
+SECOND = 10**9
+BLOB = Schema("a/Blob", "ros1msg", b"uint32 n\nfloat64 x\nbool pressed\nuint8[] data\n")
+SIZES = {"/camera": 50_000, "/points": 20_000, "/arm": 0, "/bumper": 0}
+EVERY = {"/camera": 100, "/points": 500, "/arm": 50, "/bumper": 10_000}
+"""Milliseconds between two messages."""
+CHANNELS = {topic: Channel(topic, "ros1", BLOB, {}, has_publish_time=False) for topic in SIZES}
+PARTS = ("first", "clock", "full", "box")
+"""What is recorded, one after the other: killed, killed after its clock was set, ended by a full
+disk, and around a trigger alone."""
+
+
+def payload(topic: str, number: int, *, pressed: bool = False) -> bytes:
+    size = SIZES[topic]
+    first = number * 7919 % (len(NOISE) - size)
+    return struct.pack("<Id?I", number, number / 2, pressed, size) + NOISE[first : first + size]
+
+
+class Robot:
+    """Sends messages to a recorder, and writes down each of them before.
+
+    Args:
+        path: The store.
+        log: File of what was sent: part, topic, number, log time, and time of the machine.
+        part: What is recorded.
+        seconds: How long, in time of the robot.
+        speed: So much faster the robot's clock runs than that of the machine.
+    """
+
+    def __init__(self, path: Path, log: Path, part: str, seconds: float, speed: float) -> None:
+        self.path, self.part, self.seconds, self.speed = path, part, seconds, speed
+        self.log = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        self.store = hl.open(path, mongo="none")
+        self.speaker = Speaker()
+        begin = NOW + PARTS.index(part) * 86_400 * SECOND
+        self.clock = Clock(BOOT if part == "clock" else begin)
+        self.is_set_to = begin
+        self.is_full = False
+        snapshots = contract = None
+        if part == "box":
+            trigger = Trigger.of("/bumper: pressed = true")
+            snapshots = SnapshotOptions(20, seconds / 40, seconds / 40, (trigger,))
+        else:
+            contract = Contract({"/points": TopicRules(longest_gap=round(seconds / 20 * SECOND))})
+        options = RecorderOptions(
+            part, reserve_bytes=0, flush_interval_s=FLUSH_S, contract=contract, snapshots=snapshots
+        )
+        self.recorder = Recorder(self.store, [self.speaker], options, self.say, self.clock)
+
+    def say(self, text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    def note(self, *words: object) -> None:
+        os.write(self.log, (" ".join(map(str, (self.part, *words))) + "\n").encode())
+
+    def send(self, topic: str, number: int, *, pressed: bool = False) -> None:
+        self.note(topic, number, self.clock.time, time.time_ns())
+        message = payload(topic, number, pressed=pressed)
+        self.speaker.say(CHANNELS[topic], message, self.clock.time)
+
+    def pin(self) -> None:
+        """Pin the images of the last seconds."""
+        span = self.clock.time - round(self.seconds / 20 * SECOND), self.clock.time
+        with hl.open(self.path, mongo="none") as other:
+            other.pin(self.recorder.name, *span, ["/camera"])
+        self.note("pin", *span)
+
+    def write(self, do: Any, fd: int, parts: list[memoryview], *where: int) -> int:
+        """Write as a disk does that has some blocks left."""
+        if self.is_full and sum(map(len, parts)) > 4096:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return int(do(fd, parts, *where))
+
+    def run(self) -> None:
+        """Go through the part; a part that is to be killed goes on until then."""
+        writev, pwritev = os.writev, os.pwritev
+        os.writev = lambda *words: self.write(writev, *words)  # type: ignore[assignment]
+        os.pwritev = lambda *words: self.write(pwritev, *words)  # type: ignore[assignment]
+        self.recorder.start()
+        events: list[tuple[float, Any]] = [
+            (0.3, self.pin),
+            (0.4, lambda: self.recorder.mark("slipped", {})),
+            (0.5, lambda: self.send("/bumper", 10**6, pressed=True)),
+            (1.0, lambda: print("done", flush=True)),
+        ]
+        if self.part == "box":
+            del events[:2]
+        if self.part == "clock":
+            events.insert(0, (0.1, self.set_clock))
+        if self.part == "full":
+            events.insert(-1, (0.9, lambda: setattr(self, "is_full", True)))
+        begun, looked, most, step = time.monotonic(), 0.0, 0, 0
+        while events or self.part in PARTS[:2]:
+            now = time.monotonic()
+            passed = step / 1000
+            if passed > (now - begun) * self.speed:
+                time.sleep(0.001)
+                continue
+            if events and passed >= events[0][0] * self.seconds:
+                events.pop(0)[1]()
+            for topic, every in EVERY.items():
+                is_silent = topic == "/points" and 0.6 < passed / self.seconds < 0.8
+                if step % every == 0 and not is_silent:
+                    self.send(topic, step // every)
+            step += 10
+            self.clock.run(10**7)
+            if now - looked > 0.1:
+                looked = now
+                self.recorder.look()
+                if (used := disk_bytes(self.path)) > most:
+                    most = used
+                    self.note("used", most)
+        if self.part == "full":
+            wait_for(self.has_ended)
+            for number in range(5):
+                self.send("/arm", 10**6 + number)
+        with suppress(DiskFullError):  # for what can be made again, such as the catalog
+            self.recorder.stop()
+        self.store.close()
+
+    def has_ended(self) -> bool:
+        self.recorder.look()
+        return self.recorder.wait(0.1)
+
+    def set_clock(self) -> None:
+        self.clock.time = self.is_set_to
+
+
+def drive(*words: str) -> None:
+    path, log, part, seconds, speed = words
+    Robot(Path(path), Path(log), part, float(seconds), float(speed)).run()
+
+
+@dataclass
+class Sent:
+    """What the robot has written down of a part.
+
+    Attributes:
+        messages: Log time and time of the machine, by topic and number.
+        pins: Begin and end of pins.
+        used: The most that the store took.
+    """
+
+    messages: dict[tuple[str, int], tuple[int, int]] = field(default_factory=dict)
+    pins: list[tuple[int, int]] = field(default_factory=list)
+    used: int = 0
+
+
+def sent_of(log: Path) -> dict[str, Sent]:
+    found: dict[str, Sent] = defaultdict(Sent)
+    for line in log.read_text().splitlines():
+        part, what, *rest = line.split()
+        numbers = [*map(int, rest)]
+        if what == "pin":
+            found[part].pins.append((numbers[0], numbers[1]))
+        elif what == "used":
+            found[part].used = numbers[0]
+        else:
+            found[part].messages[what, numbers[0]] = numbers[1], numbers[2]
+    return found
+
+
+def stored_of(store: hl.Store, label: str) -> dict[tuple[str, int], tuple[int, bytes | None]]:
+    """Log time and payload of each message, None when it has expired; by topic and number."""
+    found: dict[tuple[str, int], tuple[int, bytes | None]] = {}
+    for topic in SIZES:
+        query = store.query([topic], [label])
+        before = len(found)
+        for message in query:
+            key = topic, message.fields["n"]
+            assert key not in found
+            assert message.fields["x"] == (key[1] / 2)
+            try:
+                found[key] = message.log_time_ns, message.raw
+            except PayloadError:
+                found[key] = message.log_time_ns, None
+        assert query.count() == len(found) - before
+        assert query.where("x >= 0").count() == query.count()
+    return found
+
+
+def account(path: Path, sent: dict[str, Sent], killed: dict[str, int], seconds: float) -> int:
+    """Compare what is stored with what was sent; returns how many payloads have expired."""
+    expired = 0
+    with hl.open(path, mongo="none") as store:
+        for part in PARTS:
+            messages = sent[part].messages
+            (entry,) = store.recordings(part)
+            stored = stored_of(store, part)
+            for (topic, number), (at, raw) in stored.items():
+                assert at == messages[topic, number][0]
+                right = payload(topic, number, pressed=(topic, number) == ("/bumper", 10**6))
+                assert raw in {None, right}
+                assert raw is not None or part != "box"
+                expired += raw is None
+            for begin, end in sent[part].pins:
+                pinned = [k for k, (at, _) in messages.items() if begin <= at < end]
+                pinned = [key for key in pinned if key[0] == "/camera"]
+                assert pinned
+                assert all(stored[key][1] is not None for key in pinned)
+            missing = {key: messages[key] for key in messages.keys() - stored.keys()}
+            assert missing
+            if part in killed:
+                assert entry.status == "recovered"
+                assert all(
+                    killed[part] - at < (FLUSH_S + SLACK_S) * 1e9 for _, at in missing.values()
+                )
+            elif part == "box":
+                (fired,) = [at for (_, n), (at, _) in messages.items() if n == 10**6]
+                around = seconds / 40 * SECOND
+                assert all(not -around <= at - fired < around for at, _ in missing.values())
+            else:
+                rows = entry.end["losses"]
+                for topic in SIZES:
+                    gone = [at for (t, _), (at, _) in missing.items() if t == topic]
+                    ours = [row for row in rows if row["topic"] == topic]
+                    assert sum(row["count"] for row in ours) == len(gone)
+                    assert {row["cause"] for row in ours} <= {"disk"}
+                    assert all(any(r["from"] <= at <= r["to"] for r in ours) for at in gone)
+        marks = [m.fields for m in store.topic(MARKS)]
+        causes = Counter(mark["tags"].get("cause", mark["text"]) for mark in marks)
+        rows = store.recordings("full")[0].end["losses"]
+        lost = sum(row["count"] for row in rows if row["topic"] == MARKS)
+        assert causes["slipped"] + causes["contract"] + lost == 6
+        assert causes["slipped"] >= 2
+        assert causes["contract"] >= 2
+        assert causes["clock"] >= 1
+        assert store.verify().findings == []
+    return expired
+
+
+@pytest.mark.parametrize(
+    ("seconds", "speed", "quota"),
+    [
+        (12, 15, 18_000_000),
+        pytest.param(450, 12, 100_000_000, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_every_message_of_a_robot_is_accounted_for(
+    tmp_path: Path, seconds: float, speed: float, quota: int
+) -> None:
+    path, log = tmp_path / "store", tmp_path / "sent"
+    rules: dict[str, Any] = {"topic": {"/points": "1000d"}, "never-tag": ["trigger"]}
+    store_with(path, quota=str(quota), **rules).close()
+    killed: dict[str, int] = {}
+    for part in PARTS:
+        words = map(str, (path, log, part, seconds, speed))
+        code = "import sys; from tests.live.test_play import drive; drive(*sys.argv[1:])"
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == "done\n"
+            if part in PARTS[:2]:
+                time.sleep(random.Random(part).uniform(0, 0.5))
+                killed[part] = time.time_ns()
+                process.kill()
+            process.wait()
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+        assert process.returncode == (-9 if part in killed else 0)
+    sent = sent_of(log)
+    assert account(path, sent, killed, seconds) > 0
+    assert max(one.used for one in sent.values()) <= quota + 2 * MIN_SEGMENT
+    with hl.open(path, mongo="none") as store:
+        store.keep({"max-age": "0s", "never-tag": ["trigger"]})
+    assert account(path, sent, killed, seconds) > 0
