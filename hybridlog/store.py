@@ -1175,7 +1175,7 @@ class Store:
         try:
             return keeper.keep(wanted, progress)
         finally:
-            self.session.catch_up()
+            self.refresh()
 
     def pin(
         self,

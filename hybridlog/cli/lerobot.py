@@ -78,10 +78,8 @@ def export_set(
     Raises:
         UsageError: An option does not fit, a gap is refused, or the output exists.
     """
-    from hybridlog.training.feature_map import proposed
-
     if given["propose_map"]:
-        _write_map(proposed(query).to_yaml(), target, force=force, quiet=quiet)
+        _write_map(_proposed(query), target, force=force, quiet=quiet)
         return
     if given["features"] is None:
         raise UsageError(
@@ -111,7 +109,18 @@ def export_set(
             on_gap=given["on_gap"] or "refuse",
             progress=tell,
         )
-    _print_report(report, quiet=quiet)
+    _print_report(report, given["fps"], quiet=quiet)
+
+
+def _proposed(query: Query) -> str:
+    """A map for the topics that are there; those with few messages are in comments."""
+    from hybridlog.training.feature_map import nearly_empty, proposed
+
+    empty = nearly_empty(query.with_topic(*proposed(query).topics))
+    return proposed(query, empty).to_yaml() + "".join(
+        f"# left out: {topic} has {output.counted(count, 'message')}\n"
+        for topic, count in empty.items()
+    )
 
 
 def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
@@ -125,7 +134,7 @@ def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
         output.note(f"{target}: look at it, then add --map {target}.")
 
 
-def _print_report(report: LerobotReport, *, quiet: bool) -> None:
+def _print_report(report: LerobotReport, fps: int | None, *, quiet: bool) -> None:
     counted = output.counted
     resumed = f", {report.resumed} of them from before" if report.resumed else ""
     if not quiet:
@@ -133,6 +142,8 @@ def _print_report(report: LerobotReport, *, quiet: bool) -> None:
             f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
             f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
         )
+        if fps is None:
+            output.note(f"Without --fps there are {_FPS} frames a second.")
     if report.held:
         output.note(
             f"Values that are older than usual were kept for {counted(report.held, 'frame')}."

@@ -16,7 +16,7 @@ A map is YAML:
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
@@ -156,11 +156,25 @@ class FeatureMap:
         return "\n".join(lines) + "\n"
 
 
-def proposed(query: Query) -> FeatureMap:
+def nearly_empty(query: Query) -> dict[str, int]:
+    """Topics of a question with less than a message a second, and their number of messages."""
+    found = {}
+    for one in map(query.with_topic, query.topics):
+        length = sum(end - begin for begin, end in (each.extent for each in one.summaries()))
+        if (count := one.count()) < max(length / 1e9, 1):
+            found[one.topics[0]] = count
+    return found
+
+
+def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
     """A map for the topics of a question, by their types.
 
     Joint states and odometry become states, commands become actions, images of all encodings
     and videos become images.
+
+    Args:
+        query: The question.
+        without: Topics that are left out.
 
     Raises:
         UsageError: There are no such topics.
@@ -171,7 +185,7 @@ def proposed(query: Query) -> FeatureMap:
     entries = map(query.session.entry_of, query.summaries())
     types = {one.topic: plain_type(one.type) for entry in entries for one in entry.channels}
     for topic in query.topics:
-        kind = types.get(topic, "")
+        kind = "" if topic in without else types.get(topic, "")
         if kind in _STATES:
             states.append(Source(topic, _STATES[kind]))
         elif kind in _ACTIONS:
@@ -185,7 +199,8 @@ def proposed(query: Query) -> FeatureMap:
     found = FeatureMap({name: parts for name, parts in named.items() if parts}, images)
     if not found.topics:
         raise UsageError(
-            "There are no joint states, odometry, commands or images: write the map by hand."
+            "There are no joint states, odometry, commands or images with a message a second: "
+            "write the map by hand."
         )
     return found
 
