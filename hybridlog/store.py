@@ -6,7 +6,6 @@ import math
 import os
 import secrets
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial, wraps
@@ -356,6 +355,7 @@ class Store:
         type: Texts = None,  # noqa: A002 - the word of the command line
         during: During = None,
         where: Texts = None,
+        older_than: DurationLike | None = None,
     ) -> Recordings:
         """The recordings that satisfy all conditions, oldest first; all without conditions.
 
@@ -368,6 +368,7 @@ class Store:
             during: Range `[begin, end)` of log time that they overlap, in absolute times;
                 None leaves a side open.
             where: `"scan: ranges.min < 0.5"`: holds for at least one message of the topic.
+            older_than: `"30d"`: their last message is at least this old.
 
         Returns:
             A sequence of `RecordingEntry`, perhaps empty, with `topic` for queries about them.
@@ -377,7 +378,16 @@ class Store:
             TimeError: `during` is no range of absolute times.
             WhereError: A predicate cannot be parsed, or does not fit the fields.
         """
-        return self.choose(Choice.of(name, tag=tag, has=has, type=type, during=during, where=where))
+        choice = Choice.of(
+            name,
+            tag=tag,
+            has=has,
+            type=type,
+            during=during,
+            where=where,
+            older_than=older_than,
+        )
+        return self.choose(choice)
 
     @of_one_moment
     def choose(self, choice: Choice) -> Recordings:
@@ -1088,7 +1098,6 @@ class Store:
         recordings: Names | None = None,
         topics: Sequence[str] | None = None,
         *,
-        older_than_ns: int = 0,
         drop_mcap: bool = False,
         dry_run: bool = False,
         progress: Progress | None = None,
@@ -1099,7 +1108,6 @@ class Store:
             recordings: The recordings; None for all that have ended.
             topics: Topics, as for `topic`; None for those that consist of arrays mostly: laser
                 scans, point clouds, images and other arrays of numbers.
-            older_than_ns: Only recordings whose last message is at least as old, ns.
             drop_mcap: True to take payloads that are in columns out of the segments. Every
                 message is rebuilt and compared before.
             dry_run: True to say what would be done, and write nothing.
@@ -1117,13 +1125,10 @@ class Store:
 
         self.refresh()
         wanted = None if topics is None else set(self.topic(*topics).topics)
-        before = time.time_ns() - older_than_ns
         found: list[CompactedTopic] = []
         try:
             for entry in self.select(recordings):
                 if recordings is None and entry.status in {"open", "unfinished"}:
-                    continue
-                if older_than_ns and (entry.span is None or entry.span[1] > before):
                     continue
                 found += compact(
                     self.directory,

@@ -158,24 +158,27 @@ def test_recording_a_slice_follows_the_same_rule(log: Path, tmp_path: Path) -> N
 
 def test_commands(store: hl.Store, tmp_path: Path) -> None:
     path = store.directory.path
-    rows = run("attachments", "drive", "--json", store=path).json
+    rows = run("info", "drive", "--attachments", "--json", store=path).json
     assert [(r["name"], r["bytes"]) for r in rows] == [(a[1], len(a[3])) for a in ATTACHMENTS]
-    table = run("attachments", "drive", store=path).lines
+    table = run("info", "drive", "--attachments", store=path).lines
     assert table[1].split() == ["calibration.yaml", "text/yaml", "11", "B", "1970-01-01T00:01:40Z"]
-    done = run("attachments", "drive", "../../etc/passwd", store=path)
+    done = run("info", "drive", "--attachment", "../../etc/passwd", store=path)
     assert done.out == "root"
     out = tmp_path / "map.png"
-    run("attachments", "drive", "*Karte*", "-o", out, store=path)
+    run("info", "drive", "--attachment", "*Karte*", "-o", out, store=path)
     assert out.read_bytes() == ATTACHMENTS[4][3]
-    assert "exists" in run("attachments", "drive", "*Karte*", "-o", out, store=path, code=2).err
-    run("attachments", "drive", "-o", tmp_path / "all", "-q", store=path)
+    assert (
+        "exists"
+        in run("info", "drive", "--attachment", "*Karte*", "-o", out, store=path, code=2).err
+    )
+    run("info", "drive", "--attachments", "-o", tmp_path / "all", store=path)
     names = ["calibration.yaml", "_.._etc_passwd", "calibration-2.yaml", "attachment"]
     names.append("späte Karte.png")
     found = {p.name: p.read_bytes() for p in (tmp_path / "all").iterdir()}
     assert found == {name: a[3] for name, a in zip(names, ATTACHMENTS, strict=True)}
-    twice = run("attachments", "drive", "calibration.yaml", store=path, code=2)
+    twice = run("info", "drive", "--attachment", "calibration.yaml", store=path, code=2)
     assert "2 attachments have this name" in twice.err
-    missing = run("attachments", "drive", "x", store=path, code=2)
+    missing = run("info", "drive", "--attachment", "x", store=path, code=2)
     assert "späte Karte.png" in missing.err
 
 

@@ -216,19 +216,18 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
     ]
     assert call(store, "fetch", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
     assert call(store, "intervals", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
-    assert call(store, "changes", "-t", "scan", "--fields", "n", "--count", "-q", *chosen).out
-    assert "/left/scan" in call(store, "schema", "scan", *chosen).out
-    assert "from 1 recording," in call(store, "losses", *chosen).out
-    rows = json.loads(call(store, "du", *chosen, "--json").out)["rows"]
+    assert call(store, "intervals", "scan", "--changes", "n", "--count", "-q", *chosen).out
+    assert "/left/scan" in call(store, "info", "-t", "scan", *chosen).out
+    assert "from 1 recording," in call(store, "info", "--losses", *chosen).out
+    rows = json.loads(call(store, "info", "--sizes", "recording", *chosen, "--json").out)["rows"]
     assert [row["recording"] for row in rows] == ["tuesday"]
     assert call(store, "verify", *chosen).out.startswith("1 recording,")
     assert call(store, "index", "rebuild", *chosen).out.startswith("1 recording,")
     assert call(store, "repair", *chosen).out == "nothing to mend\n"
-    for command in ("info", "losses", "du", "verify", "index rebuild", "repair", "rm"):
+    for command in ("info", "verify", "index rebuild", "repair", "rm"):
         assert call(store, *command.split(), "--tag", "robot=9").code == 2
-    for command in ("fetch", "intervals", "schema"):
-        topic = ["scan"] if command == "schema" else ["-t", "scan"]
-        assert "robot=9" in call(store, command, *topic, "--tag", "robot=9").err
+    for command in ("fetch", "intervals", "tables"):
+        assert "robot=9" in call(store, command, "scan", "--tag", "robot=9").err
 
 
 def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
@@ -246,10 +245,10 @@ def test_tags_of_many_are_changed_at_once(store: hl.Store) -> None:
     assert call(store, "tag", "--has", "imu", "by=machine").code == 0
     store.refresh()
     assert list(store.recordings(tag="by=machine").labels) == ["monday-2", "run1"]
-    assert call(store, "untag", "-r", "*", "by").code == 0  # also of those that lack it
+    assert call(store, "tag", "-r", "*", "--remove", "by").code == 0  # also of those that lack it
     store.refresh()
     assert store.recordings(tag="by") == []
-    assert "has no tag 'by'" in call(store, "untag", "tuesday", "by").err
+    assert "has no tag 'by'" in call(store, "tag", "tuesday", "--remove", "by").err
     assert "Name a recording" in call(store, "tag").err
     assert "KEY=VALUE" in call(store, "tag", "--has", "imu", "run1").err
 
@@ -405,8 +404,8 @@ def test_completion_of_choices(store: hl.Store) -> None:
     assert complete("ls", "--tag", "robot=7") == ["robot=7"]
     assert complete("info", "--type", "sensor_msgs/L") == [SCAN]
     assert complete("info", "--type", "La") == ["LaserScan"]
-    assert complete("du", "--with", "/i") == ["/imu: "]
-    assert complete("du", "--with", "/imu: n") == []
+    assert complete("info", "--with", "/i") == ["/imu: "]
+    assert complete("info", "--with", "/imu: n") == []
     assert complete("fetch", "-r", "tues*", "--topic", "/") == ["/left/scan", "/odd"]
 
 

@@ -36,7 +36,7 @@ def test_a_server_has_to_be_agreed_to(state: Path) -> None:
     settings = StoreSettings("a", URI)
     with pytest.raises(DatabaseError, match=r"mongodb://lab-server/robots\b.*") as caught:
         consent.trusted_uri(settings, Path("some/store"))
-    assert "hybridlog trust --store some/store" in str(caught.value)
+    assert "hybridlog index trust --store some/store" in str(caught.value)
     assert "--mongo URI" in str(caught.value)
     assert "me@" not in str(caught.value)
     consent.remember("a", URI)
@@ -173,10 +173,10 @@ def foreign(tmp_path: Path, listener: Listener) -> Path:
         ("index", "rebuild"),
         ("rm", "-y", "x"),
         ("index", "list"),
-        ("schema", "x"),
+        ("info", "-t", "x"),
         ("record", __file__),
         ("export", "/nonexistent/x.mcap"),
-        ("losses",),
+        ("info", "--losses"),
     ],
     ids=" ".join,
 )
@@ -187,18 +187,18 @@ def test_no_command_connects_without_consent(
     assert listener.visits == 0
     if command[0] in {"verify", "index"}:
         assert done.code == 6
-        assert "hybridlog trust" in done.err
+        assert "hybridlog index trust" in done.err
 
 
 def test_trust_and_forget(foreign: Path, listener: Listener) -> None:
-    assert run("trust", "--store", foreign).lines == [f"trusted {listener.uri}"]
+    assert run("index", "trust", "--store", foreign).lines == [f"trusted {listener.uri}"]
     assert listener.visits == 0, "to agree is not to connect"
     done = run("verify", store=foreign, code=6)
     assert listener.visits > 0
-    assert "hybridlog trust" not in done.err
+    assert "hybridlog index trust" not in done.err
     before = listener.visits
-    assert run("trust", "--forget", store=foreign).lines == ["forgotten"]
-    assert run("trust", "--forget", store=foreign).lines == ["nothing was trusted"]
+    assert run("index", "trust", "--forget", store=foreign).lines == ["forgotten"]
+    assert run("index", "trust", "--forget", store=foreign).lines == ["nothing was trusted"]
     run("verify", store=foreign, code=6)
     assert listener.visits == before
 
@@ -216,9 +216,9 @@ def test_what_is_named_outright_needs_no_consent(
 
 def test_a_store_without_a_server(tmp_path: Path) -> None:
     write_settings(tmp_path, StoreSettings("x"))
-    assert "nothing to trust" in run("trust", store=tmp_path).out
+    assert "nothing to trust" in run("index", "trust", store=tmp_path).out
     assert not (Path(os.environ["XDG_STATE_HOME"]) / "hybridlog").exists()
 
 
 def test_a_store_that_is_none(tmp_path: Path) -> None:
-    run("trust", store=tmp_path / "none", code=5)
+    run("index", "trust", store=tmp_path / "none", code=5)

@@ -170,7 +170,7 @@ def test_saved_rules_are_those_of_later_passes(store: Path) -> None:
     found = keep("--json", store=store).json["plan"]
     assert found["steps"] == []
     assert found["pinned_bytes"] > 0
-    answer("untag", "run", "keep", store=store)
+    answer("tag", "run", "--remove", "keep", store=store)
     assert keep("--json", store=store).json["plan"]["steps"]
 
 

@@ -1,147 +1,155 @@
-"""`hybridlog align` and `resample`."""
+"""`hybridlog align`: topics side by side by time."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli import options
-from hybridlog.cli.answers import Destination, answer_tables, print_cost, table_options
+from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_cost
+from hybridlog.cli.binder import command, option, repeated
 from hybridlog.cli.completion import complete_recording, complete_topic
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.options import Asking, in_frame, parse_fields, query_of
 from hybridlog.cli.output import notes
-from hybridlog.cli.query_options import asked, parse_fields, query_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.choice import Choice
+    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
+_BESIDE = ("asof", "nearest", "interpolate")
 
-@click.command()
-@click.option(
-    "--to",
-    "base",
-    required=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="The topic whose messages are the rows.",
-)
-@click.option(
-    "--topic",
-    "-t",
-    required=True,
-    multiple=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="A topic beside it: full name, an unambiguous short one, a glob, or re:REGEX. Repeatable.",
-)
-@click.option(
-    "--how",
-    type=click.Choice(["asof", "nearest", "interpolate"]),
-    default="asof",
-    help="The last message not after the row, the nearest one, or between the last and the next.",
-)
-@options.near
-@click.option(
-    "--clock",
-    type=click.Choice(["log", "publish", "header"]),
-    default="log",
-    help="The time that is compared.",
-)
-@options.store
-@options.between
-@click.option(
-    "--where",
-    multiple=True,
-    metavar="TOPIC: PREDICATE",
-    help="Only messages of this topic that satisfy a predicate. Repeatable.",
-)
-@options.choice
-@click.option(
-    "--beside",
-    multiple=True,
-    metavar="RECORDING",
-    shell_complete=complete_recording,
-    help="The topics beside it are of these recordings, whose time may overlap: a second robot or "
-    "recorder. As for --recording; '*' for all. Repeatable.",
-)
-@click.option(
-    "--fields",
-    multiple=True,
-    metavar="TOPIC: A,B.C",
-    help="Only these fields of a topic, with commas between them. Repeatable.",
-)
-@options.in_frame
-@table_options
-@options.verbose
-def align_command(
-    *,
-    base: str,
-    topic: tuple[str, ...],
-    how: str,
-    tolerance: str | None,
-    clock: str,
-    store: Path | None,
-    between: tuple[str, str] | None,
-    where: tuple[str, ...],
-    choice: Choice,
-    beside: tuple[str, ...],
-    fields: tuple[str, ...],
-    frame: str | None,
-    to: Destination,
-    strict: bool,
-    mongo: str | None,
-    quiet: bool,
-) -> None:
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(Asking, Tabular):
+    needs_topic: ClassVar[bool] = True
+    base: str | None = option(
+        "--to",
+        metavar="TOPIC",
+        shell_complete=complete_topic,
+        help="The topic whose messages are the rows.",
+    )
+    step: str | None = option(
+        "--step", metavar="DURATION", help="Instead: rows at regular times, such as 100ms."
+    )
+    how: str = option(
+        "--how",
+        type=click.Choice([*_BESIDE, "count", "first", "last", "min", "max", "mean"]),
+        default="asof",
+        help="The last message not after the row, the nearest one, or between the last and the "
+        "next. With --step also of the messages from a row to the next: their number, the first, "
+        "the last, or the least, greatest or mean of each number.",
+    )
+    tolerance: str | None = option(
+        "--tolerance",
+        metavar="DURATION",
+        help="Greatest distance in time, such as 20ms; without, any.",
+    )
+    clock: str = option(
+        "--clock",
+        type=click.Choice(["log", "publish", "header"]),
+        default="log",
+        help="With --to: the time that is compared.",
+    )
+    where: tuple[str, ...] = repeated(  # type: ignore[misc]
+        "--where",
+        metavar="TOPIC: PREDICATE",
+        help="Only messages of this topic that satisfy a predicate; with --step a predicate alone.",
+    )
+    beside: tuple[str, ...] = repeated(
+        "--beside",
+        metavar="RECORDING",
+        shell_complete=complete_recording,
+        help="With --to: the topics beside it are of these recordings, whose time may overlap: a "
+        "second robot or recorder. As for --recording; '*' for all.",
+    )
+    fields: tuple[str, ...] = repeated(
+        "--fields",
+        metavar="TOPIC: A,B.C",
+        help="Only these fields of a topic, with commas between them; with --step of all topics, "
+        "without their names.",
+    )
+    frame: str | None = in_frame()
+
+
+@command(_Given)
+def align_command(given: _Given) -> None:
     """Show topics side by side by time.
 
-    A row for each message of one topic, with what the others had said by then. Columns are
-    named by topic and field; `distance` is the time of a topic's message minus that of the
-    row. What is not near enough is empty; lines on standard error say why.
+    With --to, a row for each message of one topic, with what the others had said by then;
+    with --step, rows at regular times, from the beginning of each recording or of --between.
+    Columns are named by topic and field; `distance` is the time of a topic's message minus
+    that of the row. What is not near enough is empty; lines on standard error say why.
     """
+    if (given.base is None) == (given.step is None):
+        raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
+    topics, to = given.topics, given.to
     started = time.monotonic()
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        queries = _queries(opened, [base, *topic], choice, beside)
-        for predicates, add in ((where, _where), (fields, _fields)):
-            for text in predicates:
-                add(opened, queries, text)
-        if frame is not None:
-            from hybridlog.query.planner import Planner
-            from hybridlog.tf.in_frame import has_places
-
-            placed = [has_places(Planner(q.session, q.question, q.counters)) for q in queries]
-            queries = [
-                query.in_frame(frame) if is_placed or not any(placed) else query
-                for query, is_placed in zip(queries, placed, strict=True)
-            ]
-        if between is not None:
-            queries[0] = queries[0].between(*between)
-        if strict:
-            for query in queries:
-                query.completeness().check()
-        aligned = opened.align(
-            queries[0],
-            queries[1:],
-            how=how,
-            tolerance=tolerance,
-            clock=clock,
-            across_recordings=bool(beside),
-        )
-        # That there is a transform shows only at the end.
-        completeness = aligned.completeness if strict else None
-        answer_tables(aligned.to_tables(), aligned.schema, to, completeness)
+    with given.opened() as store:
+        show = _resample if given.base is None else _align
+        counters, remarks = show(store, given, topics, to)
         sys.stdout.flush()
-        if not quiet:
-            print_cost(aligned.counters, time.monotonic() - started, count=False)
-            notes(aligned.remarks(base, *topic))
+        if not given.quiet:
+            print_cost(counters, time.monotonic() - started, count=False)
+            notes(remarks)
+
+
+def _resample(
+    store: Store, given: _Given, topics: Sequence[str], to: Destination
+) -> tuple[Counters, Sequence[str]]:
+    """Answer with rows at regular times; gives the cost and what is to be known."""
+    if given.clock != "log" or given.beside or given.frame is not None:
+        raise UsageError("--clock, --beside and --in-frame are for --to, not for --step.")
+    query = given.query(store)
+    if given.fields:
+        query = query.fields(*parse_fields(",".join(given.fields)))
+    rows = query.resample(given.step or 0, given.how, given.tolerance)
+    answer_tables(rows.to_tables(), rows.schema, to)
+    return rows.counters, rows.remarks(*topics)
+
+
+def _align(
+    store: Store, given: _Given, topics: Sequence[str], to: Destination
+) -> tuple[Counters, Sequence[str]]:
+    """Answer with a row for each message of a topic; gives the cost and what is to be known."""
+    if given.how not in _BESIDE:
+        raise UsageError(f"--how {given.how} is for --step, not for --to.")
+    base = given.base or ""
+    queries = _queries(store, [base, *topics], given.choice, given.beside)
+    for predicates, add in ((given.where, _where), (given.fields, _fields)):
+        for text in predicates:
+            add(store, queries, text)
+    if given.frame is not None:
+        from hybridlog.query.planner import Planner
+        from hybridlog.tf.in_frame import has_places
+
+        placed = [has_places(Planner(q.session, q.question, q.counters)) for q in queries]
+        queries = [
+            query.in_frame(given.frame) if is_placed or not any(placed) else query
+            for query, is_placed in zip(queries, placed, strict=True)
+        ]
+    queries[0] = given.bounded(queries[0])
+    if given.strict:
+        for query in queries:
+            query.completeness().check()
+    aligned = store.align(
+        queries[0],
+        queries[1:],
+        how=given.how,
+        tolerance=given.tolerance,
+        clock=given.clock,
+        across_recordings=bool(given.beside),
+    )
+    # That there is a transform shows only at the end.
+    completeness = aligned.completeness if given.strict else None
+    answer_tables(aligned.to_tables(), aligned.schema, to, completeness)
+    return aligned.counters, aligned.remarks(base, *topics)
 
 
 def _queries(
@@ -180,57 +188,3 @@ def _named(store: Store, queries: list[Query], text: str, form: str) -> tuple[li
     if not places:
         raise TopicError(f"{topic} is no topic of this alignment.")
     return places, rest
-
-
-@click.command()
-@options.topics
-@click.option("--step", required=True, metavar="DURATION", help="Time between two rows: 100ms.")
-@click.option(
-    "--how",
-    type=click.Choice(
-        ["asof", "nearest", "interpolate", "count", "first", "last", "min", "max", "mean"]
-    ),
-    default="asof",
-    help="The last message not after the row, the nearest one, or between the last and the next. "
-    "Or of the messages from a row to the next: their number, the first, the last, or the least, "
-    "greatest or mean of each number.",
-)
-@options.near
-@options.store
-@options.between
-@options.where
-@options.choice
-@click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
-@table_options
-@options.verbose
-def resample_command(
-    *,
-    topic: tuple[str, ...],
-    step: str,
-    how: str,
-    tolerance: str | None,
-    store: Path | None,
-    between: tuple[str, str] | None,
-    where: tuple[str, ...],
-    choice: Choice,
-    fields: str | None,
-    to: Destination,
-    strict: bool,
-    mongo: str | None,
-    quiet: bool,
-) -> None:
-    """Show topics at regular times, or what they say between these.
-
-    The times begin with each recording, or with the range of --between.
-    """
-    started = time.monotonic()
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        query = asked(
-            opened, topic, choice, between=between, where=where, fields=fields, strict=strict
-        )
-        rows = query.resample(step, how, tolerance)
-        answer_tables(rows.to_tables(), rows.schema, to)
-        sys.stdout.flush()
-        if not quiet:
-            print_cost(rows.counters, time.monotonic() - started, count=False)
-            notes(rows.remarks(*topic))

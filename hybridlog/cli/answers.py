@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
-from functools import partial, wraps
+from functools import partial
 from itertools import chain, groupby, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.options import VERBOSE
+from hybridlog.cli.binder import option
+from hybridlog.cli.options import VERBOSE, AsJson, Forced, Topics
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.sql.engine import SqlAnswer
+    from hybridlog.store import Store
 
 
 SCREEN: Final = "table"
@@ -127,29 +130,6 @@ class Destination:
             check_room(self.path, force=self.force, is_directory=folder)
 
 
-def format_option(names: Sequence[str]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The option `--format` of commands that answer."""
-    return click.option(
-        "--format",
-        "-F",
-        "form",
-        type=click.Choice([SCREEN, *names]),
-        help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
-    )
-
-
-def output_option(what: str = "Write to this file") -> Callable[..., Any]:
-    """The option `--output`; `-` is as good as none."""
-    return click.option(
-        "--output",
-        "-o",
-        type=options.PATH,
-        metavar="FILE",
-        callback=lambda _, __, path: None if str(path) == "-" else path,
-        help=f"{what}; - is standard output.",
-    )
-
-
 def format_of(form: str | None, path: Path | None, names: Sequence[str]) -> str:
     """The format of an answer: as given, by the suffix, or the usual one for standard output.
 
@@ -174,37 +154,154 @@ def format_of(form: str | None, path: Path | None, names: Sequence[str]) -> str:
     return suffixes[path.suffix.lower()]
 
 
-def table_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a command that answers with a table; it gets them as `to`."""
+def output_option(what: str) -> Any:
+    """The option `--output`; `-` is as good as none."""
+    return option(
+        "--output",
+        "-o",
+        type=options.PATH,
+        metavar="FILE",
+        callback=lambda _, __, path: None if str(path) == "-" else path,
+        help=f"{what}; - is standard output.",
+    )
 
-    @wraps(command)
-    def with_destination(
-        *, form: str | None, output: Path | None, force: bool, limit: int | None, **others: Any
-    ) -> Any:
+
+@dataclass(frozen=True, kw_only=True)
+class Tabular(Forced):
+    """Options of commands that answer with rows.
+
+    Attributes:
+        formats: Formats that the command has.
+    """
+
+    formats: ClassVar[Sequence[str]] = TABLE_FORMATS
+    form: str | None = option(
+        "--format",
+        "-F",
+        type=click.Choice([SCREEN, *TABLE_FORMATS]),
+        help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
+    )
+    output: Path | None = output_option("Write to this file")
+    limit: int | None = option(
+        "--limit", "-n", type=click.IntRange(min=0), metavar="N", help="At most so many."
+    )
+
+    @property
+    def to(self) -> Destination:
+        """Format and place of the answer.
+
+        Raises:
+            UsageError: The file exists, or the format does not fit the place.
+        """
         to = Destination(
-            form=format_of(form, output, TABLE_FORMATS),
-            path=output,
-            force=force,
-            limit=limit,
-            quiet=others["quiet"],
+            form=format_of(self.form, self.output, self.formats),
+            path=self.output,
+            force=self.force,
+            limit=self.limit,
+            quiet=getattr(self, "quiet", False),
         )
         to.check()
-        return command(to=to, **others)
+        return to
 
-    decorated: Callable[..., Any] = with_destination
-    for add in (
-        options.quiet,
-        options.mongo,
-        options.force,
-        options.strict,
-        output_option(),
-        format_option(TABLE_FORMATS),
-        click.option(
-            "--limit", "-n", type=click.IntRange(min=0), metavar="N", help="At most so many rows."
-        ),
-    ):
-        decorated = add(decorated)
-    return decorated
+
+@dataclass(frozen=True, kw_only=True)
+class Listing(Tabular, AsJson):
+    """Options of commands that answer with rows, which are text unless another form is given."""
+
+    form: str | None = option(
+        "--format",
+        "-F",
+        type=click.Choice([SCREEN, *TABLE_FORMATS]),
+        help="Without: by the suffix of -o, else a table.",
+    )
+
+    @property
+    def to(self) -> Destination | None:  # type: ignore[override]
+        """Format and place of the answer; None for text and JSON.
+
+        Raises:
+            UsageError: As of `Tabular`, or `--json` is given as well.
+        """
+        if self.output is None and self.form in {None, SCREEN}:
+            return None
+        if self.as_json:
+            raise UsageError("--json is a form of its own: leave out --format and --output.")
+        return super().to
+
+    @property
+    def table(self) -> Destination:
+        """Format and place of an answer that is a table in any case.
+
+        Raises:
+            UsageError: As of `Tabular`.
+        """
+        return Tabular.to.fget(self)  # type: ignore[attr-defined,no-any-return]
+
+    def answer(
+        self,
+        rows: Iterable[Mapping[str, Any]],
+        columns: Sequence[output.Column],
+        cells: Callable[[Any], Sequence[str]],
+        spare: Sequence[str] = (),
+    ) -> None:
+        """Print or write rows.
+
+        Args:
+            rows: The rows.
+            columns: Of the table for people.
+            cells: Gives the cells of a row.
+            spare: Columns that may be left out, see `output.fitted`.
+        """
+        from hybridlog.schema.plain import without_nan
+
+        to, limited = self.to, islice(rows, self.limit)
+        if to is not None:
+            answer_tables(_tables_of(limited), lambda: None, to)
+        elif self.as_json:
+            output.print_json_list(map(without_nan, limited))
+        elif spare:
+            output.print_table(*output.fitted(columns, [cells(row) for row in limited], spare))
+        else:
+            first = list(islice(limited, 1))
+            if first:
+                output.print_table(columns, map(cells, chain(first, limited)))
+
+
+def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
+    import pyarrow as pa
+
+    block = list(islice(rows, output.ROWS_AT_ONCE))
+    yield pa.Table.from_pylist(block)
+    while block := list(islice(rows, output.ROWS_AT_ONCE)):
+        yield pa.Table.from_pylist(block)
+
+
+@dataclass
+class Answering:
+    """A question that is being answered.
+
+    Attributes:
+        is_empty: Whether the answer is; None to tell by the counters of the query.
+    """
+
+    store: Store
+    query: Query
+    is_empty: bool | None = None
+
+
+@contextmanager
+def answering(given: Topics) -> Iterator[Answering]:
+    """The open store and the query; its cost and remarks are printed at the end."""
+    started = time.monotonic()
+    topics = given.topics
+    with given.opened() as store:
+        asked = Answering(store, given.query(store))
+        yield asked
+        sys.stdout.flush()
+        if not given.quiet:
+            query = asked.query
+            print_cost(query.counters, time.monotonic() - started, count=True)
+            print_remarks(query, topics, is_empty=asked.is_empty)
 
 
 def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:

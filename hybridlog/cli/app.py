@@ -46,51 +46,61 @@ def as_text() -> str:
     return "\n".join(f"  {code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())
 
 
-COMMANDS: Final = {
-    "record": "record",
-    "ls": "ls",
-    "info": "info",
-    "du": "ls",
-    "losses": "losses",
-    "top": "top",
-    "mark": "edit",
-    "rename": "edit",
-    "tag": "edit",
-    "untag": "edit",
-    "note": "edit",
-    "import": "maintain",
-    "trigger": "trigger",
-    "schema": "schema",
-    "tables": "schema",
-    "fetch": "fetch",
-    "intervals": "intervals",
-    "changes": "intervals",
-    "align": "align",
-    "resample": "align",
-    "rate": "stats",
-    "gaps": "intervals",
-    "check": "check",
-    "diff": "diff",
-    "stats": "stats",
-    "tf": "tf",
-    "plot": "plot",
-    "sql": "sql",
-    "view": "view",
-    "export": "export",
-    "serve": "serve",
-    "mcp": "mcp",
-    "open": "open",
-    "attachments": "attachments",
-    "index": "index",
-    "verify": "maintain",
-    "repair": "maintain",
-    "compact": "maintain",
-    "keep": "keep",
-    "rm": "edit",
-    "trust": "index",
-    "demo": "demo",
+GROUPS: Final = {
+    "Record": {
+        "record": "record",
+        "mark": "edit",
+        "trigger": "trigger",
+        "top": "top",
+        "import": "maintain",
+    },
+    "Look": {"ls": "ls", "info": "info", "view": "view", "open": "open", "plot": "plot"},
+    "Ask": {
+        "fetch": "fetch",
+        "intervals": "intervals",
+        "stats": "stats",
+        "align": "align",
+        "sql": "sql",
+        "tf": "tf",
+        "check": "check",
+        "diff": "check",
+    },
+    "Export": {"export": "export", "mcp": "mcp"},
+    "Maintain": {
+        "tag": "edit",
+        "edit": "edit",
+        "keep": "keep",
+        "index": "index",
+        "tables": "tables",
+        "verify": "maintain",
+        "repair": "maintain",
+        "compact": "maintain",
+        "rm": "edit",
+        "demo": "demo",
+    },
 }
-"""Names of the commands, in the order of the help text, and their modules."""
+"""Names of the commands by group, in the order of the help text, and their modules."""
+
+COMMANDS: Final = {name: module for group in GROUPS.values() for name, module in group.items()}
+"""Names of all commands, and their modules."""
+
+MOVED: Final = {
+    "attachments": "info RECORDING --attachments",
+    "changes": "intervals TOPIC --changes FIELDS",
+    "du": "info --sizes recording",
+    "gaps": "intervals TOPIC --gaps",
+    "losses": "info --losses",
+    "note": "edit RECORDING --note TEXT",
+    "rate": "stats --rate",
+    "reindex": "index rebuild",
+    "rename": "edit RECORDING --name NAME",
+    "resample": "align TOPIC --step DURATION",
+    "schema": "info --topic TOPIC",
+    "serve": "open websocket",
+    "trust": "index trust",
+    "untag": "tag RECORDING --remove KEY",
+}
+"""Other names that people try, and the commands that do this."""
 
 
 class _LazyGroup(click.Group):
@@ -100,11 +110,23 @@ class _LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name in MOVED:
+            raise click.UsageError(f"There is no {cmd_name!r}: use `hybridlog {MOVED[cmd_name]}`.")
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        width = formatter.width - max(map(len, COMMANDS)) - 6
+        for title, names in GROUPS.items():
+            found = [(name, self.get_command(ctx, name)) for name in names]
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(name, one.get_short_help_str(width)) for name, one in found if one],
+                    col_max=12,
+                )
 
 
 def _note_all(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001

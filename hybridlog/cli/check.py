@@ -1,74 +1,50 @@
-"""`hybridlog check`."""
+"""`hybridlog check` and `diff`."""
 
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answers import check_room, print_cost, print_remarks
+from hybridlog.cli.answers import Listing, answering, check_room
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import asked, recordings_of
+from hybridlog.cli.binder import command, option
+from hybridlog.cli.options import InStore, Quiet, Strict, Topics, Verbose, one_recording
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
-    from hybridlog.query.answers.regularity import TopicCheck
-    from hybridlog.query.choice import Choice
 
 
-@click.command()
-@options.only_recordings
-@options.only_topics
-@options.store
-@options.between
-@options.choice
-@click.option(
-    "--contract",
-    type=options.PATH,
-    metavar="FILE",
-    help="Judge recordings by the rules in this file; exit code 12 if one is broken.",
-)
-@click.option(
-    "--make",
-    type=options.PATH,
-    metavar="FILE",
-    help="Write a contract that this good recording keeps, to be edited.",
-)
-@click.option(
-    "--junit",
-    type=options.PATH,
-    metavar="FILE",
-    help="With --contract: also write the results in JUnit's XML, for CI.",
-)
-@options.force
-@options.strict
-@options.mongo
-@options.as_json
-@options.quiet
-@options.verbose
-def check_command(
-    *,
-    topic: tuple[str, ...],
-    store: Path | None,
-    between: tuple[str, str] | None,
-    choice: Choice,
-    contract: Path | None,
-    make: Path | None,
-    junit: Path | None,
-    force: bool,
-    strict: bool,
-    mongo: str | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Check(options.Named, Strict, Topics, Verbose, Listing):
+    contract: Path | None = option(
+        "--contract",
+        type=options.PATH,
+        metavar="FILE",
+        help="Judge recordings by the rules in this file; exit code 12 if one is broken.",
+    )
+    make: Path | None = option(
+        "--make",
+        type=options.PATH,
+        metavar="FILE",
+        help="Write a contract that this good recording keeps, to be edited.",
+    )
+    junit: Path | None = option(
+        "--junit",
+        type=options.PATH,
+        metavar="FILE",
+        help="With --contract: also write the results in JUnit's XML, for CI.",
+    )
+
+
+@command(_Check)
+def check_command(given: _Check) -> None:
     """Show how regularly topics came, the worst first.
 
     Rate, jitter, longest gap and where it begins, late start, early stop and losses of each
@@ -76,58 +52,60 @@ def check_command(
     """
     from hybridlog.contract.contract import Contract, contract_of
 
-    started = time.monotonic()
-    if sum(map(bool, (contract, make))) > 1 or (junit and not contract):
+    contract, make = given.contract, given.make
+    if sum(map(bool, (contract, make))) > 1 or (given.junit and not contract):
         raise UsageError("--contract and --make exclude each other; --junit is for --contract.")
-    if contract and (topic or between):
+    if contract and (given.topic or given.between):
         raise UsageError("A contract is about whole recordings: leave out -t and --between.")
-    rules = None if contract is None else Contract.read(contract)
-    for path in filter(None, (make, junit)):
-        check_room(path, force=force)
-    with opened_store(store, mongo, quiet=quiet or as_json) as opened:
-        if rules is not None:
-            chosen = recordings_of(opened, choice)
-            results = [one for label in chosen.labels for one in opened.judge(rules, label)]
-            _show_verdict(results, len(chosen), junit, as_json=as_json, quiet=quiet)
-            return
-        query = asked(opened, topic, choice, between=between, where=(), strict=strict)
-        found = query.check()
+    for path in filter(None, (make, given.junit)):
+        check_room(path, force=given.force)
+    if contract is not None:
+        rules = Contract.read(contract)
+        with given.opened() as store:
+            chosen = given.recordings_in(store)
+            results = [one for label in chosen.labels for one in store.judge(rules, label)]
+        _show_verdict(results, len(chosen), given)
+        return
+    with answering(given) as asked:
+        asked.is_empty = False
+        found = asked.query.check()
         if make is not None:
             if len({one.recording for one in found}) != 1:
                 raise UsageError("A contract is made from one good recording: name it with -r.")
             _write(make, contract_of(found))
             return
-        if as_json:
-            output.print_json([asdict(one) for one in found])
-        elif found:
-            _print(found)
-        sys.stdout.flush()
-        if not quiet:
-            if not found:
-                output.note("No topic.")
-            print_cost(query.counters, time.monotonic() - started, count=True)
-            print_remarks(query, topic, is_empty=False)
+        columns: list[output.Column] = [
+            ("recording", "left"),
+            ("topic", "left"),
+            *((name, "right") for name in ("messages", "Hz", "jitter", "longest gap", "from")),
+            *((name, "right") for name in ("late", "early", "lost")),
+        ]
+        is_one = len({one.recording for one in found}) == 1
+        given.answer(
+            map(asdict, found),
+            columns[1:] if is_one else columns,
+            lambda row: _cells(row)[is_one:],
+            ("early", "late", "from", "jitter", "Hz"),
+        )
+        if not found and not given.quiet:
+            output.note("No topic.")
 
 
-def _show_verdict(
-    results: Sequence[Result], recordings: int, junit: Path | None, *, as_json: bool, quiet: bool
-) -> None:
+def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> None:
     from hybridlog.contract.judge import broken
     from hybridlog.contract.junit import junit_of
 
-    if junit is not None:
-        _write(junit, junit_of(results))
+    if given.junit is not None:
+        _write(given.junit, junit_of(results))
     bad = broken(results)
-    if as_json:
-        output.print_json([asdict(one) for one in results])
-    elif bad:
-        columns: list[output.Column] = [
-            (name, "left") for name in ("recording", "topic", "rule", "wanted", "found")
-        ]
-        rows = [[one.recording, one.topic, one.rule, one.wanted, one.found] for one in bad]
-        output.print_table(columns, rows)
+    names = ("recording", "topic", "rule", "wanted", "found")
+    given.answer(
+        map(asdict, results if given.as_json else bad),
+        [(name, "left") for name in names],
+        lambda row: [row[name] for name in names],
+    )
     sys.stdout.flush()
-    if not quiet:
+    if not given.quiet:
         rules = (
             f"{output.counted(len(results), 'rule')} in {output.counted(recordings, 'recording')}"
         )
@@ -144,41 +122,66 @@ def _write(path: Path, text: str) -> None:
     sink.commit()
 
 
-def _print(found: Sequence[TopicCheck]) -> None:
-    columns: list[output.Column] = [
-        ("recording", "left"),
-        ("topic", "left"),
-        ("messages", "right"),
-        ("Hz", "right"),
-        ("jitter", "right"),
-        ("longest gap", "right"),
-        ("from", "right"),
-        ("late", "right"),
-        ("early", "right"),
-        ("lost", "right"),
-    ]
-    rows = [_cells(one) for one in found]
-    if len({one.recording for one in found}) == 1:
-        del columns[0]
-        rows = [row[1:] for row in rows]
-    output.print_table(*output.fitted(columns, rows, ("early", "late", "from", "jitter", "Hz")))
-
-
-def _cells(one: TopicCheck) -> list[str]:
-    def duration(ns: float | None) -> str:
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    def duration(name: str) -> str:
+        ns = row[name]
         return "" if ns is None else output.short_duration(round(ns))
 
-    begin = one.gap_begin_ns
-    late, early = (None, None) if one.is_latched else (one.late_ns, one.early_ns)
+    begin, rate = row["gap_begin_ns"], row["rate_hz"]
     return [
-        one.recording,
-        one.topic,
-        str(one.messages),
-        "" if one.rate_hz is None else f"{one.rate_hz:.2f}",
-        duration(one.jitter_ns),
-        duration(one.gap_ns),
-        "" if begin is None else f"+{(begin - one.begin_ns) / 1e9:.3f}s",
-        duration(late),
-        duration(early),
-        "?" if one.lost is None else str(one.lost),
+        row["recording"],
+        row["topic"],
+        str(row["messages"]),
+        "" if rate is None else f"{rate:.2f}",
+        duration("jitter_ns"),
+        duration("gap_ns"),
+        "" if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s",
+        *(("", "") if row["is_latched"] else (duration("late_ns"), duration("early_ns"))),
+        "?" if row["lost"] is None else str(row["lost"]),
     ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Diff(InStore, Quiet, Listing):
+    a: str = one_recording(
+        metavar="A", help="A recording, as for --recording, or a glob for several together."
+    )
+    b: str = one_recording(metavar="B", help="The same.")
+    tolerance: str = option(
+        "--tolerance",
+        default="0",
+        metavar="SHARE",
+        help="Numbers are equal that differ by at most this, such as 5%.",
+    )
+    contract: Path | None = option(
+        "--contract",
+        type=options.PATH,
+        metavar="FILE",
+        help="Also compare which rules in this file are broken.",
+    )
+
+
+@command(_Diff)
+def diff_command(given: _Diff) -> None:
+    """Show what differs between two recordings.
+
+    Topics, types, messages, rates, gaps, losses, and statistics of fields. Exit code 12 if
+    anything does.
+    """
+    from hybridlog.contract.contract import Contract, parse_share
+
+    rules = None if given.contract is None else Contract.read(given.contract)
+    share = parse_share(given.tolerance)
+    with given.opened() as store:
+        found = store.diff(given.a, given.b, tolerance=share, contract=rules)
+    names = ("topic", "what", "a", "b")
+    given.answer(
+        map(asdict, found),
+        [(name, "left") for name in names],
+        lambda row: [row[name] for name in names],
+    )
+    sys.stdout.flush()
+    if not (given.quiet or given.as_json):
+        output.note(output.counted(len(found), "difference") + "." if found else "No difference.")
+    if found:
+        raise click.exceptions.Exit(DIFFERENT)

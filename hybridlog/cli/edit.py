@@ -1,164 +1,162 @@
-"""`hybridlog rename`, `tag`, `untag`, `note`, `mark` and `rm`."""
+"""`hybridlog edit`, `tag`, `mark` and `rm`."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
+from hybridlog.cli.binder import argument, command, flag, option, repeated
 from hybridlog.cli.completion import complete_recording
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import named_or_chosen, recordings_of
+from hybridlog.cli.options import (
+    AsJson,
+    Choosing,
+    InStore,
+    Named,
+    Quiet,
+    Running,
+    one_recording,
+    recordings_of,
+)
 from hybridlog.cli.signals import if_stopped
+from hybridlog.query.choice import Choice
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.query.choice import Choice
+    from hybridlog.recordings import Recordings
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
 
 
-@click.command()
-@options.one_recording
-@click.argument("name", metavar="NAME", help="Its new name.")
-@options.store
-@options.quiet
-def rename_command(*, recording: str, name: str, store: Path | None, quiet: bool) -> None:
-    """Give a recording another name.
+@dataclass(frozen=True, kw_only=True)
+class _Edit(InStore, Quiet):
+    recording: str = one_recording()
+    name: str | None = option("--name", metavar="NAME", help="Give it this name.")
+    note: str | None = option(
+        "--note", metavar="TEXT", help="Write a note about it; `info` shows notes."
+    )
 
-    Its directory is renamed as well; nothing else of the recording changes.
+
+@command(_Edit)
+def edit_command(given: _Edit) -> None:
+    """Give a recording another name, or write a note about it.
+
+    With the name, its directory is renamed as well; nothing else of the recording changes.
     """
-    if not name.strip():
-        raise UsageError("A recording needs a name: give one that is not empty.")
-    with opened_store(store, None, quiet=quiet) as opened:
-        entry = opened.rename(recording, name)
-    if not quiet:
+    if given.name is None and given.note is None:
+        raise UsageError("Say what to change: --name NAME or --note TEXT.")
+    for word, text in (("name", given.name), ("note", given.note)):
+        if text is not None and not text.strip():
+            raise UsageError(f"A {word} needs a text: give one that is not empty.")
+    with given.opened() as store:
+        (entry,) = store.select([given.recording])
+        if given.note is not None:
+            store.note(entry.id, given.note)
+        if given.name is not None:
+            entry = store.rename(entry.id, given.name)
+    if given.name is not None and not given.quiet:
         output.say(f"renamed to {entry.label}")
 
 
-@click.command()
-@click.argument(
-    "words",
-    nargs=-1,
-    metavar="[RECORDING] [KEY=VALUE]...",
-    shell_complete=complete_recording,
-    help="A recording, as for --recording, unless options choose; and tags to set. Without "
-    "tags, show them.",
-)
-@options.choice
-@options.store
-@options.as_json
-@options.quiet
-def tag_command(
-    *, words: tuple[str, ...], choice: Choice, store: Path | None, as_json: bool, quiet: bool
-) -> None:
-    """Set or show the tags of recordings."""
-    with opened_store(store, None, quiet=quiet) as opened:
-        chosen, pairs, is_one = named_or_chosen(opened, choice, words)
+@dataclass(frozen=True, kw_only=True)
+class _Tag(Choosing, InStore, AsJson, Quiet):
+    words: tuple[str, ...] = argument(
+        nargs=-1,
+        metavar="[RECORDING] [KEY=VALUE]...",
+        shell_complete=complete_recording,
+        help="A recording, as for --recording, unless options choose; and tags to set. Without "
+        "tags, show them.",
+    )
+    remove: tuple[str, ...] = repeated("--remove", metavar="KEY", help="Remove this tag.")
+
+
+@command(_Tag)
+def tag_command(given: _Tag) -> None:
+    """Set, show or remove the tags of recordings."""
+    with given.opened() as store:
+        chosen, pairs, is_one = _named_or_chosen(store, given)
         tags = options.parse_tags(pairs)
-        found = {
-            one.label: opened.tag(one.id, **tags).tags if tags else one.tags
-            for one in chosen.summaries
-        }
-    if as_json:
+        found = {}
+        for one in chosen.summaries:
+            # Of several recordings, some may lack a tag.
+            keys = given.remove if is_one else [key for key in given.remove if key in one.tags]
+            found[one.label] = one.tags
+            if keys:
+                found[one.label] = store.untag(one.id, *keys).tags
+            if tags:
+                found[one.label] = store.tag(one.id, **tags).tags
+    if given.as_json:
         output.print_json(next(iter(found.values())) if is_one else found)
-    elif not quiet:
+    elif not given.quiet:
         for label, own in found.items():
             for key, value in sorted(own.items()):
                 output.say(f"{key}={value}" if is_one else f"{label}: {key}={value}")
 
 
-@click.command()
-@click.argument(
-    "words",
-    nargs=-1,
-    metavar="[RECORDING] KEY...",
-    shell_complete=complete_recording,
-    help="A recording, as for --recording, unless options choose; and keys of tags.",
-)
-@options.choice
-@options.store
-@options.quiet
-def untag_command(
-    *, words: tuple[str, ...], choice: Choice, store: Path | None, quiet: bool
-) -> None:
-    """Remove tags of recordings."""
-    with opened_store(store, None, quiet=quiet) as opened:
-        chosen, keys, is_one = named_or_chosen(opened, choice, words)
-        if not keys:
-            raise UsageError("Name the keys of the tags to remove.")
-        for one in chosen.summaries:
-            # Of several recordings, some may lack a tag.
-            there = keys if is_one else [key for key in keys if key in one.tags]
-            if there:
-                opened.untag(one.id, *there)
+def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[str], bool]:
+    """The recordings of a command that names one in its first word, or chooses by options.
+
+    Returns:
+        The recordings, the other words, and whether one recording is named.
+
+    Raises:
+        UsageError: There is neither a word nor an option.
+        TopicError: No recording satisfies the choice.
+    """
+    choice, words = given.choice, given.words
+    if not choice.is_everything:
+        return recordings_of(store, choice), words, False
+    if not words:
+        raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
+    named = Choice.of(words[0])
+    return recordings_of(store, named), words[1:], store.is_one(named.name)
 
 
-@click.command()
-@options.one_recording
-@click.argument("text", metavar="TEXT", help="Text of the note.")
-@options.store
-@options.quiet
-def note_command(*, recording: str, text: str, store: Path | None, quiet: bool) -> None:
-    """Write a note about a recording; `info` shows it."""
-    if not text.strip():
-        raise UsageError("A note needs a text: give one that is not empty.")
-    with opened_store(store, None, quiet=quiet) as opened:
-        opened.note(recording, text)
+@dataclass(frozen=True, kw_only=True)
+class _Mark(Running):
+    text: str = argument(metavar="TEXT", help="What happened.")
+    tags: tuple[str, ...] = repeated("--set-tag", metavar="K=V", help="Add KEY=VALUE to it.")
+    at: str | None = option(
+        "--at",
+        metavar="T",
+        help="Mark a recording that has ended, at this time, written as for --between.",
+    )
+    until: str | None = option(
+        "--until", metavar="T2", help="The mark lasts from --at to this time."
+    )
 
 
-@click.command()
-@click.argument("text", metavar="TEXT", help="What happened.")
-@click.option(
-    "--set-tag", "tag", multiple=True, metavar="K=V", help="Add KEY=VALUE to it. Repeatable."
-)
-@options.running
-@click.option(
-    "--at",
-    metavar="T",
-    help="Mark a recording that has ended, at this time, written as for --between.",
-)
-@click.option("--until", metavar="T2", help="The mark lasts from --at to this time.")
-@options.store
-@options.quiet
-def mark_command(
-    *,
-    text: str,
-    tag: tuple[str, ...],
-    recording: tuple[str, ...],
-    at: str | None,
-    until: str | None,
-    store: Path | None,
-    quiet: bool,
-) -> None:
+@command(_Mark)
+def mark_command(given: _Mark) -> None:
     """Set a mark that queries can use, now or at a past time.
 
-    A mark is a message on /hybridlog/marks: `hybridlog fetch -t scan --where
+    A mark is a message on /hybridlog/marks: `hybridlog fetch scan --where
     "/hybridlog/marks: text = 'gripper slipped'" --within 5s`.
     """
-    tags = options.parse_tags(tag)
-    if not text.strip():
+    tags, at = options.parse_tags(given.tags), given.at
+    if not given.text.strip():
         raise UsageError("A mark needs a text: say what happened.")
-    if until is not None and at is None:
+    if given.until is not None and at is None:
         raise UsageError("--until ends a mark that begins at a time: add --at.")
     if at is None:
-        labels = _mark_running(text, tags, recording, store)
-    elif len(recording) == 1:
-        with opened_store(store, None, quiet=quiet) as opened:
-            _check_begun(opened, recording[0], at)
-            labels = iter([opened.mark(recording[0], at, text, tags, until=until).label])
+        labels = _mark_running(given.text, tags, given.recording, given.store)
+    elif len(given.recording) == 1:
+        (recording,) = given.recording
+        with given.opened() as store:
+            _check_begun(store, recording, at)
+            labels = iter([store.mark(recording, at, given.text, tags, until=given.until).label])
     else:
         raise UsageError("A mark at a time needs one recording: name it with --recording.")
     for label in labels:
-        if not quiet:
+        if not given.quiet:
             output.note(f"Marked in {label}.")
 
 
@@ -197,34 +195,35 @@ def _mark_running(
 _MAX_ROWS = 20
 
 
-@click.command()
-@options.only_recordings
-@options.choice
-@options.store
-@click.option("--yes", "-y", is_flag=True, help="Do not ask.")
-@options.mongo
-def rm_command(*, choice: Choice, store: Path | None, yes: bool, mongo: str | None) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Remove(Named, InStore):
+    yes: bool = flag("--yes", "-y", help="Do not ask.")
+
+
+@command(_Remove)
+def rm_command(given: _Remove) -> None:
     """Delete recordings, payloads and index."""
+    choice = given.choice
     if choice.is_everything:
         raise UsageError(
             "Name the recordings to delete, or choose them: -r 'monday*', --tag robot=7. "
             "`hybridlog ls` lists all; -r '*' is all of them."
         )
-    with opened_store(store, mongo) as opened:
-        copies = [name for name in choice.name if name in opened.repairs.copies]
+    with given.opened() as store:
+        copies = [name for name in choice.name if name in store.repairs.copies]
         rest = replace(choice, name=tuple(n for n in choice.name if n not in copies))
         chosen: Sequence[RecordingSummary] = ()
         if not copies or not rest.is_everything:
-            chosen = recordings_of(opened, rest).summaries
+            chosen = recordings_of(store, rest).summaries
         targets = {copy: copy for copy in copies} | {one.id: one.label for one in chosen}
-        if not yes:
+        if not given.yes:
             _confirm(copies, chosen)
         for recording, label in targets.items():
             with if_stopped(
                 "A recording whose removal began is gone; the next command that opens the "
                 "store removes the rest of it."
             ):
-                opened.remove(recording)
+                store.remove(recording)
             output.say(f"deleted {label}")
 
 

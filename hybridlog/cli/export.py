@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,11 +20,11 @@ from hybridlog.cli.answers import (
     print_remarks,
     write_answer,
 )
+from hybridlog.cli.binder import argument, command, flag, option
 from hybridlog.cli.lerobot import LEROBOT, check_options, export_set, lerobot_options
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.split import pieces, split_by
+from hybridlog.cli.split import pieces
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
@@ -38,7 +39,6 @@ from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
-    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
 
 _LOGS = formats_of("log")
@@ -46,81 +46,52 @@ _FILES = formats_of("table", "lines", "video")
 """Formats with a file a topic."""
 
 
-@click.command()
-@click.argument(
-    "target",
-    type=options.PATH,
-    metavar="OUTPUT",
-    help="File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).",
-)
-@click.option(
-    "--format",
-    "-F",
-    "form",
-    type=click.Choice([*_LOGS, LEROBOT, *_FILES]),
-    help=f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
-)
-@options.store
-@options.choice
-@options.only_topics
-@options.between
-@options.no_latched
-@options.original_times
-@options.bag_storage
-@options.bag_file_size
-@click.option(
-    "--no-attachments", is_flag=True, help="Leave out attachments; they are in MCAP files only."
-)
-@split_by
-@options.tag_columns
-@options.force
+@dataclass(frozen=True, kw_only=True)
+class _Given(Topics, Slices):
+    target: Path = argument(
+        type=options.PATH,
+        metavar="OUTPUT",
+        help="File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).",
+    )
+    form: str | None = option(
+        "--format",
+        "-F",
+        type=click.Choice([*_LOGS, LEROBOT, *_FILES]),
+        help=f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
+    )
+    no_attachments: bool = flag(
+        "--no-attachments", help="Leave out attachments; they are in MCAP files only."
+    )
+
+
+@command(_Given)
 @lerobot_options
-@options.mongo
-@options.quiet
-def export_command(
-    *,
-    target: Path,
-    form: str | None,
-    store: Path | None,
-    choice: Choice,
-    topic: tuple[str, ...],
-    between: tuple[str, str] | None,
-    no_latched: bool,
-    original_times: bool,
-    storage: str | None,
-    file_size: str | None,
-    no_attachments: bool,
-    split: str | None,
-    tags: str | None,
-    force: bool,
-    mongo: str | None,
-    quiet: bool,
-    **training: Any,
-) -> None:
+def export_command(given: _Given, **training: Any) -> None:
     """Export whole recordings; tables get one file a topic.
 
     `lerobot` makes a training set for robot learning.
     """
-    form = form or _form(target)
+    target, force, quiet, split = given.target, given.force, given.quiet, given.split
+    form = given.form or _form(target)
     check_options(training, form)
-    options.check_latched(no_latched=no_latched, original_times=original_times, form=form)
-    front = Front(latched=not no_latched, original_times=original_times)
-    options.check_tags(tags, form)
-    settings = options.bag_settings(storage, file_size, form)
+    options.check_latched(
+        no_latched=given.no_latched, original_times=given.original_times, form=form
+    )
+    front = Front(latched=not given.no_latched, original_times=given.original_times)
+    options.check_tags(given.tags, form)
+    settings = options.bag_settings(given.storage, given.file_size, form)
     if form in _LOGS and split is None:
         check_room(target, force=force, is_directory=is_directory(form, target))
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        query = query_of(opened, topic, choice)
+    with given.opened() as store:
+        query = given.query(store)
         if not query.topics:
             raise UsageError("The store is empty: `hybridlog record FILE` fills it.")
-        if between is not None:
-            query = query.between(*between)
-        if tags is not None:
-            query = query.tags(*parse_fields(tags, "--tags"))
+        if given.tags is not None:
+            query = query.tags(*parse_fields(given.tags, "--tags"))
         if form == LEROBOT:
             if split is not None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")
-            export_set(opened, query, target, training, force=force, quiet=quiet)
+            export_set(store, query, target, training, force=force, quiet=quiet)
             return
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
@@ -130,13 +101,13 @@ def export_command(
             to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
             if form in _LOGS:
                 extras = one.extras()
-                if no_attachments:
+                if given.no_attachments:
                     extras = extras._replace(attachments=[], left_out=0)
                 _write_file(one, to, path, front, extras)
             else:
                 _write_directory(one, to, path, front)
             if not quiet:
-                print_remarks(one, topic, is_empty=None if form in _LOGS else False)
+                print_remarks(one, given.topics, is_empty=None if form in _LOGS else False)
 
 
 def _form(target: Path) -> str:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
 from hybridlog.cli import options, output
 from hybridlog.cli.answers import (
+    SCREEN,
     Destination,
+    Tabular,
     answer_query,
     format_of,
-    format_option,
     latched,
     output_option,
     print_cost,
@@ -23,126 +25,88 @@ from hybridlog.cli.answers import (
     print_remarks,
     write_following,
 )
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import parse_fields, query_of
+from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
 from hybridlog.cli.signals import Stopped
-from hybridlog.cli.split import pieces, split_by
+from hybridlog.cli.split import pieces
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog.formats.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
 _FORMATS = formats_of()
 
 
-@dataclass(frozen=True, slots=True)
-class _Choices:
-    """The parameters of the command."""
+@dataclass(frozen=True, kw_only=True)
+class _Choices(Asking, Tabular, Slices):
+    needs_topic: ClassVar[bool] = True
+    formats: ClassVar[Sequence[str]] = _FORMATS
+    clock: str = option(
+        "--clock",
+        type=click.Choice(["log", "publish", "header"]),
+        default="log",
+        help="The clock of --between.",
+    )
+    at: str | None = option(
+        "--at", metavar="T", help="Only the message that was current at this time."
+    )
+    every: int = option(
+        "--every",
+        type=click.IntRange(min=1),
+        default=1,
+        metavar="N",
+        help="Only every n-th message.",
+    )
+    reverse: bool = flag("--reverse", help="Latest first.")
+    follow: bool = flag(
+        "--follow",
+        help="Of running recordings: print messages as they come, from now on or from the "
+        "beginning of --between, until the recordings end or Ctrl-C.",
+    )
+    fields: str | None = option(
+        "--fields", metavar="A,B.C", help="Only these fields, with commas between them."
+    )
+    frame: str | None = in_frame()
+    within: str | None = option(
+        "--within",
+        metavar="DURATION",
+        help="Greatest distance in time of messages of other topics in --where "
+        "'/odom: twist.twist.linear.x > 0.5'.",
+    )
+    before: str | None = option(
+        "--before",
+        metavar="DURATION",
+        help="Instead: start this long before each of these: 5min.",
+    )
+    after: str | None = option(
+        "--after", metavar="DURATION", help="Instead: end this long after each of these."
+    )
+    count: bool = flag("--count", help="Only print how many.")
+    form: str | None = option(
+        "--format",
+        "-F",
+        type=click.Choice([SCREEN, *_FORMATS]),
+        help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
+    )
+    output: Path | None = output_option(
+        "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
+    )
 
-    topic: tuple[str, ...]
-    store: Path | None
-    between: tuple[str, str] | None
-    clock: str
-    at: str | None
-    where: tuple[str, ...]
-    choice: Choice
-    limit: int | None
-    every: int
-    reverse: bool
-    follow: bool
-    fields: str | None
-    frame: str | None
-    split: str | None
-    tags: str | None
-    within: str | None
-    before: str | None
-    after: str | None
-    strict: bool
-    count: bool
-    form: str | None
-    output: Path | None
-    no_latched: bool
-    original_times: bool
-    storage: str | None
-    file_size: str | None
-    force: bool
-    mongo: str | None
-    quiet: bool
 
-
-@click.command()
-@options.topics
-@options.store
-@options.between
-@click.option(
-    "--clock",
-    type=click.Choice(["log", "publish", "header"]),
-    default="log",
-    help="The clock of --between.",
-)
-@click.option("--at", metavar="T", help="Only the message that was current at this time.")
-@options.where
-@options.choice
-@click.option(
-    "--limit",
-    "-n",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help="At most this number of messages.",
-)
-@click.option(
-    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Only every n-th message."
-)
-@click.option("--reverse", is_flag=True, help="Latest first.")
-@click.option(
-    "--follow",
-    is_flag=True,
-    help="Of running recordings: print messages as they come, from now on or from the beginning "
-    "of --between, until the recordings end or Ctrl-C.",
-)
-@click.option("--fields", metavar="A,B.C", help="Only these fields, with commas between them.")
-@options.in_frame
-@split_by
-@options.tag_columns
-@click.option(
-    "--within",
-    metavar="DURATION",
-    help="Greatest distance in time of messages of other topics in --where "
-    "'/odom: twist.twist.linear.x > 0.5'.",
-)
-@click.option(
-    "--before", metavar="DURATION", help="Instead: start this long before each of these: 5min."
-)
-@click.option("--after", metavar="DURATION", help="Instead: end this long after each of these.")
-@options.strict
-@options.count
-@format_option(_FORMATS)
-@output_option("Write to this file (raw: a directory; png and jpg: a directory, or one picture)")
-@options.no_latched
-@options.original_times
-@options.bag_storage
-@options.bag_file_size
-@options.force
-@options.mongo
-@options.quiet
-@options.verbose
-def fetch_command(**parameters: Any) -> None:
+@command(_Choices)
+def fetch_command(choices: _Choices) -> None:
     """Fetch messages by topic, time and content.
 
     Without --format and -o: a table on a terminal, JSON lines elsewhere. The cost of the
     answer, and what it may lack, is printed on standard error.
     """
-    choices = _Choices(**parameters)
     to = _destination(choices)
     started = time.monotonic()
-    with opened_store(
-        choices.store, choices.mongo, quiet=choices.quiet, is_lasting=choices.follow
-    ) as store:
+    with choices.opened(is_lasting=choices.follow) as store:
         query = _query(store, choices)
         if choices.follow:
             _follow(query, choices, to.form)
@@ -177,7 +141,7 @@ def fetch_command(**parameters: Any) -> None:
             cost = query.counters.copy()
             cost.add(query.spent)
             print_cost(cost, time.monotonic() - started, count=choices.count)
-            print_remarks(query, choices.topic)
+            print_remarks(query, choices.topics)
             if count is not None:
                 print_lost(query, count)
 
@@ -200,7 +164,7 @@ def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front
 def _follow(query: Query, choices: _Choices, form: str) -> None:
     """Print messages as they come, then what they may lack."""
     started = time.monotonic()
-    following = query.follow(*choices.topic)
+    following = query.follow(*choices.topics)
     stopped: Stopped | None = None
     try:
         with at_safe_points():
@@ -214,7 +178,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
 
         asked = Query(query.session, following.question)
         asked.counters = query.counters
-        print_remarks(asked, choices.topic)
+        print_remarks(asked, choices.topics)
         for one in asked.summaries():
             if one.status != "open":
                 output.note(f"{one.label} has ended: {status_text(one)}.")
@@ -223,9 +187,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
 
 
 def _query(store: Store, choices: _Choices) -> Query:
-    query = query_of(store, choices.topic, choices.choice)
-    if choices.between is not None:
-        query = query.between(*choices.between)
+    query = choices.bounded(query_of(store, choices.topics, choices.choice))
     query = query.clock(choices.clock)
     near = _near(choices)
     for predicate in choices.where:
@@ -247,6 +209,7 @@ def _query(store: Store, choices: _Choices) -> Query:
 
 def _destination(choices: _Choices) -> Destination:
     """Format and place of the answer; refuses what makes no sense before a store is opened."""
+    assert choices.topics
     _check_near(choices)
     _check_together(choices)
     usual = "jsonl" if choices.follow else None
@@ -287,6 +250,7 @@ def _check_together(choices: _Choices) -> None:
     if choices.at is not None:
         alone["--at gives one message, by log time"] = [
             (choices.between is not None, "--between"),
+            (choices.last is not None, "--last"),
             (choices.limit is not None, "--limit"),
             (choices.every > 1, "--every"),
             (choices.reverse, "--reverse"),
@@ -305,9 +269,9 @@ def _check_together(choices: _Choices) -> None:
             with_others,
         ]
     for reason, others in alone.items():
-        for given, option in others:
+        for given, name in others:
             if given:
-                raise UsageError(f"{reason}: leave out {option}.")
+                raise UsageError(f"{reason}: leave out {name}.")
 
 
 def _is_text(form: str | None) -> bool:

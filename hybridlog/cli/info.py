@@ -3,31 +3,43 @@
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.attachments import as_dict as attachment_as_dict
-from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.info_parts import (
+    attachment_as_dict,
+    show_attachments,
+    show_losses,
+    show_sizes,
+    show_topics,
+)
 from hybridlog.cli.keep import pin_cells
-from hybridlog.cli.ls import print_sizes, recording_dict, size_dict, status_text, with_misfits
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import recordings_of
+from hybridlog.cli.ls import recording_dict, status_text, with_misfits
+from hybridlog.cli.options import (
+    AsJson,
+    Choosing,
+    Forced,
+    InStore,
+    names_argument,
+    query_of,
+    recordings_of,
+)
 from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.choice import Choice
+from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import MAX_LISTED
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import SegmentError, StoreError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
     from hybridlog.drawing.density import Density
-    from hybridlog.maintenance.sizes import Size, Sizes
     from hybridlog.query.answers.video import VideoSummary
     from hybridlog.store import Store
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
@@ -40,53 +52,102 @@ _LETTERS = 40  # of the coverage bar and of the longest sparkline
 _OVER_TIME = "over time"
 
 
-@click.command()
-@click.argument(
-    "what",
-    required=False,
-    metavar="[RECORDING|SEGMENT]",
-    shell_complete=complete_recording,
-    help="A recording, as for --recording, or a segment file; without, every recording.",
-)
-@click.option(
-    "--sizes", is_flag=True, help="Also the bytes of each topic in segments, tables and MongoDB."
-)
-@options.choice
-@options.store
-@options.mongo
-@options.as_json
-def info_command(
-    *,
-    what: str | None,
-    choice: Choice,
-    sizes: bool,
-    store: Path | None,
-    mongo: str | None,
-    as_json: bool,
-) -> None:
-    """Show topics, types, rates, sizes, times, clock skew, losses."""
-    if what is not None and _is_segment(what):
-        show_segment(Path(what), as_json=as_json)
+@dataclass(frozen=True, kw_only=True)
+class _Given(Choosing, InStore, AsJson, Forced):
+    names: tuple[str, ...] = names_argument(  # type: ignore[misc]
+        "[RECORDING|SEGMENT]...", "Only a segment file, or these recordings"
+    )
+    topic: tuple[str, ...] = options.topics(
+        "Instead: the message definition and the fields of this topic. With --losses: only those "
+        "of this topic."
+    )
+    losses: bool = flag("--losses", help="Instead: what is missing, from when to when, and why.")
+    sizes: str | None = option(
+        "--sizes",
+        type=click.Choice(["recording", "topic", "both"]),
+        help="Instead: the bytes of each recording, each topic, or each topic of each recording "
+        "in segments, tables and MongoDB. Shares of what topics have in common are estimates.",
+    )
+    attachments: bool = flag("--attachments", help="Instead: the attachments of the logs.")
+    attachment: str | None = option(
+        "--attachment",
+        metavar="NAME",
+        help="Instead: the content of this attachment, or with -o those that fit a glob such as "
+        "'*.yaml'.",
+    )
+    output: Path | None = option(
+        "--output",
+        "-o",
+        type=options.PATH,
+        metavar="FILE|DIR",
+        help="Write the attachment to this file; several attachments into this directory.",
+    )
+
+
+@command(_Given)
+def info_command(given: _Given) -> None:
+    """Show topics, types, rates, sizes, times, clock skew, losses.
+
+    Options show one thing instead: the definition of a topic, losses, sizes, attachments.
+    """
+    _check(given)
+    if len(given.names) == 1 and _is_segment(given.names[0]):
+        show_segment(Path(given.names[0]), as_json=given.as_json)
         return
-    with opened_store(store, mongo, quiet=as_json) as opened:
-        if what is not None:
-            choice = replace(choice, name=(what, *choice.name))
-        chosen = [with_misfits(opened, entry) for entry in recordings_of(opened, choice)]
-        is_one = choice == Choice.of(what) and opened.is_one(choice.name)
-        index = opened.index_place
-        found = _sizes(opened.sizes([entry.id for entry in chosen])) if sizes else {}
-        extras = {entry.id: _extras(opened, entry) for entry in chosen}
-        videos = {entry.id: _videos(opened, entry) for entry in chosen[:_MAX_DRAWN]}
-        drawn = {}
-        if sys.stdout.isatty() and not as_json and len(chosen) <= _MAX_DRAWN:
-            drawn = {entry.id: _densities(opened, entry) for entry in chosen}
-    if as_json:
+    with given.opened() as store:
+        if not _show_part(store, given):
+            _show(store, given)
+
+
+def _check(given: _Given) -> None:
+    """Refuse options that do not go together."""
+    has_attachments = given.attachments or given.attachment is not None
+    parts = {
+        "--topic": bool(given.topic) and not given.losses,
+        "--losses": given.losses,
+        "--sizes": given.sizes is not None,
+        "--attachments": has_attachments,
+    }
+    asked = [name for name, wanted in parts.items() if wanted]
+    if len(asked) > 1:
+        raise UsageError(f"{' and '.join(asked)} exclude each other: give one of them.")
+    if given.output is not None and not has_attachments:
+        raise UsageError("--output is for --attachments and --attachment.")
+
+
+def _show_part(store: Store, given: _Given) -> bool:
+    """Show what options ask for instead of everything; returns whether they do."""
+    as_json = given.as_json
+    if given.losses:
+        if given.topic:
+            resolve(given.topic, store.topics())  # refuses a name that fits no topic
+        show_losses([*given.recordings_in(store)], given.topic, as_json=as_json)
+    elif given.topic:
+        query = query_of(store, given.topic, given.choice)
+        show_topics(store, query, given.topic, as_json=as_json)
+    elif given.sizes is not None:
+        show_sizes(store.sizes(given.recordings_in(store)), given.sizes, as_json=as_json)
+    elif given.attachments or given.attachment is not None:
+        found = [one for entry in given.recordings_in(store) for one in store.attachments(entry)]
+        show_attachments(found, given.attachment, given.output, force=given.force, as_json=as_json)
+    else:
+        return False
+    return True
+
+
+def _show(store: Store, given: _Given) -> None:
+    choice = given.choice
+    chosen = [with_misfits(store, entry) for entry in recordings_of(store, choice)]
+    extras = {entry.id: _extras(store, entry) for entry in chosen}
+    videos = {entry.id: _videos(store, entry) for entry in chosen[:_MAX_DRAWN]}
+    if given.as_json:
         full = [_as_dict(entry, *extras[entry.id], videos.get(entry.id, {})) for entry in chosen]
-        for about, entry in zip(full, chosen, strict=True):
-            if entry.label in found:
-                about["sizes"] = [size_dict(row) for row in found[entry.label].rows]
+        is_one = choice == Choice.of(choice.name[:1]) and store.is_one(choice.name)
         output.print_json(full[0] if is_one else full)
         return
+    drawn = {}
+    if sys.stdout.isatty() and len(chosen) <= _MAX_DRAWN:
+        drawn = {entry.id: _densities(store, entry) for entry in chosen}
     if not chosen:
         output.note("The store is empty: `hybridlog record FILE` fills it.")
     for number, entry in enumerate(chosen):
@@ -94,15 +155,11 @@ def info_command(
             output.say()
         _print_recording(
             entry,
-            index,
+            store.index_place,
             *extras[entry.id],
             videos=videos.get(entry.id, {}),
             drawn=drawn.get(entry.id),
         )
-        if entry.label in found:
-            output.say()
-            of_one = found[entry.label]
-            print_sizes(of_one.rows, of_one.total, topics=True)
 
 
 def _extras(
@@ -117,14 +174,6 @@ def _extras(
     except SegmentError as error:
         output.note(f"{entry.label}: {error}")
     return attachments, metadata
-
-
-def _sizes(of_all: Sizes) -> dict[str, Sizes]:
-    """Sizes of each recording, by its label."""
-    rows: dict[str, list[Size]] = defaultdict(list)
-    for row in of_all.rows:
-        rows[row.recording].append(row)
-    return {label: replace(of_all, rows=of_one) for label, of_one in rows.items()}
 
 
 def _is_segment(what: str) -> bool:

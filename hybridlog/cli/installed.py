@@ -14,7 +14,7 @@ from hybridlog.cli import output
 from hybridlog_storage.errors import MissingDependencyError
 
 NEEDED_FOR: Final = {
-    "foxglove": "record --foxglove, serve",
+    "foxglove": "record --foxglove, open websocket",
     "images": "compressed images, fetch -F jpg",
     "lerobot": "export -F lerobot",
     "mcp": "mcp",

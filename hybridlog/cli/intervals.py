@@ -1,204 +1,184 @@
-"""`hybridlog intervals`, `changes` and `gaps`."""
+"""`hybridlog intervals`: when a predicate held, fields changed, or nothing came."""
 
 from __future__ import annotations
 
-import sys
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import click
 
-from hybridlog.cli import options, output
-from hybridlog.cli.answers import print_cost, print_remarks
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import asked, parse_fields
+from hybridlog.cli import output
+from hybridlog.cli.answers import Answering, Listing, answering, print_cost
+from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.options import Asking, parse_fields, recordings_of
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.choice import Choice
+    from collections.abc import Mapping
+
+    from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.query.query import Query
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Choices:
-    """The parameters that the three commands have."""
+@dataclass(frozen=True, kw_only=True)
+class _Given(Asking, Listing):
+    changes: str | None = option(
+        "--changes", metavar="A,B.C", help="Instead: when these fields changed."
+    )
+    pause: str | None = option(
+        "--pause",
+        metavar="DURATION",
+        help="With --changes: longest time between steps of one change; without, 1s.",
+    )
+    tolerance: float | None = option(
+        "--tolerance",
+        type=float,
+        metavar="X",
+        help="With --changes: numbers that differ by at most this are equal.",
+    )
+    gaps: bool = flag("--gaps", help="Instead: when no message came for long.")
+    longer_than: str | None = option(
+        "--longer-than", metavar="DURATION", help="With --gaps: only longer ones: 500ms."
+    )
+    periods: float | None = option(
+        "--periods",
+        type=float,
+        metavar="K",
+        help="With --gaps: only those longer than so many usual periods of the topic; without "
+        "both, 5.",
+    )
+    rehearse: str | None = option(
+        "--rehearse",
+        metavar="TOPIC: PREDICATE",
+        help="Instead: what this trigger of `record --ring` would have kept of what is stored.",
+    )
+    before: str | None = option(
+        "--before",
+        metavar="DURATION",
+        help="With --rehearse: time before the trigger; without, 10s.",
+    )
+    after: str | None = option(
+        "--after", metavar="DURATION", help="With --rehearse: time after the trigger; without, 0."
+    )
+    at_least: str | None = option(
+        "--at-least", metavar="DURATION", help="Only those of at least this length, such as 60s."
+    )
+    length: str | None = option(
+        "--length",
+        metavar="DURATION",
+        help="Cut each into as many of exactly this length as fit, one after the other.",
+    )
+    max_gap: str | None = option(
+        "--max-gap",
+        metavar="DURATION",
+        help="A message is valid for at most this long; without, until the next one.",
+    )
+    state: str | None = option(
+        "--state",
+        type=click.Choice(["held", "not-held", "unknown"]),
+        help="When it certainly held, certainly did not, or when lost messages leave it open; "
+        "without, what the stored messages say.",
+    )
+    count: bool = flag("--count", help="Only print how many.")
 
-    store: Path | None
-    topic: str
-    between: tuple[str, str] | None
-    where: tuple[str, ...]
-    choice: Choice
-    strict: bool
-    count: bool
-    mongo: str | None
-    as_json: bool
-    quiet: bool
+    @property
+    def needs_topic(self) -> bool:  # type: ignore[override]
+        """Whether a topic has to be named."""
+        return self.rehearse is None
 
 
-@click.command()
-@options.one_topic
-@options.store
-@options.between
-@options.where
-@options.choice
-@options.at_least
-@click.option(
-    "--length",
-    metavar="DURATION",
-    help="Cut each into as many of exactly this length as fit, one after the other.",
-)
-@click.option(
-    "--max-gap",
-    metavar="DURATION",
-    help="A message is valid for at most this long; without, until the next one.",
-)
-@click.option(
-    "--state",
-    type=click.Choice(["held", "not-held", "unknown"]),
-    help="When it certainly held, certainly did not, or when lost messages leave it open; "
-    "without, what the stored messages say.",
-)
-@options.strict
-@options.count
-@options.mongo
-@options.as_json
-@options.quiet
-@options.verbose
-def intervals_command(
-    *,
-    at_least: str | None,
-    length: str | None,
-    max_gap: str | None,
-    state: str | None,
-    **parameters: Any,
-) -> None:
-    """Show when the messages of a topic satisfied a predicate.
+_ONLY_WITH = {
+    "pause": "changes",
+    "tolerance": "changes",
+    "longer_than": "gaps",
+    "periods": "gaps",
+    "before": "rehearse",
+    "after": "rehearse",
+}
+"""Options that belong to another one."""
+_OF_A_PREDICATE = ("length", "max_gap", "state")
 
-    A message is valid until the next one, or until the end of the recording.
+
+@command(_Given)
+def intervals_command(given: _Given) -> None:
+    """Show when a predicate held, fields changed, or no message came.
+
+    A message is valid until the next one, or until the end of the recording. A step of
+    --changes is a message that differs from the one before it; steps that follow each other
+    within --pause are one change. --rehearse says how often a trigger would have fired.
     """
-
-    def answer(query: Query) -> Intervals:
-        return query.intervals(at_least, length, max_gap, state and state.replace("-", " "))
-
-    _answer(parameters, answer)
-
-
-@click.command()
-@options.one_topic
-@click.option(
-    "--fields", required=True, metavar="A,B.C", help="The fields, with commas between them."
-)
-@options.store
-@options.between
-@options.where
-@options.choice
-@click.option(
-    "--pause",
-    default="1s",
-    metavar="DURATION",
-    help="Longest time between steps of one change.",
-)
-@click.option(
-    "--tolerance",
-    type=float,
-    default=0.0,
-    metavar="X",
-    help="Numbers that differ by at most this are equal.",
-)
-@options.at_least
-@options.strict
-@options.count
-@options.mongo
-@options.as_json
-@options.quiet
-@options.verbose
-def changes_command(
-    *, fields: str, pause: str, tolerance: float, at_least: str | None, **parameters: Any
-) -> None:
-    """Show when fields of a topic changed.
-
-    A step is a message that differs from the one before it. Steps that follow each other
-    within --pause are one change.
-    """
-    names = parse_fields(fields)
-
-    def answer(query: Query) -> Intervals:
-        found = query.changes(*names, pause=pause, tolerance=tolerance)
-        return found if at_least is None else found.at_least(at_least)
-
-    _answer(parameters, answer, "change")
-
-
-@click.command()
-@options.one_topic
-@click.option("--longer-than", metavar="DURATION", help="Only gaps longer than this: 500ms.")
-@click.option(
-    "--periods",
-    type=float,
-    metavar="K",
-    help="Only gaps longer than so many usual periods of the topic; without both, 5.",
-)
-@options.store
-@options.between
-@options.where
-@options.choice
-@options.strict
-@options.count
-@options.mongo
-@options.as_json
-@options.quiet
-@options.verbose
-def gaps_command(*, longer_than: str | None, periods: float | None, **parameters: Any) -> None:
-    """Show when no message of a topic came for long."""
-
-    def answer(query: Query) -> Intervals:
-        return query.gaps(longer_than, periods)
-
-    _answer(parameters, answer, "gap")
-
-
-def _answer(
-    parameters: Mapping[str, Any], answer: Callable[[Query], Intervals], noun: str = "interval"
-) -> None:
-    """Open the store, answer the query, and print the intervals.
-
-    Args:
-        parameters: Those of `_Choices`.
-        answer: Gives the intervals of the query.
-        noun: What one of them is called.
-    """
-    choices = _Choices(**parameters)
-    started = time.monotonic()
-    quiet = choices.quiet or choices.as_json
-    with opened_store(choices.store, choices.mongo, quiet=quiet) as store:
-        query = asked(
-            store,
-            [choices.topic],
-            choices.choice,
-            between=choices.between,
-            where=choices.where,
-            strict=choices.strict,
-        )
-        found = answer(query)
-        if choices.strict:
-            query.completeness().check()
-        labels = {recording.id: recording.label for recording in store.summaries()}
-        if choices.count:
+    noun = _noun(given)
+    if given.rehearse is not None:
+        _rehearse(given, given.rehearse)
+        return
+    with answering(given) as asked:
+        found = _intervals(given, asked.query)
+        if given.strict:
+            asked.query.completeness().check()
+        asked.is_empty = not len(found)
+        if given.count:
             output.say(str(len(found)))
-        elif choices.as_json:
-            output.print_json_list(_as_dict(row, labels) for row in found)
-        elif len(found):
-            _print(found, labels)
-        sys.stdout.flush()
-        if choices.quiet:
-            return
-        if not len(found) and not choices.count:
-            output.note(f"No {noun}.")
-        print_cost(query.counters, time.monotonic() - started, count=True)
-        print_remarks(query, [choices.topic], is_empty=not len(found))
+        else:
+            _show(given, found, asked)
+            if asked.is_empty and not given.quiet:
+                output.note(f"No {noun}.")
+
+
+def _noun(given: _Given) -> str:
+    """The name of what is asked for, if the options fit each other.
+
+    Raises:
+        UsageError: They do not.
+    """
+    kinds = [name for name in ("changes", "gaps", "rehearse") if getattr(given, name)]
+    if len(kinds) > 1:
+        raise UsageError(f"--{kinds[0]} and --{kinds[1]} exclude each other.")
+    for name, kind in _ONLY_WITH.items():
+        if getattr(given, name) is not None and kind not in kinds:
+            raise UsageError(f"--{name.replace('_', '-')} is for --{kind}.")
+    for name in _OF_A_PREDICATE:
+        if getattr(given, name) is not None and kinds:
+            raise UsageError(f"--{name.replace('_', '-')} is not for --{kinds[0]}.")
+    return {"changes": "change", "gaps": "gap"}.get(kinds[0] if kinds else "", "interval")
+
+
+def _intervals(given: _Given, query: Query) -> Intervals:
+    if given.changes is not None:
+        names = parse_fields(given.changes, "--changes")
+        found = query.changes(*names, pause=given.pause or "1s", tolerance=given.tolerance or 0.0)
+    elif given.gaps:
+        found = query.gaps(given.longer_than, given.periods)
+    else:
+        state = given.state and given.state.replace("-", " ")
+        return query.intervals(given.at_least, given.length, given.max_gap, state)
+    return found if given.at_least is None else found.at_least(given.at_least)
+
+
+def _show(given: _Given, found: Intervals, asked: Answering) -> None:
+    from hybridlog.query.times import format_duration, format_time
+
+    labels = {recording.id: recording.label for recording in asked.store.summaries()}
+    narrow = output.is_narrow()
+    columns: list[output.Column] = [
+        ("recording", "left"),
+        ("begin", "whole"),
+        *([] if narrow else [("end", "whole")]),  # type: ignore[list-item]
+        ("duration", "right"),
+        ("messages", "right"),
+    ]
+
+    def cells(row: Mapping[str, int]) -> list[str]:
+        begin, end = row["begin_ns"], row["end_ns"]
+        return [
+            str(row["recording"]),
+            format_time(begin),
+            *([] if narrow else [format_time(end)]),
+            format_duration(end - begin),
+            str(row["messages"]),
+        ]
+
+    given.answer((_as_dict(row, labels) for row in found), columns, cells)
 
 
 def _as_dict(row: Interval, labels: Mapping[str, str]) -> dict[str, object]:
@@ -210,29 +190,63 @@ def _as_dict(row: Interval, labels: Mapping[str, str]) -> dict[str, object]:
     }
 
 
-def _print(found: Intervals, labels: Mapping[str, str]) -> None:
-    from hybridlog.query.times import format_duration, format_time
+def _rehearse(given: _Given, trigger: str) -> None:
+    """Print what a trigger would have kept.
 
-    columns: list[output.Column] = [
-        ("recording", "left"),
-        ("begin", "whole"),
-        ("end", "whole"),
-        ("duration", "right"),
-        ("messages", "right"),
+    Raises:
+        UsageError: Options that do not fit are given.
+    """
+    if given.words or given.topic or given.where or given.between or given.to is not None:
+        raise UsageError(
+            "--rehearse is about whole snapshots: leave out topics, --where, --between, --format "
+            "and --output."
+        )
+    with given.opened() as store:
+        choice = given.choice if given.last is None else replace(given.choice, during=None)
+        chosen = [one.id for one in recordings_of(store, choice).summaries]
+        found = store.rehearse(
+            trigger,
+            since=None if given.last is None else given.since,
+            before=given.before or "10s",
+            after=given.after or 0,
+            recordings=None if choice.is_everything else chosen,
+        )
+        labels = {summary.id: summary.label for summary in store.summaries()}
+    if given.count:
+        output.say(str(len(found.snapshots)))
+    elif given.as_json:
+        output.print_json(_rehearsal_as_dict(found, labels))
+    else:
+        _print_rehearsal(found)
+    if not given.quiet:
+        output.notes(found.remarks)
+        if not found.recordings:
+            output.note("No recording is from that time.")
+        print_cost(found.counters, found.counters.elapsed_s, count=True)
+
+
+def _rehearsal_as_dict(found: Rehearsal, labels: Mapping[str, str]) -> dict[str, object]:
+    return {
+        "trigger": found.trigger,
+        "recordings": found.recordings,
+        "fired": found.fired,
+        "messages": found.messages,
+        "payload_bytes": found.payload_bytes,
+        "stored_bytes": found.stored_bytes,
+        "snapshots": [_as_dict(one, labels) for one in found.snapshots],
+    }
+
+
+def _print_rehearsal(found: Rehearsal) -> None:
+    share = 100 * found.payload_bytes / found.stored_bytes if found.stored_bytes else 0.0
+    kept = f"{output.counted(found.messages, 'message')}, {output.size(found.payload_bytes)}"
+    rows = [
+        ("trigger", found.trigger),
+        ("recordings", str(found.recordings)),
+        ("fired", output.counted(found.fired, "time")),
+        ("snapshots", str(len(found.snapshots))),
+        ("kept", f"{kept} of {output.size(found.stored_bytes)} of payload ({share:.3g} %)"),
     ]
-    if output.is_narrow():
-        del columns[2]
-
-    def cells(row: Interval) -> list[str]:
-        shown = [
-            labels[row.recording],
-            format_time(row.begin_ns),
-            format_time(row.end_ns),
-            format_duration(row.duration_ns),
-            str(row.messages),
-        ]
-        if len(columns) < len(shown):
-            del shown[2]
-        return shown
-
-    output.print_table(columns, map(cells, found))
+    width = max(len(heading) for heading, _ in rows)
+    for heading, text in rows:
+        output.say(f"{heading:<{width}}  {text}")

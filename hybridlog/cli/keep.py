@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
+from hybridlog.cli.binder import command, flag, option, repeated
 from hybridlog.cli.completion import complete_condition, complete_topic
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of, recordings_of
 from hybridlog.cli.progress import Stages, progress_bar
-from hybridlog.cli.query_options import query_of, recordings_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.query.choice import Choice
 from hybridlog.wording import listed
@@ -27,71 +26,73 @@ if TYPE_CHECKING:
 _MAX_PINS = 1000
 
 
-@click.command()
-@click.option("--quota", metavar="SIZE", help="The most that the store may take, such as 200GB.")
-@click.option("--min-free", metavar="SIZE", help="The least that stays free on the disk.")
-@click.option("--max-age", metavar="DURATION", help="Payloads older than this go, such as 30d.")
-@click.option(
-    "--topic",
-    "-t",
-    multiple=True,
-    metavar="TOPIC=AGE",
-    shell_complete=complete_topic,
-    help="Payloads of this topic go at this age, and first when room is short; earlier ones "
-    "before later ones. With --pin: TOPIC alone, to pin only this topic. Repeatable.",
-)
-@click.option(
-    "--never-tag",
-    multiple=True,
-    metavar="K=V",
-    help="Nothing of recordings with this tag goes; K alone is any value. Repeatable.",
-)
-@click.option(
-    "--fields-age",
-    metavar="DURATION",
-    help="Recordings older than this go, with fields and counts, such as 2y.",
-)
-@click.option("--save", is_flag=True, help="Write these rules into the store, for recorders too.")
-@click.option("--dry-run", is_flag=True, help="Only say what would go.")
-@click.option("--pin", is_flag=True, help="Pin recordings, or a time of them: it never goes.")
-@click.option("--at", metavar="T", help="With --pin: the time around T, see --before and --after.")
-@click.option(
-    "--when",
-    multiple=True,
-    metavar="TOPIC: PREDICATE",
-    shell_complete=complete_condition,
-    help="With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around messages "
-    "of a topic alone, or of marks. Repeatable.",
-)
-@click.option("--before", default="0s", metavar="TIME", help="With --pin: so much before it, too.")
-@click.option("--after", default="0s", metavar="TIME", help="With --pin: so much after it, too.")
-@click.option("--reason", default="", metavar="TEXT", help="With --pin: why.")
-@click.option("--unpin", multiple=True, metavar="PIN", help="Remove a pin. Repeatable.")
-@click.option("--pins", is_flag=True, help="List the pins.")
-@options.choice
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
-def keep_command(
-    *,
-    choice: Choice,
-    store: Path | None,
-    mongo: str | None,
-    as_json: bool,
-    quiet: bool,
-    **given: Any,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Given(Choosing, InStore, AsJson, Quiet):
+    quota: str | None = option(
+        "--quota", metavar="SIZE", help="The most that the store may take, such as 200GB."
+    )
+    min_free: str | None = option(
+        "--min-free", metavar="SIZE", help="The least that stays free on the disk."
+    )
+    max_age: str | None = option(
+        "--max-age", metavar="DURATION", help="Payloads older than this go, such as 30d."
+    )
+    topic: tuple[str, ...] = repeated(
+        "--topic",
+        "-t",
+        metavar="TOPIC=AGE",
+        shell_complete=complete_topic,
+        help="Payloads of this topic go at this age, and first when room is short; earlier ones "
+        "before later ones. With --pin: TOPIC alone, to pin only this topic.",
+    )
+    never_tag: tuple[str, ...] = repeated(
+        "--never-tag",
+        metavar="K=V",
+        help="Nothing of recordings with this tag goes; K alone is any value.",
+    )
+    fields_age: str | None = option(
+        "--fields-age",
+        metavar="DURATION",
+        help="Recordings older than this go, with fields and counts, such as 2y.",
+    )
+    save: bool = flag("--save", help="Write these rules into the store, for recorders too.")
+    dry_run: bool = flag("--dry-run", help="Only say what would go.")
+    pin: bool = flag("--pin", help="Pin recordings, or a time of them: it never goes.")
+    at: str | None = option(
+        "--at", metavar="T", help="With --pin: the time around T, see --before and --after."
+    )
+    when: tuple[str, ...] = repeated(
+        "--when",
+        metavar="TOPIC: PREDICATE",
+        shell_complete=complete_condition,
+        help="With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around "
+        "messages of a topic alone, or of marks.",
+    )
+    before: str = option(
+        "--before", default="0s", metavar="TIME", help="With --pin: so much before it, too."
+    )
+    after: str = option(
+        "--after", default="0s", metavar="TIME", help="With --pin: so much after it, too."
+    )
+    reason: str = option("--reason", default="", metavar="TEXT", help="With --pin: why.")
+    unpin: tuple[str, ...] = repeated("--unpin", metavar="PIN", help="Remove a pin.")
+    pins: bool = flag("--pins", help="List the pins.")
+
+
+@command(_Given)
+def keep_command(asked: _Given) -> None:
     """Keep the store within a quota; pin what never goes.
 
     Payloads go, fields and counts stay. Without options for rules, those of [retention] in
     hybridlog.toml hold. Above 80 % of the quota payloads of the topics of --topic go, above
     90 % whole segments, the oldest first. Exits with 1 when not enough may go.
     """
+    given, choice = vars(asked), asked.choice
+    as_json, quiet = asked.as_json, asked.quiet
     pinning = [name for name in ("pin", "pins", "unpin") if given[name]]
     rules = _rules(given) if not given["pin"] else {}
     _check(pinning, rules, choice, given)
-    with opened_store(store, mongo, quiet=quiet or as_json) as opened:
+    with asked.opened() as opened:
         if given["pin"]:
             found = _pin(opened, choice, given)
             if as_json:

@@ -52,7 +52,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         raise UsageError("--flush-interval must be longer than 0, and at most an hour.")
     return RecorderOptions(
         name=choices.name or _name(choices),
-        tags=parse_tags(choices.tag),
+        tags=parse_tags(choices.set_tag),
         matcher=matcher(choices.topics, choices.exclude)
         if choices.topics or choices.exclude
         else None,

@@ -128,7 +128,7 @@ class LiveSummary:
             yield line_of(row)
         if len(rows) > _MAX_ROWS:
             more = output.counted(len(rows) - _MAX_ROWS, "more place")
-            yield f"and {more} that could not be read; `hybridlog losses` lists them"
+            yield f"and {more} that could not be read; `hybridlog info --losses` lists them"
         for report in self._reports:
             if report.failure is not None:
                 yield (

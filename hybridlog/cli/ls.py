@@ -1,38 +1,32 @@
-"""`hybridlog ls` and `du`; recordings and sizes as text and as JSON."""
+"""`hybridlog ls`; recordings as text and as JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from hybridlog.cli import options, output
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import recordings_of
+from hybridlog.cli import output
+from hybridlog.cli.binder import command
+from hybridlog.cli.options import AsJson, Choosing, InStore
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from hybridlog.maintenance.sizes import Size
-    from hybridlog.query.choice import Choice
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 
-@click.command()
-@options.choice
-@options.store
-@options.mongo
-@options.as_json
-def ls_command(*, choice: Choice, store: Path | None, mongo: str | None, as_json: bool) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Given(Choosing, InStore, AsJson):
+    pass
+
+
+@command(_Given)
+def ls_command(given: _Given) -> None:
     """List the recordings."""
-    with opened_store(store, mongo, quiet=as_json) as opened:
-        recordings = recordings_of(opened, choice).summaries
-    if as_json:
+    with given.opened() as store:
+        recordings = given.recordings_in(store).summaries
+    if given.as_json:
         output.print_json([recording_dict(entry) for entry in recordings])
     elif recordings:
         _print(recordings)
@@ -71,40 +65,6 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
         output.size(entry.stored_bytes),
         ", ".join(notes),
     ]
-
-
-@click.command()
-@options.only_recordings
-@click.option(
-    "--by",
-    type=click.Choice(["recording", "topic", "both"]),
-    default="recording",
-    help="A row for each recording, for each topic, or for each topic of each recording.",
-)
-@options.choice
-@options.store
-@options.mongo
-@options.as_json
-def du_command(
-    *, choice: Choice, by: str, store: Path | None, mongo: str | None, as_json: bool
-) -> None:
-    """Show what recordings and topics take on the disk.
-
-    Sizes are those in segments, in tables and in MongoDB; the largest come first. Shares of
-    what topics have in common are estimates.
-    """
-    with opened_store(store, mongo, quiet=as_json) as opened:
-        sizes = opened.sizes(recordings_of(opened, choice))
-    rows = sizes.rows
-    if by != "both":
-        rows = sizes.by_recording() if by == "recording" else sizes.by_topic()
-    if as_json:
-        each = [size_dict(row) for row in rows]
-        output.print_json({"rows": each, "total": size_dict(sizes.total)})
-    elif rows:
-        print_sizes(rows, sizes.total, recordings=by != "topic", topics=by != "recording")
-    else:
-        output.note("The store is empty: `hybridlog record FILE` fills it.")
 
 
 _STATUS = {
@@ -158,52 +118,3 @@ def with_misfits(store: Store, recording: RecordingEntry) -> RecordingEntry:
             unreadable = min(unreadable, unfit)
         channels.append(replace(channel, stats=replace(channel.stats, unreadable=unreadable)))
     return replace(recording, channels=channels)
-
-
-NO_TOPIC = "(no topic)"
-
-
-def size_dict(row: Size) -> dict[str, Any]:
-    """A row for JSON, without empty names."""
-    return {
-        **{name: value for name, value in asdict(row).items() if value != ""},
-        "total_bytes": row.total_bytes,
-    }
-
-
-def print_sizes(
-    rows: Sequence[Size], total: Size, *, recordings: bool = False, topics: bool = False
-) -> None:
-    """Print rows and their sum.
-
-    Args:
-        rows: The rows.
-        total: The sum.
-        recordings: Whether the rows are of single recordings.
-        topics: Whether the rows are of single topics.
-    """
-    columns: list[output.Column] = [("recording", "left")] if recordings else []
-    if topics:
-        columns.append(("topic", "left"))
-    has_columns = bool(total.column_bytes)
-    columns_too = ("columns",) if has_columns else ()
-    headings = ("messages", "payload", "segments", *columns_too, "tables", "MongoDB", "total")
-    names: list[output.Column] = [(heading, "right") for heading in headings]
-    if output.is_narrow():
-        del names[:2]
-    cells = []
-    for row in (*rows, total):
-        is_total = row is total
-        named = [("total" if is_total else row.recording)] if recordings else []
-        if topics:
-            name = row.topic or NO_TOPIC
-            named.append(name if not is_total else "" if recordings else "total")
-        cells.append([*named, *_numbers(row, has_columns=has_columns)[-len(names) :]])
-    output.print_table([*columns, *names], cells)
-
-
-def _numbers(row: Size, *, has_columns: bool) -> list[str]:
-    index = "-" if row.index_bytes is None else output.size(row.index_bytes)
-    columns = [row.column_bytes] if has_columns else []
-    sizes = [row.payload_bytes, row.segment_bytes, *columns, row.table_bytes]
-    return [str(row.messages), *map(output.size, sizes), index, output.size(row.total_bytes)]

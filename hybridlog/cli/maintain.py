@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.binder import argument, command, flag
+from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet
 from hybridlog.cli.progress import Stages, progress_bar
-from hybridlog.cli.query_options import recordings_of
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, StoreError, UsageError, WithoutMongoError
@@ -21,42 +21,33 @@ from hybridlog_storage.errors import DatabaseError, StoreError, UsageError, With
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import CompactedTopic
     from hybridlog.maintenance.verify import Verification
-    from hybridlog.query.choice import Choice
 
 
-@click.command()
-@options.only_recordings
-@options.choice
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
-def verify_command(
-    *,
-    choice: Choice,
-    store: Path | None,
-    mongo: str | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Verify(Named, InStore, AsJson, Quiet):
+    pass
+
+
+@command(_Verify)
+def verify_command(given: _Verify) -> None:
     """Read everything, check checksums and references.
 
     Exits with 1 when it finds a problem, and prints a cure for each.
     """
     started = time.monotonic()
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        chosen = recordings_of(opened, choice)
+    with given.opened(quiet=given.quiet) as store:
+        chosen = given.recordings_in(store)
         total = sum(entry.stored_bytes for entry in chosen.summaries)
-        with progress_bar("verify", total, quiet=quiet) as bar:
-            result = opened.verify(None if choice.is_everything else chosen, Stages(bar))
-        why = opened.without_database
+        with progress_bar("verify", total, quiet=given.quiet) as bar:
+            result = store.verify(None if given.choice.is_everything else chosen, Stages(bar))
+        why = store.without_database
     elapsed = time.monotonic() - started
-    if as_json:
+    if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
-        _print(result, elapsed, quiet=quiet)
+        _print(result, elapsed, quiet=given.quiet)
         running = [one.label for one in chosen.summaries if one.status == "open"]
-        if running and not quiet:
+        if running and not given.quiet:
             output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
     is_wanted = not isinstance(why, WithoutMongoError)
     if not result.index and is_wanted and (result.findings or why is None):
@@ -85,94 +76,63 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
     )
 
 
-@click.command()
-@options.only_recordings
-@options.choice
-@options.store
-@click.option("--moved", is_flag=True, help="The store was moved to here: take its index over.")
-@click.option(
-    "--new-id",
-    is_flag=True,
-    help="The store is a copy: give it an id of its own, with the index at --mongo.",
-)
-@options.mongo
-@options.as_json
-@options.quiet
-def repair_command(
-    *,
-    choice: Choice,
-    store: Path | None,
-    moved: bool,
-    new_id: bool,
-    mongo: str | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Repair(Named, InStore, AsJson, Quiet):
+    moved: bool = flag("--moved", help="The store was moved to here: take its index over.")
+    new_id: bool = flag(
+        "--new-id",
+        help="The store is a copy: give it an id of its own, with the index at --mongo.",
+    )
+
+
+@command(_Repair)
+def repair_command(given: _Repair) -> None:
     """Repair what can be repaired without losing anything.
 
     It restores the names of segments, writes damaged summaries and journals again, and brings
     catalog and index up to date. Exits with 1, and a list, when only a copy can restore the
     rest.
     """
-    if moved and new_id:
+    if given.moved and given.new_id:
         raise UsageError("A store was moved or it is a copy: give --moved or --new-id, not both.")
-    if new_id:
+    if given.new_id:
         from hybridlog.maintenance.lease import become_another
         from hybridlog.store import store_path
 
-        become_another(store_path(store), mongo)
+        become_another(store_path(given.store), given.mongo)
         output.say("the store has a new id now")
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        if moved:
-            opened.take_over()
+    with given.opened(quiet=given.quiet) as store:
+        if given.moved:
+            store.take_over()
             output.say("the index belongs to the store at this place now")
-        chosen = None if choice.is_everything else recordings_of(opened, choice)
-        with progress_bar("repair", 0, quiet=quiet) as bar:
-            done = opened.repair(chosen, Stages(bar))
+        chosen = None if given.choice.is_everything else given.recordings_in(store)
+        with progress_bar("repair", 0, quiet=given.quiet) as bar:
+            done = store.repair(chosen, Stages(bar))
     left = [one for one in done if not one.is_cured]
-    if as_json:
+    if given.as_json:
         output.print_json([asdict(one) for one in done])
     else:
         for one in done:
             result = "mended" if one.is_cured else "left"
             of = f"{one.recording}: " if one.recording else ""
             output.say(f"{of}{one.place}: {result}: {one.done}")
-        if not done and not quiet:
+        if not done and not given.quiet:
             output.say("nothing to mend")
     if left:
         raise click.exceptions.Exit(1)
 
 
-@click.command()
-@options.choice
-@options.only_topics
-@click.option(
-    "--older-than",
-    metavar="DURATION",
-    help="Only recordings whose last message is at least this old, such as 1d.",
-)
-@click.option(
-    "--drop-mcap",
-    is_flag=True,
-    help="Take payloads that are in columns out of the segments.",
-)
-@click.option("--dry-run", is_flag=True, help="Only say what would be done.")
-@options.store
-@options.mongo
-@options.as_json
-@options.quiet
-def compact_command(
-    *,
-    choice: Choice,
-    topic: tuple[str, ...],
-    older_than: str | None,
-    drop_mcap: bool,
-    dry_run: bool,
-    store: Path | None,
-    mongo: str | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Compact(Choosing, InStore, AsJson, Quiet):
+    topic: tuple[str, ...] = options.topics()
+    drop_mcap: bool = flag(
+        "--drop-mcap", help="Take payloads that are in columns out of the segments."
+    )
+    dry_run: bool = flag("--dry-run", help="Only say what would be done.")
+
+
+@command(_Compact)
+def compact_command(given: _Compact) -> None:
     """Write payloads into columns that any reader opens.
 
     Of ended recordings: laser scans, point clouds by their own fields, images, and other
@@ -180,28 +140,25 @@ def compact_command(
     before the columns are used. Without --topic, topics are chosen that consist of arrays
     mostly.
     """
-    from hybridlog.query.times import parse_duration
-
-    age = 0 if older_than is None else parse_duration(older_than)
+    choice = given.choice
     with (
-        opened_store(store, mongo, quiet=quiet) as opened,
+        given.opened(quiet=given.quiet) as store,
         if_stopped("Recordings that were finished have their columns; run it again."),
-        progress_bar("compact", 0, quiet=quiet) as bar,
+        progress_bar("compact", 0, quiet=given.quiet) as bar,
     ):
-        found = opened.compact(
-            None if choice.is_everything else recordings_of(opened, choice),
-            topic or None,
-            older_than_ns=age,
-            drop_mcap=drop_mcap,
-            dry_run=dry_run,
+        found = store.compact(
+            None if choice.is_everything else given.recordings_in(store),
+            given.topic or None,
+            drop_mcap=given.drop_mcap,
+            dry_run=given.dry_run,
             progress=Stages(bar),
         )
-    if as_json:
+    if given.as_json:
         output.print_json([asdict(one) for one in found])
         return
     for one in found:
-        output.say(_told(one, dry_run=dry_run))
-    if not found and not quiet:
+        output.say(_told(one, dry_run=given.dry_run))
+    if not found and not given.quiet:
         output.say("nothing to compact")
 
 
@@ -224,28 +181,26 @@ def _told(one: CompactedTopic, *, dry_run: bool) -> str:
     return f"{one.recording} {one.topic}: {'; '.join(parts)}"
 
 
-@click.command("import")
-@click.argument("other", type=options.PATH, metavar="STORE", help="Directory of the other store.")
-@options.choice
-@options.store
-@options.as_json
-@options.quiet
-def import_command(
-    *, other: Path, choice: Choice, store: Path | None, as_json: bool, quiet: bool
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Import(Choosing, InStore, AsJson, Quiet):
+    other: Path = argument(type=options.PATH, metavar="STORE", help="Directory of the other store.")
+
+
+@command(_Import, "import")
+def import_command(given: _Import) -> None:
     """Copy recordings from another store.
 
     Every byte is checked. After an interruption, run it again: copied recordings stay.
     """
     with (
-        opened_store(store, None, create=True, quiet=quiet) as opened,
+        given.opened(create=True, quiet=given.quiet) as store,
         if_stopped("Run the command again: copied recordings are not copied again."),
-        progress_bar("import", 0, quiet=quiet) as bar,
+        progress_bar("import", 0, quiet=given.quiet) as bar,
     ):
-        report = opened.import_from(other, choice, Stages(bar))
-    if as_json:
+        report = store.import_from(given.other, given.choice, Stages(bar))
+    if given.as_json:
         output.print_json(asdict(report))
-    elif not quiet:
+    elif not given.quiet:
         for label in report.imported:
             output.say(f"imported {label}")
         for label in report.known:

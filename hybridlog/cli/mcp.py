@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
 
-import click
-
-from hybridlog.cli import options
+from hybridlog.cli.binder import command
+from hybridlog.cli.options import Place
 from hybridlog_storage.errors import MissingDependencyError
 
 
-@click.command()
-@options.store
-def mcp_command(*, store: Path | None) -> None:
-    """Answer the questions of an assistant, which starts this program.
+@dataclass(frozen=True, kw_only=True)
+class _Given(Place):
+    pass
+
+
+@command(_Given)
+def mcp_command(given: _Given) -> None:
+    """Answer the questions of an assistant, which starts it.
 
     It speaks the Model Context Protocol over standard input and output. The store is only read;
     answers are bounded and say what they lack.
@@ -24,5 +27,5 @@ def mcp_command(*, store: Path | None) -> None:
         raise MissingDependencyError("mcp needs: pip install 'hybridlog[mcp]'") from error
     from hybridlog.store import open_store
 
-    with open_store(store, read_only=True) as opened:
+    with open_store(given.store, read_only=True) as opened:
         serve(opened)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -10,17 +12,21 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answers import check_room, not_written, print_remarks
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import asked
+from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
+from hybridlog.cli.binder import argument, command, flag, option, repeated
+from hybridlog.cli.options import Filtered, Forced, names_argument
+from hybridlog.cli.serve import check_installed, play
 from hybridlog.cli.signals import if_stopped
-from hybridlog_storage.errors import HybridlogError, MissingDependencyError
+from hybridlog.formats.slices import SliceCache
+from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.choice import Choice
     from hybridlog.query.query import Query
+    from hybridlog.store import Store
 
-_PLAY = "`hybridlog serve` plays to the one in the browser"
+_WEBSOCKET: Final = "websocket"
+_PORT: Final = 8765
+_PLAY: Final = "`hybridlog open websocket` plays to the one in the browser"
 
 
 class _Viewer(NamedTuple):
@@ -45,79 +51,113 @@ _VIEWERS: Final = {
 }
 
 
-@click.command()
-@click.argument(
-    "viewer",
-    type=click.Choice(sorted(_VIEWERS)),
-    metavar="VIEWER",
-    help="foxglove, lichtblick or rerun. Where only Lichtblick is installed, foxglove is that.",
-)
-@options.only_recordings
-@options.only_topics
-@options.store
-@options.between
-@options.where
-@options.choice
-@click.option(
-    "--output",
-    "-o",
-    "path",
-    type=options.PATH,
-    metavar="FILE",
-    help="Write the slice to this MCAP file; without, into the user's cache.",
-)
-@options.strict
-@options.force
-@options.mongo
-@options.quiet
-def open_command(
-    *,
-    viewer: str,
-    choice: Choice,
-    topic: tuple[str, ...],
-    store: Path | None,
-    between: tuple[str, str] | None,
-    where: tuple[str, ...],
-    path: Path | None,
-    strict: bool,
-    force: bool,
-    mongo: str | None,
-    quiet: bool,
-) -> None:
-    """Open a slice in Foxglove, Lichtblick or Rerun.
+@dataclass(frozen=True, kw_only=True)
+class _Given(Filtered, Forced):
+    viewer: str = argument(
+        type=click.Choice([*sorted(_VIEWERS), _WEBSOCKET]),
+        metavar="VIEWER",
+        help="foxglove, lichtblick or rerun, which is started; websocket plays to those that "
+        "connect. Where only Lichtblick is installed, foxglove is that.",
+    )
+    names: tuple[str, ...] = names_argument()  # type: ignore[misc]
+    path: Path | None = option(
+        "--output",
+        "-o",
+        type=options.PATH,
+        metavar="FILE",
+        help="Write the slice to this MCAP file; without, into the user's cache.",
+    )
+    port: int | None = option(
+        "--port",
+        type=click.IntRange(0, 65535),
+        metavar="N",
+        help="With websocket: TCP port on this computer, 0 for a free one; without, 8765.",
+    )
+    speed: float | None = option(
+        "--speed",
+        type=click.FloatRange(0.01, 100),
+        metavar="N",
+        help="With websocket: times as fast as recorded, 0.01 to 100; viewers can change it.",
+    )
+    loop: bool = flag("--loop", help="With websocket: begin again at the end.")
+    paused: bool = flag("--paused", help="With websocket: wait until a viewer plays.")
+    origins: tuple[str, ...] = repeated(
+        "--allow-origin",
+        metavar="URL",
+        help="With websocket: let a web page of this origin connect, such as "
+        "https://viewer.example; Foxglove and pages of this computer may.",
+    )
 
-    The program has to be installed. The slice is written as an MCAP file first. The command
-    ends when the program does.
+
+@command(_Given)
+def open_command(given: _Given) -> None:
+    """Open a slice in Foxglove, Lichtblick or Rerun, or play it.
+
+    A viewer has to be installed. The slice is written as an MCAP file first, and the command
+    ends when the program does. `open websocket` plays recordings over a WebSocket, also to
+    viewers in the browser: they play, pause, seek and change the speed. Ctrl-C ends it.
     """
-    import subprocess
-
-    from hybridlog.cli.answers import write_answer
-    from hybridlog.formats.slices import SliceCache
-
-    program = _find(viewer)
-    if path is not None:
-        check_room(path, force=force)
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
-
-        def write(query: Query, path: Path) -> None:
-            write_answer(query, "mcap", path, extras=query.extras(), quiet=quiet)
-
-        if path is None:
-            ids = query.recordings
-            name = opened.entry(ids[0]).label if len(ids) == 1 else "slice"
-            path = SliceCache().get(query, name, write)
-        else:
-            with if_stopped(partial(not_written, path)):
-                write(query, path)
-        if not quiet:
-            print_remarks(query, topic, is_empty=False)
+    _check(given)
+    if given.viewer == _WEBSOCKET:
+        check_installed()
+        with given.opened(is_lasting=True) as store:
+            play(
+                given.query(store),
+                given.choice.name,
+                given.topics,
+                quiet=given.quiet,
+                port=_PORT if given.port is None else given.port,
+                speed=given.speed or 1.0,
+                loops=given.loop,
+                is_paused=given.paused,
+                origins=given.origins,
+            )
+        return
+    program = _find(given.viewer)
+    with given.opened() as store:
+        query = given.query(store)
+        path = _written(store, query, given)
+        if not given.quiet:
+            print_remarks(query, given.topics, is_empty=False)
             output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
     ended = subprocess.run(  # noqa: S603
-        [program, *_VIEWERS[viewer].options, path.absolute()], check=False
+        [program, *_VIEWERS[given.viewer].options, path.absolute()], check=False
     )
     if ended.returncode:
         raise HybridlogError(f"{program} ended with exit code {ended.returncode}.")
+
+
+def _check(given: _Given) -> None:
+    """Refuse options of the other way to show a slice.
+
+    Raises:
+        UsageError: There are some, or the output exists.
+    """
+    if given.viewer == _WEBSOCKET:
+        if given.path is not None:
+            raise UsageError("--output is the file for a viewer; websocket writes none.")
+        return
+    if given.port is not None or given.speed or given.loop or given.paused or given.origins:
+        raise UsageError(
+            "--port, --speed, --loop, --paused and --allow-origin are for `open websocket`."
+        )
+    if given.path is not None:
+        check_room(given.path, force=given.force)
+
+
+def _written(store: Store, query: Query, given: _Given) -> Path:
+    """The slice as an MCAP file."""
+
+    def write(query: Query, path: Path) -> None:
+        write_answer(query, "mcap", path, extras=query.extras(), quiet=given.quiet)
+
+    if given.path is None:
+        ids = query.recordings
+        name = store.entry(ids[0]).label if len(ids) == 1 else "slice"
+        return SliceCache().get(query, name, write)
+    with if_stopped(partial(not_written, given.path)):
+        write(query, given.path)
+    return given.path
 
 
 def _find(viewer: str) -> str:

@@ -1,14 +1,18 @@
-"""Parameters that several commands share, and types of parameters."""
+"""Options that several commands share, as base classes of their options."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import wraps
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import click
 
+from hybridlog.cli import output
+from hybridlog.cli.binder import argument, flag, option, repeated
 from hybridlog.cli.completion import (
     complete_condition,
     complete_recording,
@@ -17,241 +21,393 @@ from hybridlog.cli.completion import (
     complete_topic,
     complete_type,
 )
-from hybridlog.cli.output import parse_size
+from hybridlog.cli.open_store import opened_store
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import UsageError
 
+if TYPE_CHECKING:
+    from hybridlog.query.query import Query
+    from hybridlog.recordings import Recordings
+    from hybridlog.store import Store
+
 PATH: Final = click.Path(readable=False, path_type=Path)
 """A path that click does not check: the library's errors name a cure and have exit codes."""
-
-store = click.option(
-    "--store",
-    type=PATH,
-    envvar="HYBRIDLOG_STORE",
-    show_envvar=True,
-    metavar="DIR",
-    help="Directory of the store.",
-)
-mongo = click.option(
-    "--mongo",
-    envvar="HYBRIDLOG_MONGO_URI",
-    show_envvar=True,
-    metavar="URI",
-    help="URI of the MongoDB that holds the index, 'embedded' for our own, or 'none'; without, "
-    "the one that the store was made with.",
-)
-cache_size = click.option(
-    "--cache-size",
-    type=int,
-    envvar="HYBRIDLOG_CACHE_SIZE",
-    show_envvar=True,
-    metavar="MB",
-    help="Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
-    "made with, or 256.",
-)
 VERBOSE: Final = f"{__name__}.verbose"
 """Key in `click.Context.meta`: True with `--verbose`."""
 
-as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON, for scripts.")
-quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, no tables; errors only.")
-verbose = click.option(
-    "--verbose",
-    "-v",
-    is_flag=True,
-    expose_value=False,
-    callback=lambda ctx, _, value: ctx.meta.update({VERBOSE: value}),
-    help="Say what the answer has cost.",
-)
-force = click.option("--force", "-f", is_flag=True, help="Overwrite existing files.")
-strict = click.option(
-    "--strict",
-    is_flag=True,
-    help="Fail, with exit code 11, if the ledger knows of losses in this range.",
-)
-count = click.option("--count", is_flag=True, help="Only print how many.")
-_CHOICE: Final = (
-    click.option(
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """The option of all commands on a store."""
+
+    store: Path | None = option(
+        "--store",
+        type=PATH,
+        envvar="HYBRIDLOG_STORE",
+        show_envvar=True,
+        metavar="DIR",
+        help="Directory of the store.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InStore(Place):
+    """Options of commands that may ask MongoDB."""
+
+    mongo: str | None = option(
+        "--mongo",
+        envvar="HYBRIDLOG_MONGO_URI",
+        show_envvar=True,
+        metavar="URI",
+        help="URI of the MongoDB that holds the index, 'embedded' for our own, or 'none'; "
+        "without, the one that the store was made with.",
+    )
+
+    def opened(self, **how: Any) -> AbstractContextManager[Store]:
+        """The open store; see `opened_store`."""
+        how.setdefault("quiet", getattr(self, "quiet", False) or getattr(self, "as_json", False))
+        return opened_store(self.store, self.mongo, **how)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AsJson:
+    """The option of commands that print JSON."""
+
+    as_json: bool = flag("--json", help="Print JSON, for scripts.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quiet:
+    """The option of commands that say more than their answer."""
+
+    quiet: bool = flag("--quiet", "-q", help="No progress, no tables; errors only.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forced:
+    """The option of commands that write files."""
+
+    force: bool = flag("--force", "-f", help="Overwrite existing files.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strict:
+    """The option of commands that can refuse incomplete answers."""
+
+    strict: bool = flag(
+        "--strict", help="Fail, with exit code 11, if the ledger knows of losses in this range."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choosing:
+    """Options that choose recordings.
+
+    Attributes:
+        names: Names in an argument of the command count as `--recording`.
+    """
+
+    names: ClassVar[tuple[str, ...]] = ()
+    recording: tuple[str, ...] = repeated(
         "--recording",
         "-r",
-        multiple=True,
         metavar="RECORDING",
         shell_complete=complete_recording,
         help="Only this recording: label, name, the beginning of a label or an id, or a glob "
-        "such as 'monday*'. Repeatable.",
-    ),
-    click.option(
+        "such as 'monday*'.",
+    )
+    tag: tuple[str, ...] = repeated(
         "--tag",
-        multiple=True,
         metavar="K=V",
         shell_complete=complete_tag,
-        help="Only recordings with this tag; K alone is any value. Repeatable.",
-    ),
-    click.option(
+        help="Only recordings with this tag; K alone is any value.",
+    )
+    has: tuple[str, ...] = repeated(
         "--has",
-        multiple=True,
         metavar="TOPIC",
         shell_complete=complete_topic,
-        help="Only recordings with this topic. Repeatable.",
-    ),
-    click.option(
+        help="Only recordings with this topic.",
+    )
+    types: tuple[str, ...] = repeated(
         "--type",
-        "types",
-        multiple=True,
         metavar="TYPE",
         shell_complete=complete_type,
-        help="Only recordings with messages of this type: sensor_msgs/Imu, Imu, or a glob. "
-        "Repeatable.",
-    ),
-    click.option(
+        help="Only recordings with messages of this type: sensor_msgs/Imu, Imu, or a glob.",
+    )
+    during: tuple[str, str] | None = option(
         "--during",
         nargs=2,
         metavar="T0 T1",
         help="Only recordings with a time in this range: ISO 8601, epoch seconds, now, start, end.",
-    ),
-    click.option(
+    )
+    last: str | None = option(
+        "--last",
+        metavar="DURATION",
+        help="Only from so long ago until now, such as 30d: recordings, and their messages.",
+    )
+    older_than: str | None = option(
+        "--older-than",
+        metavar="DURATION",
+        help="Only recordings whose last message is at least this old, such as 30d.",
+    )
+    conditions: tuple[str, ...] = repeated(
         "--with",
-        "conditions",
-        multiple=True,
         metavar="TOPIC: PREDICATE",
         shell_complete=complete_condition,
         help="Only recordings with a message that satisfies this, such as "
-        "'scan: ranges.min < 0.5'. Repeatable.",
-    ),
-)
+        "'scan: ranges.min < 0.5'.",
+    )
+
+    @property
+    def choice(self) -> Choice:
+        """The conditions for recordings.
+
+        Raises:
+            UsageError: `--last` and `--during` are given.
+        """
+        during: Any = self.during
+        if self.last is not None:
+            if during is not None:
+                raise UsageError("--last is a range of time, as --during: give one of them.")
+            during = self.since, None
+        return Choice.of(
+            (*self.names, *self.recording),
+            tag=self.tag,
+            has=self.has,
+            type=self.types,
+            during=during,
+            where=self.conditions,
+            older_than=self.older_than,
+        )
+
+    @property
+    def since(self) -> int:
+        """The log time at which `--last` begins, ns."""
+        from hybridlog.query.times import parse_duration
+
+        return max(time.time_ns() - parse_duration(self.last or 0), 0)
+
+    def recordings_in(self, store: Store) -> Recordings:
+        """The chosen recordings; see `recordings_of`."""
+        return recordings_of(store, self.choice)
 
 
-def choice(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that choose recordings; the function gets them as `choice`.
+def names_argument(metavar: str = "[RECORDING]...", what: str = "Only these recordings") -> Any:
+    """The argument that names recordings."""
+    return argument(
+        nargs=-1,
+        metavar=metavar,
+        shell_complete=complete_recording,
+        help=f"{what}, as for --recording; without, all.",
+    )
 
-    Names in an argument of the command called `names` count as `--recording`.
+
+@dataclass(frozen=True, kw_only=True)
+class Named(Choosing):
+    """Options that choose recordings, whose names may be arguments, too."""
+
+    names: tuple[str, ...] = names_argument()  # type: ignore[misc]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Between:
+    """The option of commands about a range of time."""
+
+    between: tuple[str, str] | None = option(
+        "--between",
+        nargs=2,
+        metavar="T0 T1",
+        help="From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
+        "integer nanoseconds, +5s or 1m30s from the start, -10s from the end, start, end.",
+    )
+
+
+def topics(
+    what: str = "Only this topic: full name, an unambiguous short one (scan), a glob, or re:REGEX.",
+) -> Any:
+    """The option that names topics."""
+    return repeated("--topic", "-t", metavar="TOPIC", shell_complete=complete_topic, help=what)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topics(Between, Choosing, InStore, Quiet):
+    """Options of commands about messages of some topics.
+
+    Attributes:
+        words: Topics as arguments of the command.
+        where: Predicates that all messages satisfy.
+        strict: Incomplete answers are refused.
+        needs_topic: Without a topic, the question is refused: all would be too much.
     """
 
-    @wraps(function)
-    def chosen(
-        *,
-        recording: tuple[str, ...],
-        tag: tuple[str, ...],
-        has: tuple[str, ...],
-        types: tuple[str, ...],
-        during: tuple[str, str] | None,
-        conditions: tuple[str, ...],
-        names: tuple[str, ...] = (),
-        **others: Any,
-    ) -> Any:
-        made = Choice.of(
-            (*names, *recording), tag=tag, has=has, type=types, during=during, where=conditions
-        )
-        return function(choice=made, **others)
+    needs_topic: ClassVar[bool] = False
+    words: ClassVar[tuple[str, ...]] = ()
+    where: ClassVar[tuple[str, ...]] = ()
+    strict: ClassVar[bool] = False
+    topic: tuple[str, ...] = topics()
 
-    for option in reversed(_CHOICE):
-        chosen = option(chosen)
-    return chosen
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics as typed.
+
+        Raises:
+            UsageError: There is none, and one is needed.
+        """
+        found = (*self.words, *self.topic)
+        if self.needs_topic and not found:
+            raise click.UsageError("Missing TOPIC; `hybridlog info` lists the topics.")
+        return found
+
+    def query(self, store: Store) -> Query:
+        """The query about these topics, recordings, times and predicates.
+
+        Raises:
+            TopicError: A name fits nothing, or several things; or no recording is chosen.
+            TimeError: `between` is no range of time.
+            WhereError: A predicate cannot be parsed, or does not fit the fields.
+            IncompleteError: `--strict`, and messages of the range are lost.
+        """
+        query = self.bounded(query_of(store, self.topics, self.choice))
+        for predicate in self.where:
+            query = query.where(predicate)
+        if self.strict:
+            query.completeness().check()
+        return query
+
+    def bounded(self, query: Query) -> Query:
+        """The messages of a query in the range of `--between` or `--last`."""
+        if self.between is None:
+            return query if self.last is None else query.between(self.since)
+        if self.last is not None:
+            raise UsageError("--last is a range of time, as --between: give one of them.")
+        return query.between(*self.between)
 
 
-running = click.option(
-    "--recording",
-    "-r",
-    multiple=True,
-    metavar="RECORDING",
-    shell_complete=complete_running,
-    help="Only this recorder (id or name of its recording, or the beginning of the id). "
-    "Repeatable.",
-)
-only_recordings = click.argument(
-    "names",
-    nargs=-1,
-    metavar="[RECORDING]...",
-    shell_complete=complete_recording,
-    help="Only these recordings, as for --recording; without, all.",
-)
-one_recording = click.argument(
-    "recording",
-    metavar="RECORDING",
-    shell_complete=complete_recording,
-    help="A recording: label, name, or the beginning of its id.",
-)
-one_topic = click.option(
-    "--topic",
-    "-t",
-    required=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="Full name, or an unambiguous short one (scan).",
-)
-topics = click.option(
-    "--topic",
-    "-t",
-    required=True,
-    multiple=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="Full name, an unambiguous short one (scan), a glob, or re:REGEX. Repeatable.",
-)
-only_topics = click.option(
-    "--topic",
-    "-t",
-    multiple=True,
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="Only these topics. Repeatable.",
-)
-between = click.option(
-    "--between",
-    nargs=2,
-    metavar="T0 T1",
-    help="From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
-    "integer nanoseconds, +5s or 1m30s from the start, -10s from the end, start, end.",
-)
-no_latched = click.option(
-    "--no-latched",
-    is_flag=True,
-    help="With --between: leave out the latched messages and frames of video from before it.",
-)
-original_times = click.option(
-    "--original-times",
-    is_flag=True,
-    help="Latched messages and frames from before the time range keep their log time.",
-)
-where = click.option(
-    "--where",
-    multiple=True,
-    metavar="PREDICATE",
-    help="Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'. "
-    "Repeatable.",
-)
-near = click.option(
-    "--tolerance",
-    metavar="DURATION",
-    help="Greatest distance in time, such as 20ms; without, any.",
-)
-in_frame = click.option(
-    "--in-frame",
-    "frame",
-    metavar="FRAME",
-    help="Points and poses in this frame, such as map, at the times of their headers.",
-)
-bag_storage = click.option(
-    "--storage",
-    type=click.Choice(["mcap", "sqlite3"]),
-    help="For rosbag2: the storage of the bag; without, mcap.",
-)
-bag_file_size = click.option(
-    "--file-size",
-    metavar="SIZE",
-    help="For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
-)
-tag_columns = click.option(
-    "--tags", metavar="A,B", help="Tags of the recordings as columns, with commas between them."
-)
-at_least = click.option(
-    "--at-least",
-    metavar="DURATION",
-    help="Only those of at least this length, such as 60s.",
-)
-tags = click.option(
-    "--tag", multiple=True, metavar="K=V", help="Store KEY=VALUE with it. Repeatable."
-)
+@dataclass(frozen=True, kw_only=True)
+class Filtered(Strict, Topics):
+    """Options of commands about messages that satisfy predicates."""
+
+    where: tuple[str, ...] = repeated(  # type: ignore[misc]
+        "--where",
+        metavar="PREDICATE",
+        help="Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'.",
+    )
+
+
+def _note_verbose(context: click.Context, _: click.Parameter, wanted: bool) -> bool:  # noqa: FBT001
+    context.meta[VERBOSE] = wanted
+    return wanted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verbose:
+    """The option of commands that can tell the cost of an answer."""
+
+    verbose: bool = flag(
+        "--verbose", "-v", callback=_note_verbose, help="Say what the answer has cost."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asking(Filtered, Verbose):
+    """Options of commands that answer about topics."""
+
+    words: tuple[str, ...] = argument(  # type: ignore[misc]
+        nargs=-1,
+        metavar="[TOPIC]...",
+        shell_complete=complete_topic,
+        help="Topics, as for --topic.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Running(InStore, Quiet):
+    """Options of commands to a recorder."""
+
+    recording: tuple[str, ...] = repeated(
+        "--recording",
+        "-r",
+        metavar="RECORDING",
+        shell_complete=complete_running,
+        help="Only this recorder (id or name of its recording, or the beginning of the id).",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latched:
+    """Options about messages from before a slice."""
+
+    no_latched: bool = flag(
+        "--no-latched",
+        help="With --between: leave out the latched messages and frames of video from before it.",
+    )
+    original_times: bool = flag(
+        "--original-times",
+        help="Latched messages and frames from before the time range keep their log time.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slices(Latched, Forced):
+    """Options of commands that write slices of logs, or tables."""
+
+    split: str | None = option(
+        "--split-by",
+        metavar="HOW",
+        help="A file for each `recording`, each `mark`, or each interval in which a predicate "
+        "holds: 'odom: twist.twist.linear.x > 0.1'. Their names follow that of the output.",
+    )
+    tags: str | None = option(
+        "--tags",
+        metavar="A,B",
+        help="Tags of the recordings as columns, with commas between them.",
+    )
+    storage: str | None = option(
+        "--storage",
+        type=click.Choice(["mcap", "sqlite3"]),
+        help="For rosbag2: the storage of the bag; without, mcap.",
+    )
+    file_size: str | None = option(
+        "--file-size",
+        metavar="SIZE",
+        help="For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, "
+        "2GiB.",
+    )
+
+
+def one_recording(**settings: Any) -> Any:
+    """The argument that names one recording."""
+    return argument(
+        **{
+            "metavar": "RECORDING",
+            "shell_complete": complete_recording,
+            "help": "A recording: label, name, or the beginning of its id.",
+            **settings,
+        }
+    )
+
+
+def in_frame() -> Any:
+    """The option for points and poses in another frame."""
+    return option(
+        "--in-frame",
+        metavar="FRAME",
+        help="Points and poses in this frame, such as map, at the times of their headers.",
+    )
+
+
+def cache_size() -> Any:
+    """The option of commands that start the embedded MongoDB for long."""
+    return option(
+        "--cache-size",
+        type=int,
+        envvar="HYBRIDLOG_CACHE_SIZE",
+        show_envvar=True,
+        metavar="MB",
+        help="Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
+        "made with, or 256.",
+    )
 
 
 def check_latched(*, no_latched: bool, original_times: bool, form: str | None) -> None:
@@ -288,7 +444,7 @@ def bag_settings(storage: str | None, file_size: str | None, form: str) -> dict[
         return {}
     settings: dict[str, Any] = {"storage": storage or "mcap"}
     if file_size is not None:
-        settings["max_file"] = parse_size(file_size)
+        settings["max_file"] = output.parse_size(file_size)
         if not settings["max_file"]:
             raise UsageError("--file-size must be more than 0.")
     return settings
@@ -317,3 +473,49 @@ def parse_tags(pairs: Iterable[str]) -> dict[str, str]:
             raise UsageError(f"A tag is written KEY=VALUE, not {pair!r}.")
         tags[key] = value
     return tags
+
+
+def recordings_of(store: Store, choice: Choice) -> Recordings:
+    """The chosen recordings; of an empty store none, if nothing is asked of them.
+
+    Raises:
+        TopicError: No recording satisfies the choice; says which condition none does.
+    """
+    chosen = store.choose(choice)
+    return chosen if choice.is_everything else chosen.check()
+
+
+def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Query:
+    """A query of some topics of the chosen recordings.
+
+    Short names and globs are resolved among the topics of the chosen recordings. A name that
+    is ambiguous in the store may be clear in one recording.
+
+    Args:
+        store: The store.
+        topics: As typed; None or empty for all.
+        choice: The recordings.
+
+    Raises:
+        TopicError: A name fits nothing, or several things; or no recording is chosen.
+    """
+    if choice.is_everything:
+        if not topics:
+            return store.all_topics()
+        return store.topic(*topics)
+    chosen = recordings_of(store, choice)
+    if not topics:
+        return chosen.all_topics()
+    return chosen.topic(*topics)
+
+
+def parse_fields(text: str, option: str = "--fields") -> list[str]:
+    """The names of --fields or a similar option, each once.
+
+    Raises:
+        UsageError: A name is empty.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise UsageError(f"{option} takes names with commas between them, not {text!r}.")
+    return list(dict.fromkeys(names))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import re
 import sys
-import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.answers import check_room, not_written, print_cost, print_remarks
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import asked, parse_fields
+from hybridlog.cli.answers import answering, check_room, not_written
+from hybridlog.cli.binder import command, option
+from hybridlog.cli.options import Asking, Forced, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from hybridlog.drawing.lines import Line
     from hybridlog.drawing.series import Series
-    from hybridlog.query.choice import Choice
 
 _FORMATS = ("png", "svg", "pdf", "html")
 _WIDTH, _HEIGHT = 1200, 400
@@ -33,80 +32,55 @@ _PAGE_PIXELS = 10_000  # of a page, in which one can zoom
 _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 
-@click.command()
-@options.topics
-@click.option(
-    "--fields",
-    metavar="A,B.C",
-    help="Fields that are numbers (ranges.min, position[2]), or messages with numbers.",
-)
-@click.option(
-    "--output",
-    "-o",
-    type=options.PATH,
-    metavar="FILE",
-    help="Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard output. "
-    "Without: a line of text for each field.",
-)
-@click.option(
-    "--format", "-F", "form", type=click.Choice(_FORMATS), help="Without: by the suffix of -o."
-)
-@click.option(
-    "--size",
-    metavar="WxH",
-    help=f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each further "
-    "topic.",
-)
-@options.store
-@options.between
-@options.where
-@options.choice
-@options.strict
-@options.force
-@options.mongo
-@options.quiet
-@options.verbose
-def plot_command(
-    *,
-    topic: tuple[str, ...],
-    fields: str | None,
-    output: Path | None,
-    form: str | None,
-    size: str | None,
-    store: Path | None,
-    between: tuple[str, str] | None,
-    where: tuple[str, ...],
-    choice: Choice,
-    strict: bool,
-    force: bool,
-    mongo: str | None,
-    quiet: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Given(Asking, Forced):
+    needs_topic: ClassVar[bool] = True
+    fields: str | None = option(
+        "--fields",
+        metavar="A,B.C",
+        help="Fields that are numbers (ranges.min, position[2]), or messages with numbers.",
+    )
+    output: Path | None = option(
+        "--output",
+        "-o",
+        type=options.PATH,
+        metavar="FILE",
+        help="Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard "
+        "output. Without: a line of text for each field.",
+    )
+    form: str | None = option(
+        "--format", "-F", type=click.Choice(_FORMATS), help="Without: by the suffix of -o."
+    )
+    size: str | None = option(
+        "--size",
+        metavar="WxH",
+        help=f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each "
+        "further topic.",
+    )
+
+
+@command(_Given)
+def plot_command(given: _Given) -> None:
     """Draw fields over time."""
-    form = _form(output, form)
-    shape = None if size is None else _size(size)
-    path = None if output is None or str(output) == "-" else output
+    form = _form(given.output, given.form)
+    shape = None if given.size is None else _size(given.size)
+    path = None if given.output is None or str(given.output) == "-" else given.output
     if path is not None:
-        check_room(path, force=force)
-    started = time.monotonic()
-    with opened_store(store, mongo, quiet=quiet) as opened:
+        check_room(path, force=given.force)
+    with answering(given) as asked:
         from hybridlog.drawing.lines import lines
 
-        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
-        names = [] if fields is None else parse_fields(fields)
+        names = [] if given.fields is None else parse_fields(given.fields)
         width = _WIDTH if shape is None else shape[0]
         pixels = {"": _MAX_LETTERS, "html": _PAGE_PIXELS}.get(form, width)
-        found = lines(query, names, pixels=pixels)
+        found = lines(asked.query, names, pixels=pixels)
         if not form:
             _print(found)
         else:
             height = _HEIGHT * max(1, len({line.topic for line in found}))
             with if_stopped(partial(not_written, path) if path else ""):
                 _write(found, form, shape or (width, height), path)
-        sys.stdout.flush()
-        if not quiet:
-            print_cost(query.counters, time.monotonic() - started, count=True)
-            print_remarks(query, topic, is_empty=not found or not query.counters.messages)
+        asked.is_empty = not found or not asked.query.counters.messages
 
 
 def _form(path: Path | None, form: str | None) -> str:

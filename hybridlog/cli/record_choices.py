@@ -7,9 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import click
+
 from hybridlog.cli import output
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.options import check_latched
+from hybridlog.cli.binder import argument, flag, option, repeated
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.options import (
+    PATH,
+    AsJson,
+    Between,
+    InStore,
+    Latched,
+    Quiet,
+    cache_size,
+    check_latched,
+)
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,60 +34,218 @@ DEFAULT_CHUNK: Final = 2 << 20
 """Bytes of a chunk."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordChoices:
+class LiveOption(click.Option):
+    """An option for live recording, which is refused when logs are given."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """The help, which says that it is for live recording."""
+        record = super().get_help_record(ctx)
+        if record is None or record[1].startswith("With --"):
+            return record
+        return record[0], f"Live: {record[1]}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     """The parameters as typed.
 
     Attributes:
         live_options: The options for live recording that were given.
     """
 
-    paths: tuple[Path, ...]
-    store: Path | None
-    topics: tuple[str, ...]
-    exclude: tuple[str, ...]
-    no_index: tuple[str, ...]
-    between: tuple[str, str] | None
-    no_latched: bool
-    original_times: bool
-    name: str | None
-    tag: tuple[str, ...]
-    again: bool
-    watch: bool
-    settle: str
-    chunk_size: str | None
-    compression: str
-    level: int
-    ros1: bool
-    master: str | None
-    ros2: bool
-    qos: Path | None
-    foxglove: str | None
-    replay: Path | None
-    speed: float
-    duration: str | None
-    max_messages: int | None
-    max_size: str | None
-    split_size: str
-    split_duration: str
-    use_sim_time: bool
-    throttle: tuple[str, ...]
-    priority: tuple[str, ...]
-    budget: str | None
-    reserve: str
-    flush_interval: str
-    ring: str | None
-    trigger: tuple[str, ...]
-    before: str | None
-    after: str | None
-    contract: Path | None
-    on_breach: str | None
-    shared: bool
-    mongo: str | None
-    cache_size: int | None
-    as_json: bool
-    quiet: bool
-    live_options: tuple[str, ...]
+    paths: tuple[Path, ...] = argument(
+        nargs=-1,
+        type=PATH,
+        metavar="[PATH]...",
+        help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files, and directories with any "
+        "of them.",
+    )
+    topics: tuple[str, ...] = repeated(
+        "--topics",
+        "-t",
+        metavar="TOPIC",
+        help="Only these: name, glob, or re:REGEX.",
+    )
+    exclude: tuple[str, ...] = repeated("--exclude", "-x", metavar="TOPIC", help="Not these.")
+    no_index: tuple[str, ...] = repeated(
+        "--no-index",
+        metavar="TOPIC",
+        help="No documents in MongoDB for these: questions about them read tables.",
+    )
+    name: str | None = option(
+        "--name", metavar="NAME", help="Name of the recording; without, the file's."
+    )
+    again: bool = flag("--again", help="Record it even if its content is in the store.")
+    watch: bool = flag(
+        "--watch",
+        help="Go on recording logs that come into the directories, when they are complete, until "
+        "Ctrl-C.",
+    )
+    settle: str = option(
+        "--settle",
+        default="60s",
+        metavar="TIME",
+        help="With --watch: a file that does not say so is complete when unchanged for this time.",
+    )
+    chunk_size: str | None = option(
+        "--chunk-size",
+        metavar="SIZE",
+        help="Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
+        "small.",
+    )
+    compression: str = option(
+        "--compression",
+        type=click.Choice(["zstd", "lz4", "none"]),
+        default="zstd",
+        help="Compression of chunks.",
+    )
+    level: int = option(
+        "--level", type=click.IntRange(1, 19), default=3, metavar="N", help="zstd level, 1 to 19."
+    )
+    ros1: bool = flag(
+        "--ros1",
+        help="Record a running ROS 1 robot; the URI of a master may follow, else ROS_MASTER_URI "
+        "names it.",
+    )
+    master: str | None = option("--master", metavar="URI", help="The ROS 1 master.")
+    ros2: bool = flag("--ros2", help="Record a running ROS 2 robot; needs rclpy.")
+    qos: Path | None = option(
+        "--qos",
+        type=PATH,
+        metavar="FILE",
+        help="With --ros2: YAML file of QoS overrides, as for rosbag2.",
+        kind=LiveOption,
+    )
+    foxglove: str | None = option(
+        "--foxglove", metavar="URL", help="Record what a Foxglove WebSocket server sends."
+    )
+    replay: Path | None = option(
+        "--replay",
+        type=PATH,
+        metavar="FILE",
+        help="Play a log at the speed of a robot, and record that.",
+    )
+    speed: float = option(
+        "--speed",
+        type=click.FloatRange(min=0.01),
+        default=1.0,
+        metavar="N",
+        help="With --replay: N times as fast.",
+        kind=LiveOption,
+    )
+    duration: str | None = option(
+        "--duration", metavar="TIME", help="Stop after this time, such as 10m.", kind=LiveOption
+    )
+    max_messages: int | None = option(
+        "--max-messages",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Stop after this number of messages.",
+        kind=LiveOption,
+    )
+    max_size: str | None = option(
+        "--max-size",
+        metavar="SIZE",
+        help="Stop after this size of payloads, such as 10GB.",
+        kind=LiveOption,
+    )
+    split_size: str = option(
+        "--split-size",
+        default="1GiB",
+        metavar="SIZE",
+        help="Start a new segment file after this size.",
+        kind=LiveOption,
+    )
+    split_duration: str = option(
+        "--split-duration",
+        default="10m",
+        metavar="TIME",
+        help="Start a new segment file after this time.",
+        kind=LiveOption,
+    )
+    use_sim_time: bool = flag(
+        "--use-sim-time",
+        help="Log times are those of /clock, the time of a simulation.",
+        kind=LiveOption,
+    )
+    throttle: tuple[str, ...] = repeated(
+        "--throttle",
+        metavar="TOPIC RATE",
+        shell_complete=complete_topic,
+        help="At most this rate of messages, such as /camera 5Hz.",
+        kind=LiveOption,
+    )
+    priority: tuple[str, ...] = repeated(
+        "--priority",
+        metavar="TOPIC WORD",
+        shell_complete=complete_topic,
+        help="low, normal or high: when more arrives than can be written, payloads of the lowest "
+        "priority are dropped first.",
+        kind=LiveOption,
+    )
+    budget: str | None = option(
+        "--budget",
+        metavar="SIZE",
+        help="Size of payloads in memory; without, a sixteenth of all memory.",
+        kind=LiveOption,
+    )
+    reserve: str = option(
+        "--reserve",
+        default="1GB",
+        metavar="SIZE",
+        help="Stop when the disk has less than this free.",
+        kind=LiveOption,
+    )
+    flush_interval: str = option(
+        "--flush-interval",
+        default="1s",
+        metavar="TIME",
+        help="The most that a killed recorder can lose.",
+        kind=LiveOption,
+    )
+    ring: str | None = option(
+        "--ring",
+        metavar="TIME",
+        help="Hold only the last TIME, in memory, and write it to disk at a trigger: --trigger, "
+        "SIGUSR1, or `hybridlog trigger`.",
+        kind=LiveOption,
+    )
+    trigger: tuple[str, ...] = repeated(
+        "--trigger",
+        metavar="TOPIC: PREDICATE",
+        help="With --ring: a message that triggers, such as '/diagnostics: status[*].level >= 2'. ",
+        kind=LiveOption,
+    )
+    before: str | None = option(
+        "--before",
+        metavar="TIME",
+        help="With --ring: time before the trigger; without, all.",
+        kind=LiveOption,
+    )
+    after: str | None = option(
+        "--after", metavar="TIME", help="With --ring: time after the trigger.", kind=LiveOption
+    )
+    contract: Path | None = option(
+        "--contract",
+        type=PATH,
+        metavar="FILE",
+        help="Tell and mark topics that are silent for longer than the rules in this file allow, "
+        "and judge the recording at its end.",
+        kind=LiveOption,
+    )
+    on_breach: str | None = option(
+        "--on-breach",
+        metavar="COMMAND",
+        help="With --contract: run this when a topic is silent; topic, rule and seconds follow.",
+        kind=LiveOption,
+    )
+    shared: bool = flag(
+        "--shared",
+        help="If this makes the store: let the group of its directory write it.",
+    )
+    set_tag: tuple[str, ...] = repeated("--set-tag", metavar="K=V", help="Store KEY=VALUE with it.")
+    cache_size: int | None = cache_size()
+    live_options: tuple[str, ...] = ()
 
     @property
     def is_live(self) -> bool:
@@ -178,9 +348,7 @@ def opened_to_record(
     choices: RecordChoices, *, recover: bool = True
 ) -> AbstractContextManager[Store]:
     """The store, which is made if there is none; see `opened_store`."""
-    return opened_store(
-        choices.store,
-        choices.mongo,
+    return choices.opened(
         create=True,
         shared=choices.shared,
         cache_mb=choices.cache_size,

@@ -130,7 +130,7 @@ class LogRecorder:
         self.results = Results(choices)
         self._choices = choices
         self._settings = segment_settings(choices)
-        self._tags = parse_tags(choices.tag)
+        self._tags = parse_tags(choices.set_tag)
         _matcher(choices)
         _no_index(choices)
 

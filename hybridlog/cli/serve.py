@@ -1,104 +1,64 @@
-"""`hybridlog serve`."""
+"""`hybridlog open websocket`: plays recordings to viewers that connect."""
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import click
-
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.answers import print_remarks
-from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.query_options import asked
 from hybridlog.cli.signals import SIGNALS
 from hybridlog.wording import listed
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    from hybridlog.query.choice import Choice
+    from collections.abc import Sequence
+
+    from hybridlog.query.query import Query
     from hybridlog.view.playback.played import PlayedLog
     from hybridlog.view.playback.server import PlaybackServer
 
 _MAX_SHOWN = 5  # topics
 
 
-@click.command()
-@options.only_recordings
-@options.only_topics
-@options.store
-@options.between
-@options.where
-@options.choice
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8765,
-    metavar="N",
-    help="TCP port on this computer; 0 for a free one.",
-)
-@click.option(
-    "--speed",
-    type=click.FloatRange(0.01, 100),
-    default=1.0,
-    metavar="N",
-    help="Times as fast as recorded, 0.01 to 100; viewers can change it.",
-)
-@click.option("--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--paused", is_flag=True, help="Wait until a viewer plays.")
-@click.option(
-    "--allow-origin",
-    "origins",
-    multiple=True,
-    metavar="URL",
-    help="Let a web page of this origin connect, such as https://viewer.example; Foxglove and "
-    "pages of this computer may. Repeatable.",
-)
-@options.strict
-@options.mongo
-@options.quiet
-def serve_command(
-    *,
-    choice: Choice,
-    topic: tuple[str, ...],
-    store: Path | None,
-    between: tuple[str, str] | None,
-    where: tuple[str, ...],
-    port: int,
-    speed: float,
-    loop: bool,
-    paused: bool,
-    origins: tuple[str, ...],
-    strict: bool,
-    mongo: str | None,
-    quiet: bool,
-) -> None:
-    """Play recordings to Foxglove or Lichtblick, over a WebSocket.
+def check_installed() -> None:
+    """Refuse to play without the package for it.
 
-    Playback begins when a viewer subscribes. Viewers play, pause, seek and change the speed.
-    Ctrl-C ends it.
+    Raises:
+        MissingDependencyError: It is missing.
     """
     try:
-        from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
+        import hybridlog.view.playback.server  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
-            "serve needs websockets: pip install 'hybridlog[foxglove]'"
+            "open websocket needs websockets: pip install 'hybridlog[foxglove]'"
         ) from error
+
+
+def play(
+    query: Query, names: Sequence[str], topics: Sequence[str], *, quiet: bool, **how: Any
+) -> None:
+    """Play a query to viewers, until a signal ends it.
+
+    Args:
+        query: The messages.
+        names: Of the recordings, as typed.
+        topics: As typed.
+        quiet: Only print the address.
+        how: Of `PlaybackOptions`.
+    """
     import asyncio
 
     from hybridlog.view.playback.played import PlayedLog
+    from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
 
-    with opened_store(store, mongo, quiet=quiet, is_lasting=True) as opened:
-        query = asked(opened, topic, choice, between=between, where=where, strict=strict)
-        log = PlayedLog(query)
-        name = " ".join(["hybridlog", *choice.name])
-        how = PlaybackOptions(port=port, speed=speed, loops=loop, is_paused=paused, origins=origins)
-        server = PlaybackServer(log, name, how, output.note)
-        if not quiet:
-            print_remarks(query, topic, is_empty=False)
-            _print_undefined(log)
-        asyncio.run(_until_signal(server, quiet=quiet))
+    log = PlayedLog(query)
+    name = " ".join(["hybridlog", *names])
+    server = PlaybackServer(log, name, PlaybackOptions(**how), output.note)
+    if not quiet:
+        print_remarks(query, topics, is_empty=False)
+        _print_undefined(log)
+    asyncio.run(_until_signal(server, quiet=quiet))
 
 
 async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import click
-
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room
 from hybridlog_storage.errors import TimeError
@@ -16,14 +14,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.pieces import Piece
     from hybridlog.query.query import Query
-
-split_by = click.option(
-    "--split-by",
-    "split",
-    metavar="HOW",
-    help="A file for each `recording`, each `mark`, or each interval in which a predicate holds: "
-    "'odom: twist.twist.linear.x > 0.1'. Their names follow that of the output.",
-)
 
 
 def pieces(

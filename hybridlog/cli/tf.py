@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import click
-
-from hybridlog.cli import options
-from hybridlog.cli.answers import SCREEN, Destination, answer_tables, table_options
+from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
+from hybridlog.cli.binder import argument, command, option, repeated
 from hybridlog.cli.completion import complete_recording, complete_topic
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.options import Between, InStore, Quiet, Strict, Verbose
 from hybridlog.cli.output import notes, print_table, short_duration
 from hybridlog.query.times import parse_duration, parse_range, parse_time
 from hybridlog.wording import counted
@@ -26,55 +24,42 @@ if TYPE_CHECKING:
     from hybridlog.tf.tree import FrameTree
 
 
-@click.command()
-@click.argument("target", required=False, metavar="[TARGET]", help="The frame of the results.")
-@click.argument(
-    "source",
-    required=False,
-    metavar="[SOURCE]",
-    help="The frame to transform from; with -t, without, that of the topic's messages.",
-)
-@click.option("--at", multiple=True, metavar="TIME", help="At this time. Repeatable.")
-@click.option("--step", metavar="DURATION", help="At regular times, such as 100ms.")
-@click.option(
-    "--topic",
-    "-t",
-    metavar="TOPIC",
-    shell_complete=complete_topic,
-    help="At the header stamps of a topic, or the log times of one without.",
-)
-@click.option(
-    "--extrapolate",
-    metavar="DURATION",
-    help="So long before its first and after its last, a transform holds; without, it does not.",
-)
-@click.option(
-    "--recording",
-    "-r",
-    metavar="RECORDING",
-    shell_complete=complete_recording,
-    help="The recording; without, the only one.",
-)
-@options.store
-@options.between
-@table_options
-@options.verbose
-def tf_command(
-    *,
-    target: str | None,
-    source: str | None,
-    at: tuple[str, ...],
-    step: str | None,
-    topic: str | None,
-    extrapolate: str | None,
-    recording: str | None,
-    store: Path | None,
-    between: tuple[str, str] | None,
-    to: Destination,
-    strict: bool,
-    mongo: str | None,
-    quiet: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Given(Between, InStore, Tabular, Strict, Quiet, Verbose):
+    target: str | None = argument(
+        required=False, metavar="[TARGET]", help="The frame of the results."
+    )
+    source: str | None = argument(
+        required=False,
+        metavar="[SOURCE]",
+        help="The frame to transform from; with -t, without, that of the topic's messages.",
+    )
+    at: tuple[str, ...] = repeated("--at", metavar="TIME", help="At this time.")
+    step: str | None = option("--step", metavar="DURATION", help="At regular times, such as 100ms.")
+    topic: str | None = option(
+        "--topic",
+        "-t",
+        metavar="TOPIC",
+        shell_complete=complete_topic,
+        help="At the header stamps of a topic, or the log times of one without.",
+    )
+    extrapolate: str | None = option(
+        "--extrapolate",
+        metavar="DURATION",
+        help="So long before its first and after its last, a transform holds; without, it does "
+        "not.",
+    )
+    recording: str | None = option(
+        "--recording",
+        "-r",
+        metavar="RECORDING",
+        shell_complete=complete_recording,
+        help="The recording; without, the only one.",
+    )
+
+
+@command(_Given)
+def tf_command(given: _Given) -> None:
     """Show coordinate frames, or transforms between them.
 
     Without frames, the tree: how often each frame moves, and where its longest gap is. With
@@ -82,23 +67,25 @@ def tf_command(
     pitch and yaw in rad; by default at the latest time that has a transform. Rows of times
     without one are empty, and the reasons are printed.
     """
-    if sum(map(bool, (at, step, topic))) > 1:
+    target, source, topic, between = given.target, given.source, given.topic, given.between
+    if sum(map(bool, (given.at, given.step, topic))) > 1:
         raise UsageError("--at, --step and --topic exclude each other.")
-    if target is None and (at or step or topic or between):
+    if target is None and (given.at or given.step or topic or between):
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
     from hybridlog.tf.reader import frames_and_stamps
 
-    with opened_store(store, mongo, quiet=quiet) as opened:
-        tree = opened.tf(recording)
-        if strict and tree.remarks:
+    to = given.to
+    with given.opened() as store:
+        tree = store.tf(given.recording)
+        if given.strict and tree.remarks:
             raise IncompleteError(" ".join(tree.remarks))
         if target is None:
-            _show_tree(tree, to, quiet=quiet)
+            _show_tree(tree, to, quiet=given.quiet)
             return
         if topic is None:
-            stamps = _times(tree, target, source, at=at, step=step, between=between)
+            stamps = _times(tree, target, source, at=given.at, step=given.step, between=between)
         else:
-            query = opened.recordings(recording).topic(topic)
+            query = store.recordings(given.recording).topic(topic)
             frames, stamps = frames_and_stamps(
                 query if between is None else query.between(*between)
             )
@@ -106,12 +93,12 @@ def tf_command(
                 source = frames[0]
         if source is None:
             raise UsageError("A transform has two frames: name TARGET and SOURCE.")
-        found = tree.lookup(target, source, stamps, extrapolate=extrapolate)
+        found = tree.lookup(target, source, stamps, extrapolate=given.extrapolate)
         if len(found) == 1 and found.missing:
-            tree.transform(target, source, int(stamps[0]), extrapolate=extrapolate)
+            tree.transform(target, source, int(stamps[0]), extrapolate=given.extrapolate)
         answer_tables([found.to_arrow()], lambda: None, to)
         sys.stdout.flush()
-        if not quiet:
+        if not given.quiet:
             notes(
                 f"{counted(number, 'time')} without a transform: {why}."
                 for why, number in found.missing.items()

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from hybridlog.cli import options, output
+from hybridlog.cli import output
+from hybridlog.cli.binder import argument, command, flag, option, repeated
 from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.live_table import LiveTable, drawn
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.options import AsJson, InStore
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -37,39 +36,29 @@ class _Field:
     path: str
 
 
-@click.command()
-@click.argument(
-    "recording",
-    required=False,
-    metavar="[RECORDING]",
-    shell_complete=complete_running,
-    help="One of several recorders: id or name of its recording, or the beginning of the id.",
-)
-@options.store
-@click.option(
-    "--field",
-    multiple=True,
-    metavar="TOPIC:FIELD",
-    shell_complete=complete_field,
-    help="Least, mean and greatest of a field in the last seconds, such as scan:ranges.min. "
-    "Repeatable.",
-)
-@click.option(
-    "--last", default="5s", metavar="TIME", help="The time that --field covers, up to now."
-)
-@click.option("--once", is_flag=True, help="Show it once and end.")
-@options.mongo
-@click.option("--json", "as_json", is_flag=True, help="A line of JSON a second, for scripts.")
-def top_command(
-    *,
-    recording: str | None,
-    store: Path | None,
-    field: tuple[str, ...],
-    last: str,
-    once: bool,
-    mongo: str | None,
-    as_json: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Given(InStore, AsJson):
+    recording: str | None = argument(
+        required=False,
+        metavar="[RECORDING]",
+        shell_complete=complete_running,
+        help="One of several recorders: id or name of its recording, or the beginning of the id.",
+    )
+    field: tuple[str, ...] = repeated(
+        "--field",
+        metavar="TOPIC:FIELD",
+        shell_complete=complete_field,
+        help="Least, mean and greatest of a field in the last seconds, such as scan:ranges.min.",
+    )
+    window: str = option(
+        "--last", default="5s", metavar="TIME", help="The time that --field covers, up to now."
+    )
+    once: bool = flag("--once", help="Show it once and end.")
+    as_json: bool = flag("--json", help="A line of JSON a second, for scripts.")
+
+
+@command(_Given)
+def top_command(given: _Given) -> None:
     """Watch a running recorder, until it ends or Ctrl-C.
 
     Without a terminal, and without --json, the state is shown once.
@@ -78,15 +67,15 @@ def top_command(
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
 
-    fields = [_field(text) for text in field]
-    span = parse_duration(last)
-    path = store_path(store)
-    (name,) = choose(path, [] if recording is None else [recording])
-    on_screen = not as_json and sys.stdout.isatty() and not once
+    fields = [_field(text) for text in given.field]
+    span = parse_duration(given.window)
+    path = store_path(given.store)
+    (name,) = choose(path, [] if given.recording is None else [given.recording])
+    on_screen = not given.as_json and sys.stdout.isatty() and not given.once
     with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
         opened = None
         if fields:
-            opened = held.enter_context(opened_store(store, mongo, is_lasting=True))
+            opened = held.enter_context(given.opened(is_lasting=True, quiet=False))
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for raw in states(path, name, _EVERY_S):
             if not raw:
@@ -96,16 +85,16 @@ def top_command(
                 values = _values_of_ring(path, name, raw, fields, span)
             elif opened is not None:
                 values = _values(opened, name, raw, fields, span)
-            if as_json:
+            if given.as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
             elif table is not None:
                 table.show(_state(raw), _lines(values))
             else:
                 console = output.console()
                 console.print(drawn(_state(raw), width=console.width, below=_lines(values)))
-            if once or not (as_json or on_screen):
+            if given.once or not (given.as_json or on_screen):
                 return
-        if not as_json:
+        if not given.as_json:
             output.note(f"{name} has ended.")
 
 

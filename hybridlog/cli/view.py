@@ -4,60 +4,46 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 
 import click
 
-from hybridlog.cli import options, output
-from hybridlog.cli.completion import complete_recording
-from hybridlog.cli.open_store import opened_store
+from hybridlog.cli import output
+from hybridlog.cli.binder import command, flag, option, repeated
+from hybridlog.cli.options import AsJson, InStore, one_recording
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 _MAX_FOLDERS = 1000
 
 
-@click.command()
-@click.argument(
-    "recording",
-    required=False,
-    metavar="[RECORDING]",
-    shell_complete=complete_recording,
-    help="Show this one first; without, the list of recordings.",
-)
-@options.store
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    show_default="any free one",
-    help="Port of 127.0.0.1 to serve on.",
-)
-@click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
-@click.option(
-    "--mcap", is_flag=True, help="Also serve selections as MCAP, to Foxglove and Lichtblick."
-)
-@click.option(
-    "--allow-origin",
-    "origins",
-    multiple=True,
-    metavar="URL",
-    help="With --mcap: let web pages of this origin read them, such as http://localhost:8080; "
-    "those of Foxglove may. Repeatable.",
-)
-@options.mongo
-@options.as_json
-def view_command(
-    *,
-    recording: str | None,
-    store: Path | None,
-    port: int,
-    opens: bool,
-    mcap: bool,
-    origins: tuple[str, ...],
-    mongo: str | None,
-    as_json: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Given(InStore, AsJson):
+    recording: str | None = one_recording(
+        required=False,
+        metavar="[RECORDING]",
+        help="Show this one first; without, the list of recordings.",
+    )
+    port: int = option(
+        "--port",
+        type=click.IntRange(0, 65535),
+        default=0,
+        show_default="any free one",
+        help="Port of 127.0.0.1 to serve on.",
+    )
+    opens: bool = flag("--open", help="Open the page in the browser.")
+    mcap: bool = flag("--mcap", help="Also serve selections as MCAP, to Foxglove and Lichtblick.")
+    origins: tuple[str, ...] = repeated(
+        "--allow-origin",
+        metavar="URL",
+        help="With --mcap: let web pages of this origin read them, such as "
+        "http://localhost:8080; those of Foxglove may.",
+    )
+
+
+@command(_Given)
+def view_command(given: _Given) -> None:
     """Look at recordings in the browser.
 
     The page has a timeline, plots, pictures and scans, and takes questions. Only this computer
@@ -73,28 +59,28 @@ def view_command(
         raise MissingDependencyError(
             "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
         ) from error
-    if store is None and not os.environ.get("HYBRIDLOG_STORE"):
-        store = _only_store_near()
-    if origins and not mcap:
+    if given.store is None and not os.environ.get("HYBRIDLOG_STORE"):
+        given = replace(given, store=_only_store_near())
+    if given.origins and not given.mcap:
         raise UsageError("--allow-origin is about --mcap: add that.")
-    with opened_store(store, mongo, quiet=as_json, is_lasting=True) as opened:
-        server = ViewServer(opened, port, viewers=mcap, origins=origins)
+    with given.opened(is_lasting=True) as store:
+        server = ViewServer(store, given.port, viewers=given.mcap, origins=given.origins)
         url = server.url
         label = ""
-        if recording is not None:
-            (entry,) = opened.select([recording])
+        if given.recording is not None:
+            (entry,) = store.select([given.recording])
             label = quote(entry.label, safe="")
             url += f"#recording={label}"
-        if as_json:
+        if given.as_json:
             shown = {"url": url, "port": server.port}
-            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if mcap else {}))
+            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if given.mcap else {}))
         else:
             click.echo(url)
             output.note("Open this address in a browser. Ctrl-C ends the server.")
-            if mcap:
+            if given.mcap:
                 _print_mcap(f"{server.url}mcap/", label)
         sys.stdout.flush()
-        if opens:
+        if given.opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
         server.run()
 

@@ -50,8 +50,8 @@ def trusted_uri(settings: StoreSettings, store: Path | None = None) -> str:
     place = "DIR" if store is None else str(store)
     raise DatabaseError(
         f"The store names a MongoDB at {without_secrets(settings.mongo)}, to which this user has "
-        f"not agreed: the store may come from somebody else. `hybridlog trust --store {place}` "
-        f"agrees to it for good, `--mongo URI` names one for a single command."
+        f"not agreed: the store may come from somebody else. `hybridlog index trust --store "
+        f"{place}` agrees to it for good, `--mongo URI` names one for a single command."
     )
 
 

@@ -93,7 +93,7 @@ def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
 
 def _check(fields: Sequence[str]) -> None:
     if not fields:
-        raise UsageError("Name at least one field; `hybridlog schema TOPIC` lists them.")
+        raise UsageError("Name at least one field; `hybridlog info -t TOPIC` lists them.")
     if len(fields) > _MAX_FIELDS or len(set(fields)) != len(fields):
         raise UsageError(f"An index takes up to {_MAX_FIELDS} fields, without duplicates.")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.times import TimeLike
+    from hybridlog.query.times import DurationLike, TimeLike
 
 Texts: TypeAlias = "str | Sequence[str] | None"
 """One text or several."""
@@ -30,6 +30,7 @@ class Choice:
         type: Types of messages that they have.
         during: Range `[begin, end)` of log time that they overlap.
         where: `TOPIC: PREDICATE`; each holds for at least one of their messages.
+        older_than: Age that their last message has at least.
     """
 
     name: tuple[str, ...] = ()
@@ -38,6 +39,7 @@ class Choice:
     type: tuple[str, ...] = ()
     during: tuple[TimeLike | None, TimeLike | None] | None = None
     where: tuple[str, ...] = ()
+    older_than: DurationLike | None = None
 
     @classmethod
     def of(
@@ -49,6 +51,7 @@ class Choice:
         type: Texts = None,  # noqa: A002 - the word of the command line
         during: During = None,
         where: Texts = None,
+        older_than: DurationLike | None = None,
     ) -> Choice:
         """A choice from single values or several.
 
@@ -65,6 +68,7 @@ class Choice:
             _texts(type),
             None if during is None else (during[0], during[1]),
             _texts(where),
+            older_than,
         )
 
     @property

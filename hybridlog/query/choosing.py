@@ -17,7 +17,13 @@ import numpy as np
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
-from hybridlog.query.times import TIME_LIMIT, format_time, is_relative, parse_range
+from hybridlog.query.times import (
+    TIME_LIMIT,
+    format_time,
+    is_relative,
+    parse_duration,
+    parse_range,
+)
 from hybridlog.query.topics import matcher, resolve, split_topic
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
@@ -26,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.choice import Choice
-    from hybridlog.query.times import TimeLike
+    from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -74,6 +80,8 @@ def choose(session: Session, choice: Choice) -> Chosen:
             choosing.by_type(name)
         if choice.during is not None:
             choosing.by_time(*choice.during)
+        if choice.older_than is not None:
+            choosing.by_age(choice.older_than)
         for condition in choice.where:
             choosing.by_content(condition)
     except _NothingLeftError as nothing:
@@ -215,6 +223,15 @@ class _Choosing:
                 last = format_time(max(span[1] for span in known))
                 hint = f"The others lie between {first} and {last}."
             raise _NothingLeftError(hint)
+
+    def by_age(self, age: DurationLike) -> None:
+        snapshot, latest = self._snapshot, time.time_ns() - parse_duration(age)
+        places = self.places
+        is_written = [snapshot.summaries[place].status == "open" for place in places.tolist()]
+        first, end = snapshot.begin[places], snapshot.end[places]
+        old = places[(first < end) & (end - 1 <= latest) & ~np.array(is_written, np.bool_)]
+        if not self._keep(old, f"whose last message is from {format_time(latest)} or before"):
+            raise _NothingLeftError("`hybridlog ls` shows the times of all.")
 
     def by_content(self, condition: str) -> None:
         pattern, predicate = split_topic(condition)

@@ -101,7 +101,7 @@ class IntervalAnswers(Steps):
             TimeError: no duration, or a range outside of all recordings.
         """
         if not fields:
-            raise UsageError("Name at least one field; `hybridlog schema TOPIC` lists them.")
+            raise UsageError("Name at least one field; `hybridlog info -t TOPIC` lists them.")
         self.fields(*fields)  # refuses unknown fields
         with self.counters.timed():
             return self._intervals().changes(fields, pause, tolerance)

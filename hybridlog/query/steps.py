@@ -283,6 +283,7 @@ class Steps:
         type: Texts = None,  # noqa: A002 - the word of the command line
         during: During = None,
         where: Texts = None,
+        older_than: DurationLike | None = None,
     ) -> Self:
         """Only these recordings: by label, name, id or glob, and as `Store.recordings`.
 
@@ -291,7 +292,15 @@ class Steps:
         """
         from hybridlog.query.choosing import choose
 
-        choice = Choice.of(names, tag=tag, has=has, type=type, during=during, where=where)
+        choice = Choice.of(
+            names,
+            tag=tag,
+            has=has,
+            type=type,
+            during=during,
+            where=where,
+            older_than=older_than,
+        )
         chosen = choose(self.session, choice)
         if chosen.problem:
             raise TopicError(chosen.problem)
@@ -412,5 +421,5 @@ def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str
     near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
     return (
         f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "
-        "`hybridlog schema TOPIC` lists them all."
+        "`hybridlog info -t TOPIC` lists them all."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hybridlog.query.steps import Steps
 from hybridlog.session import of_one_moment
@@ -34,6 +34,16 @@ class TableAnswers(Steps):
         if self.question.frame is not None:
             return pa.concat_tables(self.to_tables(), promote_options="permissive")
         return to_arrow(self._planner())
+
+    def to_polars(self) -> Any:
+        """A polars frame of the same columns, `log_time` among them.
+
+        Raises:
+            MissingDependencyError: polars is not installed.
+        """
+        from hybridlog.frames.polars import to_polars
+
+        return to_polars(self.to_arrow())
 
     @of_one_moment
     def to_pandas(self) -> pd.DataFrame:

@@ -535,7 +535,7 @@ def test_the_commands(logs: Logs, tmp_path: Path) -> None:
     assert lines[0]["log_time_ns"] == want["log_time"][0].value
     assert [row["left/pose.state"] for row in lines] == want["left/pose.state"].to_pylist()[:30]
     shown = run(
-        "resample", "-t", "base", "--step", "100ms", "--fields", "x", "-F", "table", store=store
+        "align", "-t", "base", "--step", "100ms", "--fields", "x", "-F", "table", store=store
     )
     assert shown.lines[0].split() == ["log_time", "recording", "distance", "x"]
     assert "The first 20 rows." in shown.err

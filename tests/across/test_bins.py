@@ -170,7 +170,7 @@ def test_what_is_refused(logs: Logs) -> None:
 
 
 def test_the_command(logs: Logs) -> None:
-    asked = ("resample", "-t", "*/pose", "--step", "200ms", "--how", "max", "--fields", "ticks")
+    asked = ("align", "-t", "*/pose", "--step", "200ms", "--how", "max", "--fields", "ticks")
     lines = [json.loads(line) for line in run(*asked, store=logs.store.directory.path).lines]
     want = logs.store.topic("*/pose").fields("ticks").resample("200ms", how="max").to_arrow()
     assert [row["left/pose.ticks"] for row in lines] == want["left/pose.ticks"].to_pylist()

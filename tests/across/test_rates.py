@@ -330,12 +330,12 @@ def test_what_is_refused(logs: Logs) -> None:
 
 def test_the_commands(logs: Logs) -> None:
     store = logs.store.directory.path
-    rates = run("rate", "-t", "base", "--window", "500ms", "-F", "csv", store=store)
+    rates = run("stats", "--rate", "-t", "base", "--window", "500ms", "-F", "csv", store=store)
     assert rates.lines[0] == '"begin","end","recording","topic","messages","rate"'
     assert "index document" not in rates.err
-    assert run("gaps", "-t", "right/pose", "-r", "b", "--count", "-q", store=store).out == (
-        f"{len(logs.store.topic('right/pose').in_recording('b').gaps())}\n"
-    )
+    assert run(
+        "intervals", "--gaps", "-t", "right/pose", "-r", "b", "--count", "-q", store=store
+    ).out == (f"{len(logs.store.topic('right/pose').in_recording('b').gaps())}\n")
     rows = run("stats", "-t", "base", "--fields", "x,list.n", "--json", store=store).json
     (x, n) = logs.store.topic("base").stats("x", "list.n")
     assert [(r["field"], r["count"], r["min"], r["std"]) for r in rows] == [

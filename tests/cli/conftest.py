@@ -33,7 +33,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def store(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A store with `robot`, `odd` and the damaged `torn`. Not to be changed."""
     path = tmp_path_factory.mktemp("shared") / "store"
-    run("record", logs / "robot.bag", "--tag", "place=lab", "--quiet", store=path)
+    run("record", logs / "robot.bag", "--set-tag", "place=lab", "--quiet", store=path)
     run("record", logs / "odd.mcap", "--quiet", store=path)
     run("record", logs / "torn.bag", "--quiet", store=path, code=4)
     # While this is open, no command has to start mongod anew.

@@ -472,8 +472,8 @@ def test_remarks_follow_the_closing_line(store: Path) -> None:
 
 def test_what_summaries_leave_out_is_said(store: Path) -> None:
     left_out = "messages do not fit their definition and are not in this answer"
-    assert left_out in run("changes", "-t", "/long", "--fields", "data", store=store).err
-    assert left_out in run("resample", "-t", "/long", "--step", "1s", store=store).err
-    asked = run("resample", "-t", "/long", "--step", "1s", "--where", "data > 9", store=store)
+    assert left_out in run("intervals", "/long", "--changes", "data", store=store).err
+    assert left_out in run("align", "-t", "/long", "--step", "1s", store=store).err
+    asked = run("align", "-t", "/long", "--step", "1s", "--where", "data > 9", store=store)
     assert left_out not in asked.err
     assert "messages could not be tested" in asked.err

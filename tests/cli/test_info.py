@@ -103,31 +103,31 @@ def test_a_recording_that_is_not_there(store: Path) -> None:
 
 
 def test_schema(store: Path) -> None:
-    done = run("schema", "scan", store=store)
+    done = run("info", "-t", "scan", store=store)
     assert done.lines[0].startswith("/base/scan  sensor_msgs/LaserScan  (ros1")
     assert any(line.split()[:2] == ["ranges", "float32[]"] for line in done.lines)
     assert "ranges.min, ranges.max, ranges.mean, ranges.n" in done.out
     assert "float32[] ranges" in done.out
 
-    (found,) = run("schema", "/base/scan", "--recording", "robot", "--json", store=store).json
+    (found,) = run("info", "-t", "/base/scan", "--recording", "robot", "--json", store=store).json
     fields = {f["path"]: f["type"] for f in found["fields"]}
     assert fields["header.stamp"] == "time"
     assert fields["angle_min"] == "float32"
 
 
 def test_schema_of_a_topic_whose_type_changes(store: Path) -> None:
-    found = run("schema", "change", "--json", store=store).json
+    found = run("info", "-t", "change", "--json", store=store).json
     assert [item["type"] for item in found] == ["std_msgs/msg/String", "std_msgs/msg/Int32"]
 
 
 def test_schema_of_a_hostile_definition(store: Path) -> None:
-    done = run("schema", "code", store=store)
+    done = run("info", "-t", "code", store=store)
     assert "not indexed" in done.out
     assert "__import__" in done.out
 
 
 def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path: Path) -> None:
-    (found,) = run("schema", "json", "--json", store=store).json
+    (found,) = run("info", "-t", "json", "--json", store=store).json
     assert found["observed"]
     assert [(f["path"], f["type"]) for f in found["fields"]] == [
         ("a", "integer"),
@@ -147,7 +147,7 @@ def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path:
         writer.add_message(channel, 9, b"{", 9)
         writer.finish()  # type: ignore[no-untyped-call]
     run("record", tmp_path / "weather.mcap", store=tmp_path / "s")
-    (found,) = run("schema", "weather", "--json", store=tmp_path / "s").json
+    (found,) = run("info", "-t", "weather", "--json", store=tmp_path / "s").json
     fields = {f["path"]: (f["type"], f["array"]) for f in found["fields"]}
     assert fields == {
         "wind": ("object", False),
@@ -160,7 +160,7 @@ def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path:
     for path in fields:
         where = ("--where", f"{path} exists", "--count")
         assert int(run("fetch", "-t", "weather", *where, store=tmp_path / "s").out) > 0
-    shown = run("schema", "weather", store=tmp_path / "s").out
+    shown = run("info", "-t", "weather", store=tmp_path / "s").out
     assert "No definition fixes the fields" in shown
 
 

@@ -118,7 +118,7 @@ def test_changes(store: Path, seen: list[Seen]) -> None:
             want[-1] = [want[-1][0], time + 1, want[-1][2] + 1]
         else:
             want.append([time, time + 1, 1])
-    asked = ("changes", "-t", "camera_pose", "-r", "robot", "--fields", "position, orientation")
+    asked = ("intervals", "camera_pose", "-r", "robot", "--changes", "position, orientation")
     done = run(*asked, "--pause", "500ms", "--json", store=store)
     assert want
     assert [[r["begin_ns"], r["end_ns"], r["messages"]] for r in done.json] == want
@@ -161,9 +161,9 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
         (("intervals", *GRIPPER, "--where", "position ="), "value"),
         (("intervals", *GRIPPER, "--at-least", "soon"), "not a duration"),
         (("intervals", *GRIPPER, "--length", "0"), "length 0"),
-        (("changes", *GRIPPER, "--fields", "positoin"), "position"),
-        (("changes", *GRIPPER, "--fields", "position,"), "commas"),
-        (("changes", *GRIPPER, "--fields", "position", "--tolerance", "-1"), "tolerance"),
+        (("intervals", *GRIPPER, "--changes", "positoin"), "position"),
+        (("intervals", *GRIPPER, "--changes", "position,"), "commas"),
+        (("intervals", *GRIPPER, "--changes", "position", "--tolerance", "-1"), "tolerance"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -56,7 +56,16 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
     seen = read_bag(logs / "small.bag")
     start = min(m.log_time for m in seen)
     run(
-        *("record", logs / "small.bag", "--name", "my run/1", "--tag", "a=b=c", "--tag", "d="),
+        *(
+            "record",
+            logs / "small.bag",
+            "--name",
+            "my run/1",
+            "--set-tag",
+            "a=b=c",
+            "--set-tag",
+            "d=",
+        ),
         *("--topics", "imu/*", "--topics", "scan", "--exclude", "re:.*scan"),
         *("--between", "+1s", "+2s", "--chunk-size", "16KiB", "--compression", "lz4"),
         store=tmp_path / "s",
@@ -163,7 +172,7 @@ def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:
     [
         (("--chunk-size", "big"), "no size"),
         (("--chunk-size", "1"), "chunk size"),
-        (("--tag", "a"), "KEY=VALUE"),
+        (("--set-tag", "a"), "KEY=VALUE"),
         (("--topics", r"re:(a)\1"), "refused"),
         (("--between", "x", "y"), "not a time"),
         (("--between", "+2s", "+1s"), "the range is empty"),
@@ -233,7 +242,7 @@ def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:
     odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mcap"))
     shutil.copy(logs / "odd.mcap", odd)
     tag = os.fsdecode(b"who=Ren\xe9")
-    run("record", odd, "--tag", tag, "-q", store=tmp_path / "s")
+    run("record", odd, "--set-tag", tag, "-q", store=tmp_path / "s")
     (found,) = run("ls", "--json", store=tmp_path / "s").json
     assert found["name"] == "caf\\xe9"
     assert found["tags"] == {"who": "Ren\\xe9"}

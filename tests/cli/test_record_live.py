@@ -119,7 +119,7 @@ def test_a_replay_is_recorded_whole(logs: Path, tmp_path: Path) -> None:
         (m.topic, m.payload) for m in expected
     )
     assert "complete" in run("info", "small", store=store).out
-    assert "Nothing is missing" in run("losses", store=store).out
+    assert "Nothing is missing" in run("info", "--losses", store=store).out
 
 
 def test_ctrl_c_ends_it_with_everything_stored(logs: Path, tmp_path: Path) -> None:
@@ -264,12 +264,12 @@ def test_what_is_thinned_out_is_told(logs: Path, tmp_path: Path) -> None:
     assert 0 < lost < counted["/imu/data"]
     (recording,) = report["recordings"]
     assert recording["messages"] + lost == report["messages_received"]
-    rows = run("losses", "--json", "-t", "imu/data", store=store).json
+    rows = run("info", "--losses", "--json", "-t", "imu/data", store=store).json
     assert sum(row["count"] for row in rows) == lost
     assert {row["cause"] for row in rows} == {"throttle"}
-    assert run("losses", "--json", "-t", "/joint_states", store=store).json == []
+    assert run("info", "--losses", "--json", "-t", "/joint_states", store=store).json == []
     assert "left out by a throttle" in run("fetch", "-t", "imu/data", "--count", store=store).err
-    assert "/imu/data" in run("losses", store=store).out
+    assert "/imu/data" in run("info", "--losses", store=store).out
 
 
 def test_a_simulation_is_recorded_by_its_clock(tmp_path: Path) -> None:
@@ -348,7 +348,7 @@ def assert_it_is_told_as_it_is(store: Path) -> None:
     assert "being recorded; `hybridlog top first-drive` shows it" in info
     (told,) = re.findall(r"(?m)^messages +(\d+)$", info)
     assert int(told) >= entry["messages"] > 0
-    assert "first-drive is still being recorded" in run("losses", store=store).err
+    assert "first-drive is still being recorded" in run("info", "--losses", store=store).err
     assert int(run("fetch", "-t", "/imu/data", "--count", store=store).out) > 0
 
 

@@ -1,4 +1,4 @@
-"""`hybridlog serve`, in a process of its own."""
+"""`hybridlog open websocket`, in a process of its own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .running import run, started, wait_for
 
 def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:
     output = tmp_path / "output"
-    command = ("serve", "robot", "-t", "/imu/data", "-t", "/map", "--store", store)
+    command = ("open", "websocket", "robot", "-t", "/imu/data", "-t", "/map", "--store", store)
     with started(*command, "--port", 0, "--speed", 100, output=output) as process:
         wait_for(lambda: "Ctrl-C ends it." in output.read_text())
         lines = output.read_text().splitlines()
@@ -36,17 +36,19 @@ def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:
 
 
 def test_wrong_ways(store: Path) -> None:
-    assert "0.01<=x<=100" in run("serve", "--speed", 0, store=store, code=2).err
-    assert "nothing" in run("serve", "nothing", store=store, code=2).err
+    assert "0.01<=x<=100" in run("open", "websocket", "--speed", 0, store=store, code=2).err
+    assert "nothing" in run("open", "websocket", "nothing", store=store, code=2).err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        done = run("serve", "robot", "-t", "/map", "--port", port, store=store, code=2)
+        done = run("open", "websocket", "robot", "-t", "/map", "--port", port, store=store, code=2)
     assert f"Port {port} is in use" in done.err
     assert done.out == ""
 
 
 def test_topics_that_viewers_cannot_show_are_said(store: Path, tmp_path: Path) -> None:
-    with started("serve", "odd", "--store", store, "--port", 0, output=tmp_path / "out") as process:
+    with started(
+        "open", "websocket", "odd", "--store", store, "--port", 0, output=tmp_path / "out"
+    ) as process:
         wait_for(lambda: "Ctrl-C ends it." in (tmp_path / "out").read_text())
         assert "Viewers cannot show" in (tmp_path / "out").read_text()
         process.send_signal(signal.SIGTERM)

@@ -14,7 +14,7 @@ import click
 import pytest
 
 from hybridlog.cli import options
-from hybridlog.cli.app import COMMANDS, app
+from hybridlog.cli.app import COMMANDS, GROUPS, MOVED, app
 from hybridlog.cli.installed import NEEDED_FOR
 from hybridlog.cli.main import EXIT_CODES
 
@@ -65,11 +65,27 @@ def test_looking_imports_no_table_libraries(store: Path) -> None:
 
 def test_help_names_commands_and_exit_codes() -> None:
     out = run("--help").out
-    for command in COMMANDS:
-        assert f"\n  {command} " in out
+    assert len(COMMANDS) <= 31
+    for title, commands in GROUPS.items():
+        lines = out.split(f"\n{title}:\n")[1].splitlines()
+        assert [line.split()[0] for line in lines[: len(commands)]] == [*commands]
     for code, meaning in EXIT_CODES.items():
         assert f"{code:>3}  {meaning}" in out
-    assert "..." not in out.split("Commands:")[1].split("The store is")[0]
+    assert "..." not in out.split("Record:")[1].split("The store is")[0]
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_another_name_says_the_command(name: str) -> None:
+    """The words that it says are those of a command and its options."""
+    done = run(name, "x", code=2)
+    (words,) = re.findall(r"use `hybridlog (.+)`", done.err)
+    command, *more = words.split()
+    found = commands()[command]
+    if isinstance(found, click.Group):
+        assert more[0] in found.commands
+        return
+    known = {opt for parameter in found.params for opt in parameter.opts}
+    assert {word for word in more if word.startswith("-")} <= known
 
 
 def test_version() -> None:
@@ -114,7 +130,7 @@ def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
 def test_usage_names_what_is_wanted() -> None:
     for command, words in (
         ("record", "[PATH]..."),
-        ("schema", "schema [OPTIONS] TOPIC\n"),
+        ("tables", "tables [OPTIONS] TOPIC\n"),
         ("verify", "[RECORDING]..."),
         ("rm", "rm [OPTIONS] [RECORDING]...\n"),
         ("export", "-t, --topic TOPIC"),
@@ -131,7 +147,7 @@ def test_completion(store: Path) -> None:
     assert complete(f"fetch --store {store} --topic image_") == []
     assert complete(f"fetch --store {store} --recording odd --topic /base") == []
     assert complete(f"fetch --store {store} --recording t") == ["torn"]
-    assert complete(f"losses --store {store} -t /base/s") == ["/base/scan"]
+    assert complete(f"info --losses --store {store} -t /base/s") == ["/base/scan"]
     assert complete(f"record --store {store} --throttle /base/s") == ["/base/scan"]
     assert complete(f"top --store {store} --field /base/s") == ["/base/scan:"]
     assert complete(f"trigger x --store {store} -r r") == []  # nothing is recorded now
@@ -283,12 +299,12 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
         ("ls",),
         ("info",),
         ("info", "odd"),
-        ("losses",),
-        ("losses", "torn"),
+        ("info", "--losses"),
+        ("info", "torn", "--losses"),
         ("tag", "robot"),
-        ("schema", "scan"),
+        ("info", "-t", "scan"),
         ("intervals", "-t", "scan", "-r", "robot", "--where", "ranges.min < 1"),
-        ("changes", "-t", "scan", "-r", "robot", "--fields", "ranges.min"),
+        ("intervals", "scan", "-r", "robot", "--changes", "ranges.min"),
         ("index", "list"),
         ("verify", "robot"),
         ("repair", "robot"),

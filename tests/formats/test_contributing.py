@@ -64,7 +64,7 @@ def test_the_examples(extended: Path) -> None:
     (extended / "log.jsonl").write_text(LINES)
     run(extended, "record", "log.jsonl", code=4)  # a line is damaged
     assert run(extended, "fetch", "-t", "/b", "--count", "-q")[0] == "2500\n"
-    assert "a line that is no message" in run(extended, "losses")[0]
+    assert "a line that is no message" in run(extended, "info", "--losses")[0]
     first = ("-n", "1", "-q")
     lines = run(extended, "fetch", "-t", "/b", *first, "-F", "markdown")[0].splitlines()
     assert lines == [

@@ -444,7 +444,7 @@ def test_a_recorder_that_writes_nothing_is_stalled(
 )
 def test_a_small_budget_has_small_chunks(arguments: list[str], size: int) -> None:
     with record_command.make_context("record", ["--ros2", *arguments]) as context:
-        choices = RecordChoices(**context.params, live_options=())
+        choices = RecordChoices(**context.params)
     assert recorder_options(choices).settings.chunk_size == size
 
 
@@ -684,12 +684,12 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
 
 def test_live_segments_are_short_by_default() -> None:
     context = record_command.make_context("record", ["--ros1"])
-    chosen = recorder_options(RecordChoices(**context.params, live_options=()))
+    chosen = recorder_options(RecordChoices(**context.params))
     for settings in (LiveOptions().settings, FREE.settings, chosen.settings):
         assert (settings.segment_size, settings.segment_span_s) == (1 << 30, 600)
     other = ["--ros1", "--split-size", "2MiB", "--split-duration", "5s"]
     context = record_command.make_context("record", other)
-    chosen = recorder_options(RecordChoices(**context.params, live_options=()))
+    chosen = recorder_options(RecordChoices(**context.params))
     assert (chosen.settings.segment_size, chosen.settings.segment_span_s) == (2 << 20, 5)
     # Those of logs are not.
     assert (SegmentSettings().segment_size, SegmentSettings().segment_span_s) == (4 << 30, None)

@@ -201,15 +201,15 @@ def test_what_is_refused(store: hl.Store) -> None:
 def test_the_command(store: hl.Store) -> None:
     path = store.directory.path
     found = store.rehearse("/n: v >= 80", before="1s", after="500ms")
-    asked = ("trigger", "--rehearse", "/n: v >= 80", "--before", "1s", "--after", "500ms")
+    asked = ("intervals", "--rehearse", "/n: v >= 80", "--before", "1s", "--after", "500ms")
     rows = run(*asked, "--json", store=path).json
     assert (rows["fired"], rows["payload_bytes"]) == (found.fired, found.payload_bytes)
     assert len(rows["snapshots"]) == len(found.snapshots)
     shown = run(*asked, store=path)
     assert f"fired       {found.fired} times" in shown.lines
     assert "of payload" not in shown.err
-    none = run(*asked, "--since", "1h", store=path)
+    none = run(*asked, "--last", "1h", store=path)
     assert "No recording is from that time." in none.err
     run(*asked, "name", store=path, code=2)
-    run("trigger", "name", "--since", "1d", store=path, code=2)
+    run("intervals", "n", "--before", "1s", store=path, code=2)
     run("trigger", store=path, code=2)

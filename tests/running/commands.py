@@ -196,27 +196,22 @@ COMMANDS: dict[str, list[Asked]] = {
             ],
             lambda k: ["being", str(len(k.of()))],
         ),
-    ],
-    "du": [
         asked(
-            "du --json --by topic",
+            "info --json --sizes topic",
             lambda a, _: {r["topic"]: r["messages"] for r in a.json["rows"] if r.get("messages")},
             _there,
-        )
-    ],
-    "losses": [
+        ),
         asked(
-            "losses --json",
+            "info --losses --json",
             listed("recording", "topic", "cause", "count"),
             lambda _: [(LABEL, "/said", "transport", 3)],
-        )
-    ],
-    "schema": [
+        ),
         asked(
-            "schema arm --json",
+            "info -t arm --json",
             lambda a, _: (a.json[0]["type"], a.json[0]["recordings"]),
             lambda _: ("demo/msg/Arm", [LABEL]),
-        )
+        ),
+        asked(f"info {LABEL} --attachments --json", lambda a, _: a.json, lambda _: []),
     ],
     "fetch": [
         asked("fetch -t * --count", _number, lambda k: len(k.of())),
@@ -293,49 +288,46 @@ COMMANDS: dict[str, list[Asked]] = {
             "intervals -t said --where x~>~50 --json",
             listed("begin_ns", "end_ns", "messages"),
             lambda k: held(k, "/said", _high),
-        )
-    ],
-    "changes": [
+        ),
         asked(
-            "changes -t said --fields state --pause 0s --json",
+            "intervals said --changes state --pause 0s --json",
             listed("begin_ns", "end_ns", "messages"),
             lambda k: changed(k, "/said", "state", 0),
-        )
+        ),
+        asked(
+            "intervals cam --gaps --longer-than 100ms --json",
+            lambda *told: between_messages(listed("begin_ns", "end_ns", "messages")(*told)),
+            lambda k: between_messages(silent(k, "/cam", 100 * MS)),
+        ),
+        asked(
+            "intervals --rehearse said:~x~>~124 --json",
+            lambda a, _: len(a.json) > 0,
+            lambda _: True,
+        ),
     ],
     "align": [
         asked(
             "align --to arm -t said --fields arm:~n --fields said:~n -F jsonl",
             lines("arm.n", "said.n"),
             lambda k: [(own, near) for _, own, _, near in beside(k, "/arm", "/said")],
-        )
-    ],
-    "resample": [
+        ),
         asked(
-            "resample -t said --step 100ms --how count -F jsonl",
+            "align said --step 100ms --how count -F jsonl",
             lines("log_time_ns", "count"),
             lambda k: regular(k, "/said", SECOND // 10),
-        )
-    ],
-    "rate": [
-        asked(
-            "rate -t said -t arm -F jsonl",
-            lines("begin", "end", "topic", "messages", "rate"),
-            lambda k: [*reversed(rates(k, "/said", "/arm"))],
-        )
-    ],
-    "gaps": [
-        asked(
-            "gaps -t cam --longer-than 100ms --json",
-            lambda *told: between_messages(listed("begin_ns", "end_ns", "messages")(*told)),
-            lambda k: between_messages(silent(k, "/cam", 100 * MS)),
-        )
+        ),
     ],
     "stats": [
         asked(
             "stats -t said --fields x --json",
             listed("topic", "field", "count", "nan", "infinite", "min", "max", "mean", "std"),
             lambda k: numbers(k, "/said", "x"),
-        )
+        ),
+        asked(
+            "stats said arm --rate -F jsonl",
+            lines("begin", "end", "topic", "messages", "rate"),
+            lambda k: [*reversed(rates(k, "/said", "/arm"))],
+        ),
     ],
     "check": [
         asked(
@@ -371,16 +363,6 @@ COMMANDS: dict[str, list[Asked]] = {
             lambda k: {t[1:]: k.counts[t] for t in ("/arm", "/said")},
         ),
     ],
-    "attachments": [
-        asked(f"attachments {LABEL} --json", lambda a, _: a.json, lambda _: []),
-    ],
-    "trigger": [
-        asked(
-            "trigger --rehearse said:~x~>~124 --json",
-            lambda a, _: len(a.json) > 0,
-            lambda _: True,
-        )
-    ],
     "verify": [
         asked("verify --json", lambda a, _: a.json["findings"], lambda _: []),
         asked("verify", lambda a, _: f"as far as sealed: {LABEL}" in a.err, lambda _: True),
@@ -399,13 +381,15 @@ COMMANDS: dict[str, list[Asked]] = {
         asked("keep --max-age 0s --json", lambda a, _: a.json["plan"]["steps"], lambda _: []),
         asked("keep --pins --json", lambda a, _: a.json, lambda _: []),
     ],
-    "rename": [refused(f"rename {LABEL} other", 5)],
+    "edit": [
+        refused(f"edit {LABEL} --name other", 5),
+        refused(f"edit {LABEL} --note quiet", 5),
+    ],
     "tag": [
         refused(f"tag {LABEL} a=b", 5),
+        refused(f"tag {LABEL} --remove robot", 5),
         asked(f"tag {LABEL}", lambda a, _: a.lines, lambda _: ["robot=7"]),
     ],
-    "untag": [refused(f"untag {LABEL} robot", 5)],
-    "note": [refused(f"note {LABEL} quiet", 5)],
     "mark": [refused(f"mark here -r {LABEL} --at +1s", 5)],
     "rm": [refused(f"rm {LABEL} --yes", 5)],
 }
@@ -416,10 +400,9 @@ EXEMPT: dict[str, str] = {
     "top": "it asks the recorder, not the store",
     "import": "it copies recordings that have ended, from a store",
     "view": "it serves until it is stopped; see tests/view",
-    "serve": "it serves until it is stopped; see tests/view/playback",
+    "trigger": "it asks the recorder, not the store",
     "mcp": "it serves until it is stopped; see tests/view/test_tools.py",
     "open": "it opens a program with a slice, which `fetch -o` makes",
-    "trust": "it is about servers",
     "demo": "it makes a recording",
     "tf": "these recordings have no transforms; see tests/tf/test_tree.py",
     "tables": "it names the files of recordings that have ended",

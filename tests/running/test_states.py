@@ -200,7 +200,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             assert [one.values for one in store.metadata(LABEL)] == [{"name": "seven"}]
             extras = store.topic("arm").extras()
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
-        done = answer("attachments", LABEL, "--json", store=found.path)
+        done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]
         image = found.before.topic("cam").first()
         assert image is not None

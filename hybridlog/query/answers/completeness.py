@@ -105,7 +105,7 @@ class Completeness:
         """
         if self.has_losses:
             raise IncompleteError(
-                f"{self} in this range; `hybridlog losses` says where. Without --strict the "
+                f"{self} in this range; `hybridlog info --losses` says where. Without --strict the "
                 "rest is given."
             )
         if self.late:

@@ -1,0 +1,357 @@
+"""What options of `hybridlog info` show: definitions, losses, sizes, attachments."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.cli import output
+from hybridlog.cli.answers import check_room, not_written
+from hybridlog.cli.signals import if_stopped
+from hybridlog.record.losses import losses_of
+from hybridlog.wording import listed
+from hybridlog_storage.errors import TopicError, UsageError
+
+if TYPE_CHECKING:
+    from hybridlog.attachments import StoredAttachment
+    from hybridlog.maintenance.sizes import Size, Sizes
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
+
+
+_READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
+
+
+def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: bool) -> None:
+    """Print the definition and the fields of topics, those of each type once.
+
+    Args:
+        store: The store.
+        query: A query about the topics.
+        topics: As typed.
+        as_json: Print JSON.
+
+    Raises:
+        TopicError: No recording of the query has any of them.
+    """
+    seen: dict[tuple[str, str | None], dict[str, Any]] = {}
+    for recorded in query.channels():
+        schema = recorded.channel.schema
+        key = (
+            recorded.channel.topic,
+            recorded.recording.id if schema is None else repr(schema),
+        )
+        if key in seen:
+            seen[key]["recordings"].append(recorded.recording.label)
+        else:
+            seen[key] = _topic_as_dict(store, recorded)
+    if not seen:
+        raise TopicError(
+            f"No chosen recording has {' or '.join(topics)}: `hybridlog info` lists the topics."
+        )
+    if as_json:
+        output.print_json(list(seen.values()))
+        return
+    for item in seen.values():
+        _print_topic(item)
+
+
+def _print_topic(item: dict[str, Any]) -> None:
+    encoding = f"{item['message_encoding']}, {item['schema_encoding'] or 'no schema'}"
+    output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
+    if item["definition"]:
+        for line in str(item["definition"]).splitlines():
+            output.say("  " + line)
+    if item["not_indexed"]:
+        output.say(f"not indexed: {item['not_indexed']}")
+    if item["fields"]:
+        output.say()
+        if item["observed"]:
+            output.say("No definition fixes the fields. The first messages have these:")
+        output.print_table(
+            [("field", "left"), ("type", "left"), ("asked as", "left")],
+            [
+                (f["path"], f["type"], f["path"] if item["observed"] else _asked_as(f))
+                for f in item["fields"]
+            ],
+        )
+    output.say()
+
+
+def _topic_as_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
+    from hybridlog.query.answers.infer_fields import infer_fields
+
+    channel, codec = recorded.channel, recorded.codec
+    schema = channel.schema
+    text = None
+    if schema is not None and schema.encoding in _READABLE:
+        text = bytes(schema.data).decode("utf-8", "replace")
+    fields: list[dict[str, object]] = [
+        {"path": p.path, "type": p.type, "array": p.array} for p in codec.paths()
+    ]
+    observed = codec.indexed and not fields
+    if observed:
+        fields = infer_fields(store.query([channel.topic], [recorded.recording.id]))
+    return {
+        "topic": channel.topic,
+        "type": schema.name if schema is not None else None,
+        "message_encoding": channel.message_encoding,
+        "schema_encoding": schema.encoding if schema is not None else None,
+        "definition": text,
+        "recordings": [recorded.recording.label],
+        "not_indexed": codec.reason,
+        "observed": observed,
+        "fields": fields,
+    }
+
+
+def _asked_as(field: dict[str, Any]) -> str:
+    path, kind = str(field["path"]), str(field["type"])
+    if "[" in kind and any(kind.startswith(n) for n in ("int", "uint", "float", "bool")):
+        return f"{path}.min, {path}.max, {path}.mean, {path}.n"
+    return path
+
+
+def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], *, as_json: bool) -> None:
+    """Print what is missing, from when to when, and why.
+
+    Args:
+        entries: The recordings.
+        topics: Only of these, as patterns; empty for all.
+        as_json: Print JSON.
+    """
+    from hybridlog.query.topics import matcher
+
+    fits = matcher(topics) if topics else None
+    rows = [
+        {"recording": entry.label, **loss}
+        for entry in entries
+        for loss in losses_of(entry)
+        if fits is None or (loss.get("topic") is not None and fits(loss["topic"]))
+    ]
+    if as_json:
+        output.print_json(rows)
+    elif rows:
+        _print_losses(rows, entries)
+    else:
+        named = output.counted(len(entries), "recording")
+        output.say(f"Nothing is missing from {named}, as far as the ledger knows.")
+    for entry in entries:
+        if entry.status == "open":
+            output.note(
+                f"{entry.label} is still being recorded; `hybridlog top {entry.label}` shows later "
+                "losses."
+            )
+
+
+def _print_losses(rows: Sequence[dict[str, Any]], entries: Sequence[RecordingEntry]) -> None:
+    several = len(entries) > 1
+    columns: list[output.Column] = [
+        ("topic", "left"),
+        ("cause", "left"),
+        ("messages", "right"),
+        ("from", "whole"),
+        ("for", "right"),
+        ("detail", "left"),
+    ]
+    if several:
+        columns.insert(0, ("recording", "left"))
+    output.print_table(
+        columns,
+        [([row["recording"]] if several else []) + _loss_cells(row) for row in rows],
+    )
+
+
+def _loss_cells(row: dict[str, Any]) -> list[str]:
+    begin, end = row.get("from"), row.get("to")
+    file = f"{row['file']}: " if row.get("file") else ""
+    return [
+        row.get("topic") or "any",
+        row["cause"],
+        "unknown" if row["count"] is None else str(row["count"]),
+        "" if begin is None else output.short_time(begin),
+        "" if begin is None or end is None else output.short_duration(end - begin),
+        f"{file}{row.get('reason') or ''}",
+    ]
+
+
+def show_sizes(sizes: Sizes, by: str, *, as_json: bool) -> None:
+    """Print the bytes of recordings, topics, or topics of each recording.
+
+    Args:
+        sizes: The sizes.
+        by: `recording`, `topic` or `both`.
+        as_json: Print JSON.
+    """
+    rows = sizes.rows
+    if by != "both":
+        rows = sizes.by_recording() if by == "recording" else sizes.by_topic()
+    if as_json:
+        each = [_size_as_dict(row) for row in rows]
+        output.print_json({"rows": each, "total": _size_as_dict(sizes.total)})
+    elif rows:
+        _print_sizes(rows, sizes.total, recordings=by != "topic", topics=by != "recording")
+    else:
+        output.note("The store is empty: `hybridlog record FILE` fills it.")
+
+
+_NO_TOPIC = "(no topic)"
+
+
+def _size_as_dict(row: Size) -> dict[str, Any]:
+    """A row for JSON, without empty names."""
+    return {
+        **{name: value for name, value in asdict(row).items() if value != ""},
+        "total_bytes": row.total_bytes,
+    }
+
+
+def _print_sizes(rows: Sequence[Size], total: Size, *, recordings: bool, topics: bool) -> None:
+    """Print rows and their sum.
+
+    Args:
+        rows: The rows.
+        total: The sum.
+        recordings: Whether the rows are of single recordings.
+        topics: Whether the rows are of single topics.
+    """
+    columns: list[output.Column] = [("recording", "left")] if recordings else []
+    if topics:
+        columns.append(("topic", "left"))
+    has_columns = bool(total.column_bytes)
+    columns_too = ("columns",) if has_columns else ()
+    headings = ("messages", "payload", "segments", *columns_too, "tables", "MongoDB", "total")
+    names: list[output.Column] = [(heading, "right") for heading in headings]
+    if output.is_narrow():
+        del names[:2]
+    cells = []
+    for row in (*rows, total):
+        is_total = row is total
+        named = [("total" if is_total else row.recording)] if recordings else []
+        if topics:
+            name = row.topic or _NO_TOPIC
+            named.append(name if not is_total else "" if recordings else "total")
+        cells.append([*named, *_size_cells(row, has_columns=has_columns)[-len(names) :]])
+    output.print_table([*columns, *names], cells)
+
+
+def _size_cells(row: Size, *, has_columns: bool) -> list[str]:
+    index = "-" if row.index_bytes is None else output.size(row.index_bytes)
+    columns = [row.column_bytes] if has_columns else []
+    sizes = [row.payload_bytes, row.segment_bytes, *columns, row.table_bytes]
+    return [str(row.messages), *map(output.size, sizes), index, output.size(row.total_bytes)]
+
+
+def show_attachments(
+    found: list[StoredAttachment],
+    name: str | None,
+    target: Path | None,
+    *,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """List attachments, print the content of one, or write some into files.
+
+    Args:
+        found: Those of the chosen recordings.
+        name: Only this one, or those that fit a glob.
+        target: The file, or the directory for several.
+        force: Overwrite files.
+        as_json: Print JSON.
+    """
+    found = _chosen(found, name)
+    if target is None and (name is None or as_json):
+        _list_attachments(found, as_json=as_json)
+    elif target is None:
+        _print_content(found)
+    elif name is None or len(found) > 1 or target.is_dir():
+        _write_all(found, target, force=force)
+    else:
+        check_room(target, force=force)
+        _write(found[0], target)
+
+
+def _chosen(found: list[StoredAttachment], name: str | None) -> list[StoredAttachment]:
+    if name is None:
+        return found
+    chosen = [each for each in found if each.name == name]
+    chosen = chosen or [each for each in found if fnmatchcase(each.name, name)]
+    if not chosen:
+        names = listed(output.quoted(each.name) for each in found) or "none"
+        raise TopicError(f"There is no attachment {output.quoted(name)}. There are: {names}.")
+    return chosen
+
+
+def attachment_as_dict(attachment: StoredAttachment) -> dict[str, Any]:
+    """An attachment as JSON."""
+    return {
+        "recording": attachment.recording,
+        "name": attachment.name,
+        "media_type": attachment.media_type,
+        "bytes": attachment.size,
+        "log_time_ns": attachment.log_time_ns,
+        "create_time_ns": attachment.create_time_ns,
+    }
+
+
+def _list_attachments(found: list[StoredAttachment], *, as_json: bool) -> None:
+    from hybridlog.query.times import format_time
+
+    if as_json:
+        output.print_json([attachment_as_dict(each) for each in found])
+        return
+    if not found:
+        output.note("There are no attachments.")
+        return
+    output.print_table(
+        [("attachment", "left"), ("media type", "left"), ("size", "right"), ("log time", "left")],
+        [
+            (
+                each.name,
+                each.media_type,
+                output.size(each.size),
+                format_time(each.log_time_ns) if each.log_time_ns else "-",
+            )
+            for each in found
+        ],
+    )
+
+
+def _print_content(found: list[StoredAttachment]) -> None:
+    if len(found) > 1:
+        raise UsageError(
+            f"{len(found)} attachments have this name: -o DIR writes each of them into a file."
+        )
+    if sys.stdout.isatty() and not found[0].media_type.startswith("text/"):
+        raise UsageError(f"{found[0].name} may be no text: name a file with -o.")
+    for piece in found[0].pieces():
+        sys.stdout.buffer.write(piece)
+    sys.stdout.buffer.flush()
+
+
+def _write_all(found: list[StoredAttachment], directory: Path, *, force: bool) -> None:
+    """Write each attachment into a directory, under a name made from its own."""
+    from hybridlog.attachments import file_names
+
+    paths = [directory / name for name in file_names(found)]
+    for path in paths:
+        check_room(path, force=force)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
+    for attachment, path in zip(found, paths, strict=True):
+        _write(attachment, path)
+
+
+def _write(attachment: StoredAttachment, path: Path) -> None:
+    with if_stopped(partial(not_written, path)):
+        attachment.save(path)
+    output.note(f"{path}: {output.size(attachment.size)}")
