@@ -36,12 +36,14 @@ from hybridlog_storage.errors import (
     DatabaseError,
     HeldError,
     HybridlogError,
+    ObjectExistsError,
     ResourceError,
     StoreError,
     TimeError,
     TopicError,
     UsageError,
 )
+from hybridlog_storage.remote.store import TRIES, address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
@@ -135,6 +137,13 @@ def open_store(
     """
     where = store_path(path)
     wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
+    if address_of(where) is not None:
+        directory = directory_of(where, read_only=read_only)
+        if create or shared:
+            directory.check_writable()
+        if require_database or mongo not in {None, NONE}:
+            raise UsageError("A store in a bucket is asked without MongoDB: leave out --mongo.")
+        return Store(directory, mongo=NONE, recover=False)
     if cache_mb is not None:
         checked_cache_mb(cache_mb, "The size of the cache")
     cache = cache_mb or cache_mb_from_environment()
@@ -170,6 +179,19 @@ def _again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
             return work(*args, **options)
         except ConnectionLostError:
             return work(*args, **options)
+
+    return tried
+
+
+def _again_if_overtaken(work: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Do something again if another process changed the store in the bucket at the same time."""
+
+    @wraps(work)
+    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
+        for _ in range(TRIES):
+            with suppress(ObjectExistsError):
+                return work(*args, **options)
+        return work(*args, **options)
 
     return tried
 
@@ -223,14 +245,14 @@ class Store:
         self._close()
 
     def __repr__(self) -> str:
-        return f"<Store {self.directory.path}>"
+        return f"<Store {self.directory.place}>"
 
     def _repr_html_(self) -> str:
         """The store in a notebook: its latest recordings."""
         from hybridlog.drawing.notebook import recordings_html
 
         summaries = self.summaries()
-        title = f"Store {self.directory.path}: {len(summaries)} recordings"
+        title = f"Store {self.directory.place}: {len(summaries)} recordings"
         return recordings_html(title, summaries)
 
     def _ipython_key_completions_(self) -> list[str]:
@@ -792,7 +814,7 @@ class Store:
     def _opener(self) -> Callable[[], Store]:
         """Opens this store in another process."""
         mongo = self.session.connection.wanted
-        return partial(open_store, self.directory.path.absolute(), mongo=mongo)
+        return partial(open_store, self.directory.address, mongo=mongo)
 
     def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
         """A query about a topic, with its share of the fields, which is taken out of them."""
@@ -1120,6 +1142,7 @@ class Store:
             TopicError: A recording or a topic does not exist.
             StoreError: A named recording is being written.
         """
+        self._check_on_disk()
         from hybridlog.maintenance import index
         from hybridlog.maintenance.compact import compact
 
@@ -1205,6 +1228,7 @@ class Store:
         Raises:
             TimeError: A time is invalid, or the range is empty or outside of the recording.
         """
+        self._check_on_disk()
         from hybridlog.maintenance.keep import append_pins, may_hold, pin_of
 
         (entry,) = self.select([recording])
@@ -1226,6 +1250,7 @@ class Store:
         Raises:
             UsageError: There is no pin of a name.
         """
+        self._check_on_disk()
         from hybridlog.maintenance.keep import append_pins
 
         known = {pin["id"]: entry for entry in self.select(None) for pin in entry.pins}
@@ -1237,6 +1262,7 @@ class Store:
             append_pins(self.directory, entry.label, entry.id, [line])
             self.session.catch_up(entry.id)
 
+    @_again_if_overtaken
     def remove(self, recording: str) -> None:
         """Delete a recording.
 
@@ -1290,6 +1316,7 @@ class Store:
         """Write a note about a recording; `info` shows it."""
         return self._edit(recording, journal.event(journal.NOTED, text=text(note)))
 
+    @_again_if_overtaken
     def _edit(self, recording: str | RecordingEntry, *lines: journal.Event) -> RecordingEntry:
         from hybridlog.maintenance import edit, index
 
@@ -1325,6 +1352,7 @@ class Store:
             TimeError: `moment` or `until` is invalid, or `until` is before `moment`.
             StoreError: The recording is being written; use `hybridlog mark` without `--at`.
         """
+        self._check_on_disk()
         from hybridlog.maintenance import edit
 
         self.session.catch_up()
@@ -1369,7 +1397,8 @@ class Store:
         """
         from hybridlog.maintenance import imports, tables
 
-        with Store(StoreDirectory(Path(other)), mongo=EMBEDDED) as source:
+        there = directory_of(other)
+        with Store(there, mongo=NONE if there.is_remote else EMBEDDED) as source:
             chosen: Sequence[RecordingEntry]
             if isinstance(recordings, Choice):
                 chosen = source.choose(recordings)
@@ -1393,6 +1422,7 @@ class Store:
             recordings: The recordings; None for all.
             progress: Called after each chunk.
         """
+        self._check_on_disk()
         from hybridlog.maintenance.repair import repair, repair_index
 
         self.session.mend()
@@ -1412,6 +1442,10 @@ class Store:
             )
             self.refresh()
         return done
+
+    def _check_on_disk(self) -> None:
+        if self.directory.is_remote:
+            self.directory.check_writable()
 
     def _now(self, entries: Sequence[RecordingEntry]) -> list[RecordingEntry]:
         """Recordings as they are now, oldest first; those that are gone are left out."""

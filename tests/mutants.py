@@ -987,8 +987,8 @@ SILENT = [
         "hybridlog/maintenance/edit.py",
         (
             "the-recording-that-has-the-label-is-edited",
-            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        Journal",
-            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        Journal",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        directory.append",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        directory.append",
             f"{CHOSEN}[tag-3]",
         ),
         (

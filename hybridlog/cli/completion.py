@@ -116,11 +116,11 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
 
 def _store(context: click.Context) -> StoreDirectory:
     from hybridlog.store import store_path
-    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.remote.store import directory_of
 
     value: Path | None = context.params.get("store")
     # The shell has not expanded the tilde of the line that is being completed.
-    return StoreDirectory(store_path(None if value is None else os.path.expanduser(value)))  # noqa: PTH111
+    return directory_of(store_path(None if value is None else os.path.expanduser(value)))  # noqa: PTH111
 
 
 def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:

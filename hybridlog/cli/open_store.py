@@ -107,7 +107,7 @@ def _print_repairs(store: Store, doing: str) -> None:
             "The disk of the store is full, so nothing in it is repaired or noted. Remove "
             f"recordings with `hybridlog rm`, or make room. {repairs.disk_full}"
         )
-    elif not store.directory.is_writable:
+    elif not (store.directory.is_writable or store.directory.is_remote):
         note(f"The store {store.directory.path} is read-only; its segments answer.")
     _print_rebuilt(store, doing)
 

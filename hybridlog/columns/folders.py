@@ -431,19 +431,17 @@ class Listing:
             StoreError: they cannot be read.
         """
         try:
-            with files.folder(self._path, self._depth) as fd:
-                about = os.fstat(fd)
-                now = about.st_ino, about.st_mtime_ns
-                if now == self._read_at:
-                    return False
-                self.names = files.names_in(fd)
+            now, names = files.changed_names(self._path, self._read_at, depth=self._depth)
+            if names is None:
+                return False
+            self.names = names
         except FileNotFoundError:
             self.names, self._read_at = {}, None
             return True
         except OSError as error:
             raise unreadable(error, self._path) from error
         # A change within the same tick of the clock would have the same time.
-        is_settled = time.time_ns() - about.st_mtime_ns > _SETTLED_NS
+        is_settled = time.time_ns() - now[1] > _SETTLED_NS
         self._read_at = now if is_settled else None
         return True
 

@@ -12,7 +12,7 @@ import hashlib
 import os
 import re
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -386,6 +386,8 @@ class ParquetFileReader:
         """
         try:
             with self._lock:
+                if group is not None:
+                    self._source.fetch(self._parquet.metadata.row_group(group), leaves)
                 reader: Any = self._parquet.reader
                 table: pa.Table = reader.read_row_groups(
                     [] if group is None else [group],
@@ -429,7 +431,7 @@ class _Source:
         self._lock = threading.Lock()
         self._fd = -1
         self._position = 0
-        self._same: tuple[int, int, int] | None = None
+        self._same: tuple[int, ...] | None = None
         with self._lock:
             self._open()
         self.size = os.fstat(self._fd).st_size
@@ -459,6 +461,20 @@ class _Source:
         """Read and verify the whole body."""
         for at in range(0, self._body, 64 * BLOCK):
             self.checked(at, min(at + 64 * BLOCK, self._body))
+
+    def fetch(self, group: Any, leaves: Iterable[int]) -> None:
+        """Ask a bucket once for some columns of a row group."""
+        with self._lock:
+            if self._fd < 0:
+                self._open()
+            if files.is_fetched(self._fd):
+                ranges = []
+                for column in map(group.column, leaves):
+                    begin = column.dictionary_page_offset or column.data_page_offset
+                    begin = min(begin, column.data_page_offset)
+                    end = begin + column.total_compressed_size
+                    ranges.append((begin // BLOCK * BLOCK, -(-end // BLOCK) * BLOCK))
+                files.fetch(self._fd, ranges)
 
     def read(self, size: int = -1) -> bytes:
         """Read from the current position."""
@@ -496,8 +512,7 @@ class _Source:
 
     def _open(self) -> None:
         self._fd = files.open_file(self._path, os.O_RDONLY | os.O_NONBLOCK, depth=self._depth)
-        about = os.fstat(self._fd)
-        same = about.st_ino, about.st_size, about.st_mtime_ns
+        same = files.identity(self._fd)
         if self._same is not None and same != self._same:
             os.close(self._fd)
             self._fd = -1
@@ -508,7 +523,7 @@ class _Source:
         with self._lock:
             if self._fd < 0:
                 self._open()
-            data = os.pread(self._fd, size, offset)
+            data = files.pread(self._fd, size, offset)
         if len(data) != size:
             raise StoreError("it was truncated")
         return data

@@ -49,9 +49,9 @@ def append(
         TopicError: It is gone.
     """
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        path = directory.recording(label)
-        Journal(path).append(*[_with_labels(directory, label, line) for line in lines])
-        put_entry(directory, catalog, finish_renaming(directory, label, journal.read(path)))
+        directory.append(label, *[_with_labels(directory, label, line) for line in lines])
+        state = journal.read(directory.recording(label))
+        put_entry(directory, catalog, finish_renaming(directory, label, state))
 
 
 def _with_labels(directory: StoreDirectory, label: str, line: journal.Event) -> journal.Event:

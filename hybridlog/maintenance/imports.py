@@ -323,6 +323,7 @@ def _copy(source: Path, target: Path, size: int, *, depth: int) -> None:
         raise durability.explain(error, source, "reading") from error
     try:
         with durability.new_file(target, depth=depth) as out:
+            files.fetch(fd, [(0, size)])
             while piece := os.read(fd, min(size, _PIECE)):
                 size -= durability.write_all(out, [piece])
     finally:

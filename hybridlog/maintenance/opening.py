@@ -66,8 +66,12 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
         directory: The store.
         in_memory: Use memory in any case, for a full disk.
     """
-    store_id = directory.settings.store_id
-    return Catalog(directory.path, store_id, in_memory=in_memory or not directory.is_writable)
+    return Catalog(
+        directory.path,
+        directory.settings.store_id,
+        in_memory=in_memory or not directory.is_writable,
+        folder=directory.catalog_folder(),
+    )
 
 
 def look_at_all(
@@ -536,7 +540,7 @@ def finish_renaming(directory: StoreDirectory, label: str, state: JournalState |
             if label != after:
                 directory.move(label, after)
         label = after
-    Journal(directory.recording(label)).append(journal.event(journal.RENAMED, name=state.name))
+    directory.append(label, journal.event(journal.RENAMED, name=state.name))
     return label
 
 

@@ -27,7 +27,8 @@ def remove(
     """Delete a recording.
 
     The journal announces it first. Then the directory gets a hidden name, and the recording
-    is gone; the next opening removes remaining files.
+    is gone; the next opening removes remaining files. In a bucket it is listed no more, and its
+    objects stay for those who read them.
 
     Args:
         directory: The store.
@@ -41,6 +42,10 @@ def remove(
         DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
     """
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        if directory.is_remote:
+            directory.drop(label)
+            catalog.remove(entry.id)
+            return
         announce_removal(directory, label)
         tables.announce_removal(directory, entry.id)
         hidden = directory.hide(label)

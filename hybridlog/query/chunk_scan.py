@@ -34,11 +34,12 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import SegmentReader
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
 _LOOK_AHEAD = 4
 _MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte
 _SMALL_CHUNK_BYTES = 128 << 10  # copying such a chunk is faster than decoding it by itself
+_FETCHED_BYTES = 16 << 20  # asked for at once, where each request takes long
 _MERGED_BYTES = 1 << 20  # small chunks are decoded together up to this size
 
 ChunkKey = tuple[str, int, int]
@@ -251,8 +252,11 @@ class ChunkScan:
         start: Callable[[ChunkTask, RowSelection | None], _Loading],
     ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
+        if tasks and self._reader(tasks[0]).is_fetched:
+            upcoming = self._announced(self._selected(tasks))
+        else:
+            upcoming = self._selected(tasks)
         loading: deque[tuple[ChunkTask, _Loading]] = deque()
-        upcoming = self._selected(tasks)
         while True:
             while len(loading) < _LOOK_AHEAD:
                 item = next(upcoming, None)
@@ -270,8 +274,24 @@ class ChunkScan:
             counters.without_arrays += expired
             yield task, run, loading[0][0] if loading else None
 
+    def _announced(
+        self, items: Iterator[tuple[ChunkTask, RowSelection | None]]
+    ) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
+        """The same, after a bucket was asked for many of them at once."""
+        room = _FETCHED_BYTES if self._reads_ahead else _MERGED_BYTES
+        while group := list(_up_to(items, room)):
+            by_segment: dict[tuple[str, int], list[ChunkPlace]] = {}
+            for task, _ in group:
+                by_segment.setdefault(task.key[:2], []).append(task.chunk.place)
+            for segment, places in by_segment.items():
+                self._reader_of(*segment).fetch(places)
+            yield from group
+
+    def _reader(self, task: ChunkTask) -> SegmentReader:
+        return self._reader_of(task.scan.recording.id, task.chunk.segment)
+
     def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
-        reader = self._reader_of(task.scan.recording.id, task.chunk.segment)
+        reader = self._reader(task)
         chunk = reader.read_chunk(task.chunk.place)
         run = self._wanted(task, chunk, selection)
         run, unreadable, expired = self._filtered(run)
@@ -372,6 +392,17 @@ class ChunkScan:
             else:
                 rest.append(run)
         return ready, rest
+
+
+def _up_to(
+    items: Iterator[tuple[ChunkTask, RowSelection | None]], room: int
+) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
+    """The next chunks, until they have so many bytes."""
+    for item in items:
+        yield item
+        room -= item[0].chunk.place.length
+        if room <= 0:
+            return
 
 
 _Loaded = tuple[MessageRun, int, int, int]

@@ -83,7 +83,7 @@ class PageQuestion:
 
     def command(self) -> str:
         """The command line that writes it to a file of `file_name`."""
-        words = ["hybridlog", "fetch", "--store", str(self.store.directory.path)]
+        words = ["hybridlog", "fetch", "--store", self.store.directory.place]
         words += ["-r", self.recording.label]
         for topic in self.topics or [_EVERY_TOPIC]:
             words += ["-t", topic]
@@ -158,5 +158,5 @@ def question_of(context: Context, asked: RequestParams) -> PageQuestion:
 
 def program(store: Store, body: str) -> str:
     """A program that opens a store; `body` is indented."""
-    path = str(store.directory.path)
+    path = store.directory.place
     return f"import hybridlog as hl\n\nwith hl.open({path!r}) as store:\n{body}"

@@ -92,5 +92,5 @@ class SqlProcess:
             threading.Thread(target=child.wait, daemon=True).start()
             mongo = self._store.session.connection.wanted
             directory = self._store.directory
-            self._control.send((str(directory.path.absolute()), mongo, directory.read_only))
+            self._control.send((directory.address, mongo, directory.read_only))
         send_handle(self._control, theirs.fileno(), None)

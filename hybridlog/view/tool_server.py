@@ -86,7 +86,7 @@ class _Answers:
 
     def __init__(self, store: Store, seconds: float) -> None:
         self._process = SqlProcess(store)
-        self._places = {str(store.directory.path.absolute()), str(store.directory.path)}
+        self._places = {store.directory.address, str(store.directory.path)}
         self._seconds = seconds
         self._turns = threading.BoundedSemaphore(_TURNS)
 

@@ -560,6 +560,7 @@ class Catalog:
         store: The store's directory.
         store_id: The store's id; what is of another store is removed.
         in_memory: Leave no file, for a store that this user cannot write.
+        folder: Its files, if they lie elsewhere.
 
     Attributes:
         was_damaged: True if something damaged was found since this was last set to False.
@@ -567,14 +568,21 @@ class Catalog:
         has_changed: True if an ended recording was changed by this process.
     """
 
-    def __init__(self, store: Path, store_id: str, *, in_memory: bool = False) -> None:
+    def __init__(
+        self,
+        store: Path,
+        store_id: str,
+        *,
+        in_memory: bool = False,
+        folder: MemoryFolder | None = None,
+    ) -> None:
         self.was_damaged = False
         self.has_changed = False
         self.locked: Path | None = None
         self._store = store
         self._store_id = store_id
         self._lock = taken_by_forks(RLock())
-        self._folder = MemoryFolder()
+        self._folder = folder or MemoryFolder()
         self._parts: dict[int, _Part] = {}
         self._places: dict[str, int] = {}  # number of its part, by id of a recording
         self._by_fingerprint: dict[str, list[str]] | None = None
@@ -584,7 +592,7 @@ class Catalog:
         # Bounds and the content that they are of, by kind and recording.
         self._noted: dict[str, dict[str, tuple[str, Ends]]] = defaultdict(dict)
         self._tables = Cache(_MAX_TABLES)
-        if not in_memory:
+        if not in_memory and folder is None:
             self._folder = DiskFolder(store / CATALOG)
             self._check_folder()
 

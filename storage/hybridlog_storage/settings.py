@@ -137,6 +137,15 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
             UsageError: The URI is not a MongoDB connection string.
             OSError: They cannot be written.
     """
+    files.write_file(path / NAME, settings_text(settings), depth=files.IN_STORE)
+
+
+def settings_text(settings: StoreSettings) -> bytes:
+    """The content of the file, without a password in the URI.
+
+    Raises:
+        UsageError: The URI is not a MongoDB connection string.
+    """
     lines = [f"format = {FORMAT}", f"store_id = {_quoted(settings.store_id)}"]
     if settings.mongo is not None:
         mongo = without_password(settings.mongo) if is_uri(settings.mongo) else settings.mongo
@@ -151,8 +160,7 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
     if settings.retention:
         lines.append("\n[retention]")
         lines += [f"{_quoted(k)} = {_as_toml(v)}" for k, v in settings.retention.items()]
-    content = ("\n".join(lines) + "\n").encode()
-    files.write_file(path / NAME, content, depth=files.IN_STORE)
+    return ("\n".join(lines) + "\n").encode()
 
 
 def is_uri(mongo: str | None) -> TypeGuard[str]:

@@ -49,9 +49,10 @@ class Proxy:
     Attributes:
         requests: Method, object and range of each request so far.
         spoil: Called with the number of each request, from 1; says what becomes of it: "reset"
-            before it reaches the server, "lost" after that, "503", "cut" in the middle of the
-            answer, "slow", or "" for nothing.
+            before it reaches the server, "lost" after that, "503", "403", "cut" in the middle of
+            the answer, "slow", or "" for nothing.
         delay: Seconds that each request takes longer.
+        old_lists: Answers to requests for lists, once they are kept; None to pass them on.
         without_conditions: Drop the conditions of writers, as some servers do.
     """
 
@@ -60,6 +61,7 @@ class Proxy:
         self.spoil: Callable[[int], str] = lambda _: ""
         self.delay = 0.0
         self.without_conditions = False
+        self.old_lists: dict[str, bytes] | None = None
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -85,6 +87,7 @@ class Proxy:
         self.spoil = lambda _: ""
         self.delay = 0.0
         self.without_conditions = False
+        self.old_lists = None
 
     def close(self) -> None:
         self._server.shutdown()
@@ -100,8 +103,8 @@ class Proxy:
         if what == "reset":
             _break(client)
             return
-        if what == "503":
-            client.send_response(503)
+        if what in {"503", "403"}:
+            client.send_response(int(what))
             client.send_header("content-length", "0")
             client.end_headers()
             return
@@ -111,6 +114,8 @@ class Proxy:
             server.request(client.command, client.path, body, headers)
             answer = server.getresponse()
             content = answer.read()
+        if self.old_lists is not None and "list-type" in client.path:
+            content = self.old_lists.setdefault(client.path, content)
         if what == "lost":
             _break(client)
             return

@@ -52,7 +52,7 @@ def recordings(context: Context, asked: RequestParams) -> dict[str, Any]:
     ordered = sorted(summaries, key=key, reverse=not is_ascending)
     shown = ordered[first : first + count]
     return {
-        "store": str(store.directory.path),
+        "store": store.directory.place,
         "all": len(store.session.snapshot().summaries),
         "found": len(ordered),
         "messages": sum(one.messages for one in ordered),
@@ -70,7 +70,7 @@ def recording(context: Context, asked: RequestParams) -> dict[str, Any]:
     return {
         "id": entry.id,
         "label": entry.label,
-        "store": str(context.store.directory.path),
+        "store": context.store.directory.place,
         "name": entry.name,
         "status": entry.status,
         "start": str(start),

@@ -27,9 +27,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from hybridlog_storage import journal
+from hybridlog_storage.catalog_parts import MemoryFolder
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.sharing import make_shared
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError, unreadable
@@ -99,9 +100,14 @@ class StoreDirectory:
         path: The directory.
         read_only: Behave as if this user could not write it.
 
+    Attributes:
+        is_remote: Whether it stands for a place in a bucket, see `remote.store`.
+
     Raises:
         StoreError: It is not a store, has another format, or cannot be read.
     """
+
+    is_remote: ClassVar[bool] = False
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
@@ -275,6 +281,33 @@ class StoreDirectory:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return found
 
+    def _look_of(self, label: str) -> str:
+        """The look of one recording."""
+        with files.folder(self.recording(label), files.IN_FOLDER) as fd:
+            return _look(os.fstat(fd), JOURNAL, fd)
+
+    @property
+    def address(self) -> str:
+        """What another process opens it by."""
+        return str(self.path.absolute())
+
+    @property
+    def place(self) -> str:
+        """Where the store is, for people."""
+        return str(self.path)
+
+    def catalog_folder(self) -> MemoryFolder | None:
+        """The files of the catalog; None for those in its folder here."""
+        return None
+
+    def append(self, label: str, *lines: journal.Event) -> None:
+        """Append lines to the journal of a recording that this process has locked.
+
+        Raises:
+            StoreError: It cannot be written.
+        """
+        journal.Journal(self.recording(label)).append(*lines)
+
     def has(self, label: str) -> bool:
         """True if this name exists below `recordings`."""
         try:
@@ -303,9 +336,8 @@ class StoreDirectory:
         path = self.recording(label)
         look, found, payloads = "", {}, {}
         try:
-            with files.folder(path, files.IN_FOLDER) as fd:
-                look = _look(os.fstat(fd), JOURNAL, fd)
-                found = files.names_in(fd)
+            look = self._look_of(label)
+            found = files.names(path, depth=files.IN_FOLDER)
             if PAYLOADS in found:
                 payloads = payload_names(path)
         except FileNotFoundError:
@@ -424,6 +456,10 @@ class StoreDirectory:
         hidden = f"{REMOVED}{label}-{secrets.token_hex(4)}"
         self.move(label, hidden)
         return hidden
+
+    def drop(self, label: str) -> None:
+        """List a recording no more, where a list says what there is."""
+        raise NotImplementedError
 
     def sweep(self, name: str) -> None:
         """Delete a hidden directory below `recordings`."""

@@ -8,20 +8,25 @@ store.
 A folder that is setgid and group-writable is shared: new files in it are group-writable,
 too, whatever the umask is.
 
+A store in a bucket is read by the same functions: `mounted` knows who answers for its path, and
+nothing in it can be changed here. What is read of its files goes through `pread` and `preadv`,
+or is announced by `fetch` before.
+
 All changes of a store on the disk go through `system`. Tests replace it to record the
 order of steps, to fail at a step, or to lose unsynced data.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import secrets
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, cast
 
 IN_STORE: Final = 1
 """Depth of a file in the store's own folder."""
@@ -33,6 +38,39 @@ IN_RECORDING: Final = 3
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _SHARED = stat.S_ISGID | stat.S_IWGRP
 _GROUP = stat.S_IRWXG
+_WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+Identity = tuple[int, int]
+"""Inode of a folder, and time of its last change, ns."""
+
+
+class Mounted(Protocol):
+    """A store that is no directory, to which the functions here lead."""
+
+    def status(self, inner: tuple[str, ...]) -> os.stat_result:
+        """The status of a file or folder, by the names on the way to it."""
+
+    def names(self, inner: tuple[str, ...]) -> dict[str, os.stat_result]:
+        """The status of each entry of a folder, by name."""
+
+    def open(self, inner: tuple[str, ...]) -> int:
+        """A handle for reading a file."""
+
+
+class Fetched(Protocol):
+    """A handle of a file whose content is fetched when it is read."""
+
+    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Make ranges of bytes readable."""
+
+    def again(self) -> int:
+        """Another handle of the same file."""
+
+    def identity(self) -> tuple[int, ...]:
+        """What another file does not have, nor this one after a change."""
+
+
+mounted: Final[dict[Path, Mounted]] = {}
+"""Stores that are no directories, by their paths."""
 
 
 class System:
@@ -95,6 +133,8 @@ def folder(path: Path, depth: int) -> Iterator[int]:
         OSError: It does not exist, is not a folder, or is a symlink.
     """
     outer, inner = _split(path, depth)
+    if outer in mounted:
+        raise OSError(errno.EROFS, "a store in a bucket cannot be changed like this", str(path))
     fd = os.open(outer, _FOLDER)
     try:
         for part in inner:
@@ -118,6 +158,9 @@ def open_file(path: Path, flags: int, mode: int = 0o666, *, depth: int = IN_RECO
     Raises:
         OSError: As `os.open`; ELOOP or ENOTDIR for a symlink.
     """
+    outer, inner = _split(path, depth)
+    if outer in mounted and not flags & _WRITES:
+        return mounted[outer].open(inner)
     with folder(path.parent, depth - 1) as fd:
         opened = system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
         try:
@@ -144,6 +187,7 @@ def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file", str(path))
+        fetch(fd, [(0, most + 1)])
         parts: list[bytes] = []
         left = most + 1
         while left > 0 and (part := os.read(fd, min(left, 1 << 20))):
@@ -195,6 +239,9 @@ def status(path: Path, *, depth: int = IN_RECORDING) -> os.stat_result:
     Raises:
         OSError: It does not exist.
     """
+    outer, inner = _split(path, depth)
+    if outer in mounted:
+        return mounted[outer].status(inner)
     with folder(path.parent, depth - 1) as fd:
         return os.stat(path.name, dir_fd=fd, follow_symlinks=False)
 
@@ -205,8 +252,76 @@ def names(path: Path, *, depth: int) -> dict[str, os.stat_result]:
     Raises:
         OSError: It cannot be read.
     """
+    outer, inner = _split(path, depth)
+    if outer in mounted:
+        return mounted[outer].names(inner)
     with folder(path, depth) as fd:
         return names_in(fd)
+
+
+def changed_names(
+    path: Path, before: Identity | None, *, depth: int
+) -> tuple[Identity, dict[str, os.stat_result] | None]:
+    """The status of each entry of a folder, by name, if it may have changed.
+
+    Args:
+        path: The folder.
+        before: What this returned first when it was read; None if it never was.
+        depth: As for `names`.
+
+    Returns:
+        Inode of the folder and time of its last change, ns, and None for entries as before.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    outer, inner = _split(path, depth)
+    if outer in mounted:
+        about = mounted[outer].status(inner)
+        now = about.st_ino, about.st_mtime_ns
+        return now, None if now == before else mounted[outer].names(inner)
+    with folder(path, depth) as fd:
+        about = os.fstat(fd)
+        now = about.st_ino, about.st_mtime_ns
+        return now, None if now == before else names_in(fd)
+
+
+def is_fetched(fd: int) -> bool:
+    """True for a file in a bucket, where each request takes long."""
+    return type(fd) is not int
+
+
+def fetch(fd: int, ranges: Iterable[tuple[int, int]]) -> None:
+    """Announce that some ranges of a file will be read, so that a bucket is asked once."""
+    if is_fetched(fd):
+        cast("Fetched", fd).fetch(ranges)
+
+
+def pread(fd: int, size: int, offset: int) -> bytes:
+    """As `os.pread`."""
+    if is_fetched(fd):
+        cast("Fetched", fd).fetch([(offset, offset + size)])
+    return os.pread(fd, size, offset)
+
+
+def preadv(fd: int, buffers: Sequence[memoryview], offset: int) -> int:
+    """As `os.preadv`."""
+    if is_fetched(fd):
+        cast("Fetched", fd).fetch([(offset, offset + sum(map(len, buffers)))])
+    return os.preadv(fd, buffers, offset)
+
+
+def identity(fd: int) -> tuple[int, ...]:
+    """What another file does not have, nor this one after a change."""
+    if is_fetched(fd):
+        return cast("Fetched", fd).identity()
+    about = os.fstat(fd)
+    return about.st_ino, about.st_size, about.st_mtime_ns
+
+
+def duplicate(fd: int) -> int:
+    """As `os.dup`."""
+    return cast("Fetched", fd).again() if is_fetched(fd) else os.dup(fd)
 
 
 def names_in(fd: int) -> dict[str, os.stat_result]:

@@ -95,6 +95,11 @@ class Bucket:
         self._has_conditions = False
         self._reading = _opened(self.address, _READ_S)
 
+    @property
+    def is_usable(self) -> bool:
+        """False in a process that was forked from the one that opened it."""
+        return os.getpid() == self._pid
+
     @lazy
     def _writing(self) -> ObjectStore:
         return _opened(self.address, _WRITE_S)
@@ -377,7 +382,7 @@ class Bucket:
         """Raise errors of the library as errors of this program."""
         from obstore import exceptions
 
-        if os.getpid() != self._pid:
+        if not self.is_usable:
             raise BucketError(
                 f"{self.address} was opened before this process was forked. Open it here again."
             )

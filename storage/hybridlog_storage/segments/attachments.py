@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
 
 from hybridlog_storage.checksum import crc32
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.segments.compression import FilePart
@@ -170,7 +171,7 @@ class FileHandle:
 
     def __init__(self, fd: int) -> None:
         self._at = 0
-        self._fd = os.dup(fd)
+        self._fd = files.duplicate(fd)
 
     def __del__(self) -> None:
         if hasattr(self, "_fd"):
@@ -183,6 +184,6 @@ class FileHandle:
 
     def read(self, size: int) -> bytes:
         """The next bytes; fewer at the end."""
-        data = os.pread(self._fd, size, self._at)
+        data = files.pread(self._fd, size, self._at)
         self._at += len(data)
         return data

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -259,6 +259,7 @@ class SegmentReader:
             SegmentError: It cannot be opened.
         """
         try:
+            files.fetch(self._fd, [(0, self.size)])
             return os.fdopen(os.dup(self._fd), "rb")
         except OSError as error:
             problem = f"{self.path} cannot be read: {error.strerror}."
@@ -598,6 +599,15 @@ class SegmentReader:
             crc = crc32(self.read(at, min(_PIECE, offset + length - at)), crc)
         return crc
 
+    @property
+    def is_fetched(self) -> bool:
+        """True if the file lies in a bucket, where each request takes long."""
+        return files.is_fetched(self._fd)
+
+    def fetch(self, places: Iterable[ChunkPlace]) -> None:
+        """Announce chunks that will be read, so that a bucket is asked once for all of them."""
+        files.fetch(self._fd, ((at.offset, at.offset + at.length + at.trailer) for at in places))
+
     def read(self, offset: int, length: int) -> memoryview:
         """Unchecked bytes of the file.
 
@@ -615,7 +625,7 @@ class SegmentReader:
         size = wanted + -wanted % BLOCK if self._direct else wanted
         buffer = buffers.take(size, whole_pages=self._direct).data
         try:
-            count = os.preadv(self._fd, [buffer[:size]], offset - ahead)
+            count = files.preadv(self._fd, [buffer[:size]], offset - ahead)
         except OSError as error:
             raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
         if count < wanted:

@@ -1,0 +1,196 @@
+"""Publishes recordings into a store in a bucket.
+
+Files of a recording become objects: segments and payloads first, then fields, the journal last.
+Then the catalog's row is made from what is there, as it is read back, and the next list names
+it all: only from then on is the recording in the store. What a crash leaves before that is
+found there by the next attempt, and not sent again.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybridlog.columns.folders import Addition, TableFolders, files_of
+from hybridlog.columns.layout import IN_PAYLOADS, IN_TYPE, SHARED, SUFFIX
+from hybridlog.columns.payload_files import open_file
+from hybridlog.entries import take_inventory
+from hybridlog.maintenance.opening import describe_now, open_catalog
+from hybridlog_storage import journal
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import PAYLOADS
+from hybridlog_storage.errors import ObjectExistsError, StoreError, unreadable
+from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.remote.lists import RECORDINGS, TABLES, ListedRecording
+from hybridlog_storage.remote.store import TRIES
+from hybridlog_storage.segments.segment_check import SegmentCheck
+
+if TYPE_CHECKING:
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.remote.bucket import Object
+    from hybridlog_storage.remote.store import RemoteDirectory
+
+
+def publish(
+    source: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    target: RemoteDirectory,
+    progress: Progress | None = None,
+) -> tuple[str, bool]:
+    """Put an ended recording into a store in a bucket.
+
+    Args:
+        source: The store that has it.
+        catalog: Its catalog.
+        entry: The recording.
+        target: The store in a bucket.
+        progress: Called with the bytes that have arrived.
+
+    Returns:
+        Its label there, and whether it was put there now.
+
+    Raises:
+        StoreError: It has not ended, or is damaged.
+        BucketError: The server does not answer, or refuses.
+    """
+    if entry.status in {"open", "unfinished"}:
+        raise StoreError(f"Recording {entry.label!r} has not ended. Copy it when it has.")
+    target.refresh()
+    if label := target.label_of_id(entry.id):
+        return label, False
+    listed = _bring(source, entry, target, progress)
+    tables = _bring_fields(source, entry, target)
+    for _ in range(TRIES):
+        with suppress(ObjectExistsError), target.changing():
+            if label := target.label_of_id(entry.id):  # another process was faster
+                return label, False
+            label = target.free_label(entry.label)
+            target.add_recording(label, listed, tables)
+            own = open_catalog(target)
+            _bring_results(catalog, entry, own)
+            described = describe_now(target, own, label)
+            if described.entry.status != entry.status or described.entry.id != entry.id:
+                raise StoreError(
+                    f"What has arrived of recording {entry.label!r} is not what was sent: it is "
+                    f"{described.entry.status}. Copy it again."
+                )
+            own.put(described)
+            return label, True
+    raise StoreError(f"{target.source.bucket.address} changes all the time. Copy again.")
+
+
+def _bring(
+    source: StoreDirectory,
+    entry: RecordingEntry,
+    target: RemoteDirectory,
+    progress: Progress | None,
+) -> ListedRecording:
+    """Create the objects of a recording, each after every byte of its file was checked."""
+    label = source.label_now(entry.label, entry.id)
+    inventory = take_inventory(source, label)
+    if inventory.id != entry.id or inventory.misfits or not inventory.is_proven:
+        raise StoreError(
+            f"Recording {label!r} of {source.path} is incomplete: `hybridlog verify --store "
+            f"{source.path} {label}` shows what is missing. It was not copied."
+        )
+    path, found = source.recording(label), {}
+    sizes = [size for _, size in map(inventory.stored_file, inventory.summaries)]
+    total = sum(sizes) + sum(file.bytes for file in inventory.payloads.values())
+    done = 0
+
+    def bring(name: str, size: int, depth: int) -> None:
+        nonlocal done
+        found[name] = _sent(path / name, f"{RECORDINGS}/{entry.id}", name, target, depth=depth)
+        done += size
+        if progress is not None:
+            progress(label, done, total)
+
+    for number in inventory.summaries:
+        name = inventory.listing.sealed[number]
+        digest, size = inventory.stored_file(number)
+        with SegmentCheck(path / name) as check:
+            about = check.summary
+            is_it = about is not None and (about.digest, about.size) == (digest, size)
+            if not is_it or any(True for _ in check.problems()):
+                raise StoreError(f"{path / name} is damaged: `hybridlog verify` shows where.")
+        bring(name, size, files.IN_RECORDING)
+    for file in inventory.payloads.values():
+        open_file(path / PAYLOADS, file).check()
+        bring(f"{PAYLOADS}/{file.file}", file.bytes, IN_PAYLOADS)
+    lines = _journal(path, inventory) + journal.encode(
+        journal.event(journal.ADOPTED, store=target.settings.store_id)
+    )
+    found[JOURNAL] = target.add_file(f"{RECORDINGS}/{entry.id}", JOURNAL, lines)
+    return ListedRecording(entry.id, found)
+
+
+def _journal(path: Path, inventory: Inventory) -> bytes:
+    """The lines of the journal by which files were checked."""
+    assert inventory.state is not None  # it is proven
+    try:
+        data = files.read_file(path / JOURNAL, journal.MAX_JOURNAL)
+    except OSError as error:
+        raise unreadable(error, path / JOURNAL) from error
+    return data[: inventory.state.length]
+
+
+def _sent(path: Path, place: str, name: str, target: RemoteDirectory, *, depth: int) -> Object:
+    try:
+        fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
+    except OSError as error:
+        raise durability.explain(error, path, "reading") from error
+    files.fetch(fd, [(0, 1 << 50)])
+    with open(fd, "rb") as file:  # noqa: PTH123 - of a handle
+        return target.add_file(place, name, file)
+
+
+def _bring_fields(
+    source: StoreDirectory, entry: RecordingEntry, target: RemoteDirectory
+) -> Mapping[str, Object]:
+    """Create the objects of a recording's fields; each file has no other recording."""
+    found: dict[str, Object] = {}
+    with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
+        root = Path(place)
+        for folder, paths in _fields(source, entry, root).items():
+            for number, path in enumerate(paths):
+                name = f"{folder}/{entry.id}-{number}{SUFFIX}"
+                found[name] = _sent(path, TABLES, name, target, depth=IN_TYPE)
+    return found
+
+
+def _fields(
+    source: StoreDirectory, entry: RecordingEntry, root: Path
+) -> Mapping[str, Sequence[Path]]:
+    """Files with a recording's fields by folder; of shared ones its rows alone, below `root`."""
+    found: dict[str, list[Path]] = {}
+    for reader in files_of(source.path):
+        begin, folder = 0, reader.path.parent.name
+        for section in reader.about.recordings:
+            if section.id == entry.id and not reader.path.name.startswith(SHARED):
+                found.setdefault(folder, []).append(reader.path)
+            elif section.id == entry.id:
+                rows = reader.table().slice(begin, section.rows)
+                TableFolders(root, entry.id).add({folder: Addition(rows, section)})
+            begin += section.rows
+    for reader in files_of(root):
+        found.setdefault(reader.path.parent.name, []).append(reader.path)
+    return found
+
+
+def _bring_results(catalog: Catalog, entry: RecordingEntry, own: Catalog) -> None:
+    """Tell the other catalog what decoding found out."""
+    found = []
+    for number, digest in entry.digests.items():
+        rows = catalog.decoded_table(entry, int(number))[1]
+        if rows is not None:
+            found.append((int(number), digest, rows))
+    own.put_stamps(entry.id, found)
+    own.put_damage(entry.id, catalog.damage(entry.id))

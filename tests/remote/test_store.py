@@ -1,0 +1,260 @@
+"""A store in a bucket answers as the one on the disk, with few requests, or with an error."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance.publish import publish
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import BucketError, HybridlogError, StoreError, UsageError
+from hybridlog_storage.remote.blocks import BLOCK, BlockCache
+from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.lists import StoreList, list_name
+from hybridlog_storage.remote.store import RemoteDirectory, address_of
+from tests.cli.within import answer
+from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
+from tests.remote.server import Proxy
+
+
+def everything(store: hl.Store) -> dict[str, Any]:
+    """Answers of all kinds."""
+    return {
+        "recordings": [
+            (one.id, one.label, one.status, one.tags, one.notes, one.marks, one.span, one.messages)
+            for one in store.recordings()
+        ],
+        "topics": store.topics(),
+        "counts": [store.topic(topic).count() for topic in store.topics()],
+        "where": store.topic("/arm").where("x > 20").count(),
+        "arrays": store.topic("/scan").where("ranges.max > 0.999").count(),
+        "messages": [
+            (message.log_time_ns, message.topic, bytes(message.raw))
+            for message in store.topic("/arm", "/scan")
+        ],
+        "fields": store.topic("/arm").where("n == 7").to_pandas().to_dict("list"),
+        "sql": store.sql("select count(*), sum(x) from arm where n < 10").to_arrow().to_pylist(),
+    }
+
+
+@pytest.fixture(scope="session")
+def expected(here: Path) -> dict[str, Any]:
+    with hl.open(here, mongo="none") as store:
+        return everything(store)
+
+
+@pytest.mark.parametrize("is_spoiled", [False, True])
+def test_answers_are_the_same(
+    published: str, proxy: Proxy, expected: dict[str, Any], is_spoiled: bool
+) -> None:
+    kinds = ("reset", "cut", "503", "slow")
+    if is_spoiled:
+        proxy.spoil = lambda number: kinds[number // 4 % 4] if number % 4 == 3 else ""
+    with hl.open(published) as store:
+        assert everything(store) == expected
+        assert str(store) == f"<Store {published}>"
+    assert len(proxy.requests) > 9
+    assert not any(method != "GET" for method, _, _ in proxy.requests)
+
+
+def test_requests(published: str, proxy: Proxy) -> None:
+    def asked(question: Callable[[], Any]) -> int:
+        proxy.requests.clear()
+        question()
+        return len([one for one in proxy.requests if "list-type" not in one[1]])
+
+    with hl.open(published) as store:
+        assert len(proxy.requests) <= 3
+        assert asked(store.recordings) == 0
+        assert asked(lambda: store.catalog.table(store.entry("run"), 0)) <= 2
+        second = store.topic("/scan").between(BEGIN + 20 * SECOND, BEGIN + 21 * SECOND)
+        assert asked(lambda: list(second)) <= 3
+        assert asked(lambda: list(second)) == 0
+        holding = store.topic("/arm").where("x > 5 and x < 50")
+        assert asked(holding.count) <= 4 + 2 * len(RECORDINGS)
+        assert asked(holding.count) == 0
+    files.mounted.clear()  # another process has the cache, too
+    proxy.requests.clear()
+    with hl.open(published) as store:
+        assert len(proxy.requests) <= 2
+        assert asked(store.topic("/arm").where("x > 5 and x < 50").count) == 0
+
+
+def test_edits(here: Path, address: str, proxy: Proxy) -> None:
+    publish_all(here, address, ("run", "short-0"))
+    with hl.open(address) as store:
+        store.tag("run", who="me")
+        store.note("run", "good")
+        assert store.rename("run", "A new run").label == "A-new-run"
+        store.remove("short-0")
+        assert [one.label for one in store.recordings()] == ["A-new-run"]
+    files.mounted.clear()
+    with hl.open(address) as store:
+        (entry,) = store.recordings()
+        assert (entry.name, entry.tags) == ("A new run", {"place": "lab", "who": "me"})
+        assert [note["text"] for note in entry.notes] == ["good"]
+        assert store.topic("/arm").count() == 400
+        assert not store.verify().findings
+    answer("tag", "A-new-run", "why=test", store=Path(address))
+    assert "why=test" in answer("ls", store=Path(address)).out
+
+
+def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
+    publish_all(here, address, ("run", "short-0"))
+    one = hl.open(address)
+    is_first = True
+
+    def other(*words: str) -> None:
+        command = [sys.executable, "-m", "hybridlog", *words, "--store", address]
+        subprocess.run(command, check=True, capture_output=True)
+
+    def meanwhile(_: int) -> str:
+        nonlocal is_first
+        method, name, _ = proxy.requests[-1]
+        if method == "PUT" and "/lists/" in name and is_first:
+            is_first = False
+            other("tag", "run", "b=2")
+        return ""
+
+    proxy.spoil = meanwhile
+    one.tag("run", a="1")
+    assert not is_first
+    proxy.reset()
+    proxy.old_lists = {}
+    assert one.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
+    other("tag", "short-0", "c=3")
+    one.tag("short-0", d="4")  # the list that it sees is from before
+    proxy.reset()
+    files.mounted.clear()
+    with hl.open(address) as last:
+        assert last.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
+        assert last.entry("short-0").tags == {"c": "3", "d": "4"}
+
+
+def test_publishing_goes_on_after_each_request(
+    here: Path, address: str, proxy: Proxy, expected: dict[str, Any]
+) -> None:
+    target = RemoteDirectory.create_in(address)
+    with hl.open(here, mongo="none") as store:
+        arguments = store.directory, store.catalog, store.entry("moved"), target
+        for allowed in range(1, 100, 3):
+            proxy.requests.clear()
+            proxy.spoil = lambda number, last=allowed: "403" if number > last else ""
+            try:
+                assert publish(*arguments) == ("moved", True)
+                break
+            except BucketError:
+                assert target.labels() == []
+        else:
+            pytest.fail("it never ends")
+        assert allowed > 8
+        proxy.reset()
+        assert publish(*arguments) == ("moved", False)
+        assert len(proxy.requests) == 1
+    with hl.open(address) as store:
+        (known,) = (one for one in expected["recordings"] if one[1] == "moved")
+        (found,) = everything(store)["recordings"]
+        assert found == known
+        begin, end = known[6]
+        assert [(m.log_time_ns, m.topic, bytes(m.raw)) for m in store.topic("/arm", "/scan")] == [
+            message for message in expected["messages"] if begin <= message[0] <= end
+        ]
+
+
+def test_changed_objects_are_an_error(here: Path, address: str, proxy: Proxy) -> None:
+    publish_all(here, address, ("run",))
+    bucket = Bucket(address)
+    with hl.open(address) as store:
+        name = f"recordings/{store.entry('run').id}/000000.mcap"
+        about, data = bucket.read_whole(name, 1 << 30)
+        bucket.replace(name, data[:-1] + b"x", about.version)
+        with pytest.raises(HybridlogError, match="changed"):
+            list(store.topic("/scan"))
+        bucket.delete([name])
+        with pytest.raises(HybridlogError, match="deleted meanwhile"):
+            list(store.topic("/scan"))
+
+
+def test_hostile_lists(published: str, proxy: Proxy) -> None:
+    bucket = Bucket(published)
+    newest = bucket.first("lists")
+    assert newest is not None
+    data = bucket.read_whole(newest.name, 1 << 30)[1]
+    line, _, rest = zlib.decompress(data).partition(b"\n")
+    head = json.loads(line)
+    store, number = head["store"], len(RECORDINGS)
+    assert newest.name == list_name(number)
+    assert StoreList.from_bytes(store, number, data, "it").to_bytes() == data
+    (label, one), *_ = head["recordings"].items()
+    (path, row), *_ = one["files"].items()
+
+    def refused(changed: dict[str, Any] | None, packed: bytes | None = None) -> None:
+        text = json.dumps(changed).encode() + b"\n" + rest
+        with pytest.raises(StoreError, match=r"it is (damaged|of a newer)"):
+            StoreList.from_bytes(store, number, packed or zlib.compress(text), "it")
+
+    refused({**head, "store": "other"})
+    refused({**head, "format": 2})
+    for wrong in ("../run", ".hidden", "a/b", "", "x" * 200):
+        refused({**head, "recordings": {wrong: one}})
+    refused({**head, "recordings": {label: one, "twice": one}})
+    for wrong in ("../../etc/passwd", "/etc/passwd", "a//b", "a/b/c/d"):
+        refused({**head, "recordings": {label: {**one, "files": {wrong: row}}}})
+    for bad in (["other/file", *row[1:]], [row[0] + "/../x", *row[1:]], [row[0], -1, ""], [1, 2]):
+        refused({**head, "recordings": {label: {**one, "files": {path: bad}}}})
+    refused({**head, "catalog": [["../x", 1]]})
+    refused({**head, "catalog": [["part-000000", len(rest) + 1]]})
+    refused(None, data[:-3])
+    refused(None, zlib.compress(b"[]\n"))
+
+
+def test_the_cache_heals_and_is_bounded(published: str, proxy: Proxy, tmp_path: Path) -> None:
+    bucket = Bucket(published)
+    about = max(bucket.objects("recordings"), key=lambda one: one.size)
+    whole = bucket.read_whole(about.name, about.size)[1]
+    cache = BlockCache(tmp_path / "blocks")
+    handle = cache.open(bucket, about)
+    proxy.requests.clear()
+    assert files.pread(handle, 10, 0) == whole[:10]
+    assert files.pread(handle, about.size, 0) == whole
+    assert len(proxy.requests) == 2
+    (data,) = (tmp_path / "blocks").glob("*.data")
+    flipped = bytearray(data.read_bytes())
+    flipped[5] ^= 1
+    data.write_bytes(flipped)
+    other = BlockCache(tmp_path / "blocks", BLOCK)  # of another process
+    again = other.open(bucket, about)
+    assert files.pread(again, about.size, 0) == whole
+    assert not [*(tmp_path / "blocks").glob("*.data")]
+    assert files.pread(handle, about.size, 0) == whole
+
+
+def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
+    with hl.open(published) as store:
+        refused: list[Callable[[], Any]] = [
+            store.compact,
+            store.repair,
+            lambda: store.mark("run", "+1s", "x"),
+            lambda: store.pin("run"),
+            lambda: store.keep({"quota": "1GB"}),
+            lambda: store.import_from(published),
+            lambda: store.start("new"),
+        ]
+        for change in refused:
+            with pytest.raises(StoreError, match=r"is a store in a bucket.*hybridlog copy"):
+                change()
+    assert answer("compact", store=Path(published), code=5).out == ""
+    with pytest.raises(StoreError, match="There is no store at"):
+        hl.open(published + "/none")
+    with pytest.raises(UsageError, match="without MongoDB"):
+        hl.open(published, mongo="embedded")
+    assert address_of(Path(published)) == published
+    assert address_of("./s3") is None
