@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")])
-SHOWN = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+SHOWN = [ROOT / "README.md", *sorted([*DOCS.glob("*.md"), *DOCS.glob("*.ipynb")])]
 # A terminal of this many columns.
 COLUMNS = 150
 START_NS = 1_748_937_600_000_000_000
@@ -110,8 +110,25 @@ class Step:
     code: int = 0
 
 
+def steps_of_notebook(path: Path) -> list[Step]:
+    """The cells with code of a notebook, and what they print."""
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    return [
+        Step(
+            "python",
+            "".join(cell["source"]) + "\n",
+            number,
+            [line.rstrip("\n") for output in cell["outputs"] for line in output["text"]],
+        )
+        for number, cell in enumerate(cells, 1)
+        if cell["cell_type"] == "code"
+    ]
+
+
 def steps(path: Path) -> list[Step]:
     """What a page runs, in order."""
+    if path.suffix == ".ipynb":
+        return steps_of_notebook(path)
     found: list[Step] = []
     for fence in fences(path):
         if fence.language == "python":
