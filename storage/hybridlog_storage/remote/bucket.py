@@ -1,8 +1,8 @@
 """Objects in a bucket, by way of obstore (extra `remote`).
 
 A bucket has no locks and no renames. What it has are conditions: an object is created only if
-its name is free, or replaced only if it is still the version that was read. A server that
-ignores conditions would lose data in silence, so it is refused before the first write.
+its name is free, and read or replaced only if it is still the version that was seen. A server
+that ignores conditions would lose data in silence, so it is refused before the first write.
 
 Credentials and the address of a server of one's own come from the environment, as obstore
 reads them (`AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL`, `AWS_ALLOW_HTTP`, `GOOGLE_…`, `AZURE_…`).
@@ -169,15 +169,6 @@ class Bucket:
             raise ObjectChangedError(f"{self._place(name)} is shorter than it was.")
         return data
 
-    def tail(self, name: str, size: int) -> tuple[Object, bytes]:
-        """The last bytes of an object, all of a shorter one, and what it is.
-
-        Raises:
-            FileNotFoundError: It does not exist.
-            BucketError: The server does not answer, or refuses.
-        """
-        return self._get(name, {"range": {"suffix": size}}, None)
-
     def read_whole(self, name: str, most: int) -> tuple[Object, bytes]:
         """A small object, and what it is; of a larger one than expected only one byte more.
 
@@ -197,7 +188,10 @@ class Bucket:
 
         def read() -> tuple[Object, bytes]:
             answer = obstore.get(self._reading, name, options=cast("GetOptions", options))
-            return _object(answer.meta, name), _content(answer, most)
+            about = _object(answer.meta, name)
+            if version not in {None, about.version}:  # the server ignores conditions
+                raise ObjectChangedError(f"{self._place(name)} was changed meanwhile.")
+            return about, _content(answer, most)
 
         return self._again(name, read)
 
@@ -247,26 +241,6 @@ class Bucket:
         found = self._same(name, content, size)
         if found is None:
             raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
-        return found
-
-    def replace(self, name: str, data: bytes, version: str) -> str:
-        """Replace an object, if it is still the version that was read.
-
-        Returns:
-            Its new version.
-
-        Raises:
-            ObjectChangedError: It has another version, or was deleted.
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
-        self.check_conditions()
-        try:
-            return self._put(name, data, {"e_tag": version})
-        except (ObjectChangedError, FileNotFoundError):
-            pass  # by another writer, or by this one whose connection broke
-        found = self._same(name, data, len(data))
-        if found is None:
-            raise ObjectChangedError(f"{self._place(name)} was changed by another process.")
         return found
 
     def delete(self, names: Iterable[str]) -> None:

@@ -100,6 +100,7 @@ class BucketFiles:
         self._cache = cache
         self._settings: bytes | None = None
         self._looked_at = 0.0
+        self._tables: tuple[Mapping[str, Object], _Node] = {}, {}  # of a list, and as folders
         self.lock = threading.RLock()
         self.is_changing = False
 
@@ -216,11 +217,24 @@ class BucketFiles:
     def _root(self, inner: tuple[str, ...]) -> _Node:
         """The folders on the way to a file; others are left out."""
         listed = self.list
-        recordings: dict[str, _Node] = {label: {} for label in listed.recordings}
-        if len(inner) > 1 and inner[0] == RECORDINGS and inner[1] in listed.recordings:
+        top = inner[0] if inner else ""
+        recordings: dict[str, _Node] = {}
+        if top == RECORDINGS and len(inner) == 1:
+            recordings = {label: {} for label in listed.recordings}
+        elif top == RECORDINGS and inner[1] in listed.recordings:
             recordings = {inner[1]: _folder(listed.recordings[inner[1]].files)}
-        tables = _folder(listed.tables) if inner[:1] == (TABLES,) else {}
-        return {RECORDINGS: recordings, TABLES: tables, SETTINGS: self.read_settings()}
+        return {
+            RECORDINGS: recordings,
+            TABLES: self._tables_of(listed) if top == TABLES else {},
+            SETTINGS: self.read_settings(),
+        }
+
+    def _tables_of(self, listed: StoreList) -> _Node:
+        known, folders = self._tables
+        if known is not listed.tables:
+            folders = _folder(listed.tables)
+            self._tables = listed.tables, folders
+        return folders
 
     def read_settings(self) -> bytes:
         """The file of settings, read once.
