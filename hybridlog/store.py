@@ -43,7 +43,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.remote.store import TRIES, address_of, directory_of
+from hybridlog_storage.remote.store import TRIES, RemoteDirectory, address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
@@ -1204,6 +1204,28 @@ class Store:
             return keeper.keep(wanted, progress)
         finally:
             self.refresh()
+
+    def tidy(self, *, dry_run: bool = False) -> tuple[int, int]:
+        """Delete what a store in a bucket does not need any more.
+
+        That is what no list of the last hour names, such as files of removed recordings, if it
+        is a week old: what is younger may belong to a copy that is under way.
+
+        Args:
+            dry_run: True to delete nothing.
+
+        Returns:
+            Number and bytes of the objects.
+
+        Raises:
+            UsageError: The store is a directory, which has nothing of the kind.
+        """
+        if not isinstance(self.directory, RemoteDirectory):
+            raise UsageError("A store on a disk is tidy: `tidy` is for stores in buckets.")
+        found = self.directory.unneeded()
+        if not dry_run:
+            self.directory.source.bucket.delete([one.name for one in found])
+        return len(found), sum(one.size for one in found)
 
     def pin(
         self,

@@ -77,6 +77,9 @@ class _Given(Choosing, InStore, AsJson, Quiet):
     reason: str = option("--reason", default="", metavar="TEXT", help="With --pin: why.")
     unpin: tuple[str, ...] = repeated("--unpin", metavar="PIN", help="Remove a pin.")
     pins: bool = flag("--pins", help="List the pins.")
+    tidy: bool = flag(
+        "--tidy", help="In a bucket: delete what no list of the last hour and no copy needs."
+    )
 
 
 @command(_Given)
@@ -89,7 +92,7 @@ def keep_command(asked: _Given) -> None:
     """
     given, choice = vars(asked), asked.choice
     as_json, quiet = asked.as_json, asked.quiet
-    pinning = [name for name in ("pin", "pins", "unpin") if given[name]]
+    pinning = [name for name in ("pin", "pins", "unpin", "tidy") if given[name]]
     rules = _rules(given) if not given["pin"] else {}
     _check(pinning, rules, choice, given)
     with asked.opened() as opened:
@@ -99,12 +102,23 @@ def keep_command(asked: _Given) -> None:
                 output.print_json(found)
             elif not quiet:
                 output.say(f"{output.counted(len(found), 'pin')}: {listed(found)}")
+        elif given["tidy"]:
+            _tidy(opened, dry_run=given["dry_run"], as_json=as_json, quiet=quiet)
         elif given["unpin"]:
             opened.unpin(*given["unpin"])
         elif given["pins"]:
             _show_pins(opened, choice, as_json=as_json)
         else:
             _keep(opened, rules, given, as_json=as_json, quiet=quiet)
+
+
+def _tidy(store: Store, *, dry_run: bool, as_json: bool, quiet: bool) -> None:
+    count, size = store.tidy(dry_run=dry_run)
+    if as_json:
+        output.print_json({"objects": count, "bytes": size, "dry_run": dry_run})
+    elif not quiet:
+        did = "would go" if dry_run else "deleted"
+        output.say(f"{output.counted(count, 'object')}, {output.size(size)}: {did}")
 
 
 def _rules(given: dict[str, Any]) -> dict[str, Any]:
@@ -127,8 +141,9 @@ def _check(
     Raises:
         UsageError: They do not.
     """
-    if len(pinning) > 1 or (pinning and (rules or given["save"] or given["dry_run"])):
-        raise UsageError("Give --pin, --unpin, --pins or rules, one of them at a time.")
+    plans = given["dry_run"] and not given["tidy"]
+    if len(pinning) > 1 or (pinning and (rules or given["save"] or plans)):
+        raise UsageError("Give --pin, --unpin, --pins, --tidy or rules, one of them at a time.")
     if not given["pin"] and (given["at"] or given["when"] or given["reason"]):
         raise UsageError("--at, --when and --reason are for --pin.")
     if given["pin"] and choice.is_everything:

@@ -11,6 +11,7 @@ from hybridlog.maintenance.opening import announce_removal
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.remote.store import RemoteDirectory
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -42,7 +43,7 @@ def remove(
         DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
     """
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        if directory.is_remote:
+        if isinstance(directory, RemoteDirectory):
             directory.drop(label)
             catalog.remove(entry.id)
             return

@@ -15,7 +15,14 @@ import pytest
 import hybridlog as hl
 from hybridlog.maintenance.publish import publish
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import BucketError, HybridlogError, StoreError, UsageError
+from hybridlog_storage.errors import (
+    BucketError,
+    HybridlogError,
+    ObjectExistsError,
+    StoreError,
+    UsageError,
+)
+from hybridlog_storage.remote import bucket as bucket_module
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.lists import StoreList, list_name
@@ -167,6 +174,45 @@ def test_publishing_goes_on_after_each_request(
         assert [(m.log_time_ns, m.topic, bytes(m.raw)) for m in store.topic("/arm", "/scan")] == [
             message for message in expected["messages"] if begin <= message[0] <= end
         ]
+
+
+def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Proxy) -> None:
+    publish_all(here, address, ("run", "short-0"))
+    hour, week = 3600 * SECOND, 7 * 24 * 3600 * SECOND
+    with hl.open(address) as store:
+        directory = store.directory
+        assert isinstance(directory, RemoteDirectory)
+        gone = store.entry("short-0").id
+        store.remove("short-0")
+        store.tag("run", a="b")
+        directory.source.bucket.create("recordings/x/000000.mcap", b"of a copy")
+        now = directory.source.bucket.now()
+        assert store.tidy() == (0, 0)
+        later = [one.name for one in directory.unneeded(now + 2 * hour)]
+        assert later == [list_name(number) for number in (3, 2, 1)]
+        names = {one.name for one in directory.unneeded(now + week + hour)}
+        assert {name for name in names if gone not in name} == {
+            *later,
+            "recordings/x/000000.mcap",
+        }
+        assert len(names) > 6
+        directory.source.bucket.delete([*names])
+        assert directory.unneeded(now + week + hour) == []
+        assert not store.verify().findings
+        assert store.topic("/arm").count() == 400
+    said = answer("keep", "--tidy", "--dry-run", "--json", store=Path(address))
+    assert said.json == {"objects": 0, "bytes": 0, "dry_run": True}
+
+
+def test_old_objects_are_not_taken_for_own(
+    address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bucket = Bucket(address)
+    bucket.create("a", b"1")
+    bucket.create("a", b"1")
+    monkeypatch.setattr(bucket_module, "UNLISTED_DAYS", 1)
+    with pytest.raises(ObjectExistsError):
+        bucket.create("a", b"1")
 
 
 def test_changed_objects_are_an_error(here: Path, address: str, proxy: Proxy) -> None:

@@ -457,10 +457,6 @@ class StoreDirectory:
         self.move(label, hidden)
         return hidden
 
-    def drop(self, label: str) -> None:
-        """List a recording no more, where a list says what there is."""
-        raise NotImplementedError
-
     def sweep(self, name: str) -> None:
         """Delete a hidden directory below `recordings`."""
         path = self.recording(name)

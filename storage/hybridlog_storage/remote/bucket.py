@@ -14,6 +14,7 @@ import errno
 import os
 import re
 import secrets
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -41,6 +42,10 @@ JOINED_GAP: Final = 1 << 20
 """Bytes between two ranges that cost less than another request."""
 PART_BYTES: Final = 64 << 20
 """Size from which an object is uploaded in parts of this size."""
+UNLISTED_DAYS: Final = 7
+"""Age in days from which an object that no list names may be deleted. `create` takes one that is
+there for its own only if it is a day younger: a copy that is under way needs it for a while."""
+_DAY_NS: Final = 86_400 * 10**9
 _PAGE: Final = 1000  # names that servers list at once
 _PARALLEL: Final = 8
 _TRIES: Final = 4
@@ -209,7 +214,7 @@ class Bucket:
             return None
 
     def create(self, name: str, content: bytes | BinaryIO) -> str:
-        """Create an object of a free name. One of this very content counts as created.
+        """Create an object of a free name. A young one of this very content counts as created.
 
         A file of more than `PART_BYTES` goes in parts, and only the check before it keeps
         another writer of the same name away: give it a name that only this content has.
@@ -243,7 +248,7 @@ class Bucket:
             raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
         return found
 
-    def delete(self, names: Iterable[str]) -> None:
+    def delete(self, names: Sequence[str]) -> None:
         """Delete objects; those that do not exist are left out.
 
         Raises:
@@ -251,11 +256,13 @@ class Bucket:
         """
         import obstore
 
-        for name in names:
+        for at in range(0, len(names), _PAGE):
+            some = names[at : at + _PAGE]
             try:
-                self._again(name, partial(obstore.delete, self._writing, name))
-            except FileNotFoundError:
-                continue
+                self._again(some[0], partial(obstore.delete, self._writing, some))
+            except FileNotFoundError:  # some servers stop there
+                for name in some if len(some) > 1 else ():
+                    self.delete([name])
 
     def check_conditions(self) -> None:
         """Try once, before the first write, whether the server honours conditions.
@@ -292,10 +299,22 @@ class Bucket:
             )
         self._has_conditions = True
 
+    def now(self) -> int:
+        """The time by the server's clock, ns."""
+        name = f"probe-{secrets.token_hex(8)}"
+        try:
+            self._put(name, b"hybridlog", "overwrite")
+            about = self.head(name)
+        finally:
+            self.delete([name])
+        return time.time_ns() if about is None else about.modified
+
     def _same(self, name: str, content: bytes | BinaryIO, size: int) -> str | None:
         """The version of an object, if it has this content."""
         about = self.head(name)
         if about is None or about.size != size:
+            return None
+        if time.time_ns() - about.modified > (UNLISTED_DAYS - 1) * _DAY_NS:
             return None
         if isinstance(content, bytes):
             pieces: Iterator[bytes] = iter([content])

@@ -34,7 +34,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
-from hybridlog_storage.remote.bucket import Bucket, Object
+from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object
 from hybridlog_storage.remote.lists import (
     LISTS,
     MAX_LIST,
@@ -52,6 +52,8 @@ LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for a newer list, unless this process changes something."""
 TRIES: Final = 10
 """How often a change begins again if another process was faster."""
+_READ_NS: Final = 3600 * 10**9  # for so long a reader may need what a newer list has not
+_DAY_NS: Final = 86_400 * 10**9
 _MAX_SETTINGS: Final = 1 << 20
 _ADDRESS: Final = re.compile(r"(s3|gs|az):/{1,2}([^/].*)")
 _FOLDER: Final = stat.S_IFDIR | 0o555
@@ -127,15 +129,20 @@ class BucketFiles:
             if found is None or number <= self.list.number:  # an old answer changes nothing
                 self.list = self.list if self.list.store == store else StoreList(store)
             else:
-                self._load(store, number, found)
+                self.list = self.read_list(store, found)
             self._looked_at = time.monotonic()
 
-    def _load(self, store: str, number: int, about: Object) -> None:
+    def read_list(self, store: str, about: Object) -> StoreList:
+        """One state of the store, by the object of its list.
+
+        Raises:
+            StoreError: It is damaged.
+        """
         place = f"{self.bucket.address}/{about.name}"
-        if about.size > MAX_LIST:
-            raise StoreError(f"{place} is too large to be a list.")
-        data = self._content([about])
-        self.list = StoreList.from_bytes(store, number, data, place)
+        number = number_of(about.name)
+        if number is None or about.size > MAX_LIST:
+            raise StoreError(f"{place} is no list.")
+        return StoreList.from_bytes(store, number, self._content([about]), place)
 
     def commit(self, before: StoreList, after: StoreList) -> None:
         """Create the next list.
@@ -156,7 +163,7 @@ class BucketFiles:
             except ObjectExistsError:
                 about = self.bucket.head(name)
                 if about is not None:
-                    self._load(before.store, number, about)
+                    self.list = self.read_list(before.store, about)
                 raise
             self.list = after
             self._looked_at = time.monotonic()
@@ -526,6 +533,47 @@ class RemoteDirectory(StoreDirectory):
         mine = re.compile(rf"[^/]+/{gone.id}-\d+\.parquet")
         tables = {path: o for path, o in self._now.tables.items() if not mine.fullmatch(path)}
         self.source.list = replace(self._now, recordings=others, tables=tables)
+
+    def unneeded(self, now: int | None = None) -> list[Object]:
+        """Objects that may be deleted: what neither a list of the last hour nor a copy needs.
+
+        Args:
+            now: The time, ns; None for the server's.
+
+        Raises:
+            StoreError: A list is damaged.
+            BucketError: The server does not answer, or refuses.
+        """
+        bucket = self.source.bucket
+        now = bucket.now() if now is None else now
+        self.refresh()
+        found = [one for one in bucket.objects() if one.name != SETTINGS]
+        lists = [one for one in found if number_of(one.name) is not None]
+        newest = next((n for n, one in enumerate(lists) if one.name == self._listed), None)
+        if newest is None:
+            return []
+        # A list was the newest until the one after it was created.
+        kept = [
+            one
+            for n, one in enumerate(lists)
+            if n <= newest or now - lists[n - 1].modified < _READ_NS
+        ]
+        named = {one.name for one in kept}
+        for one in kept:
+            listed = self.source.read_list(self.settings.store_id, one)
+            named.update(o.name for r in listed.recordings.values() for o in r.files.values())
+            named.update(o.name for o in listed.tables.values())
+        old = {one.name for one in lists}
+        return [
+            one
+            for one in found
+            if one.name not in named
+            and (one.name in old or now - one.modified > UNLISTED_DAYS * _DAY_NS)
+        ]
+
+    @property
+    def _listed(self) -> str:
+        return list_name(self._now.number)
 
     def _relist(self, label: str, recording: ListedRecording) -> None:
         self.source.list = replace(self._now, recordings={**self._now.recordings, label: recording})
