@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from hybridlog.training.feature_map import FeatureMap
 
 _MAX_NAMES: Final = 3  # recordings in a message
+_OWN: Final = frozenset({"log_time", "is_stale", "recording", "episode"})
 
 
 class Windows(OpensAgain, Sequence[dict[str, Any]]):
@@ -73,6 +74,8 @@ class Windows(OpensAgain, Sequence[dict[str, Any]]):
             raise UsageError("Frames per second are 1 to 1000.")
         super().__init__(query.session, open_again)
         features = features.resolved(query.session)
+        if taken := _OWN.intersection(features.vectors):
+            raise UsageError(f"{min(taken)} is no name for a feature of windows: choose another.")
         asked = query.with_topic(*features.topics)
         if running := [one.label for one in asked.summaries() if one.status == "open"]:
             raise UsageError(

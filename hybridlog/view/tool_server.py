@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -169,8 +170,6 @@ class _Answers:
             raise ToolError(self._without_path(str(error))) from error
         finally:
             timer.cancel()
-        import base64
-
         content: list[Any] = [TextContent(type="text", text=found.text)]
         content += [
             ImageContent(

@@ -90,7 +90,7 @@ class Asked:
 def recordings(context: Context, name: str | None) -> Answer:
     """The latest recordings, and how complete they are."""
     chosen = context.store.recordings(name)
-    found = list(chosen)[-MAX_ROWS:]
+    found = chosen[-MAX_ROWS:]
     rows = [
         {
             "recording": one.label,
@@ -102,7 +102,7 @@ def recordings(context: Context, name: str | None) -> Answer:
             "topics": len({channel.topic for channel in one.channels}),
             "completeness": coverage(one, losses_of(one)),
         }
-        for one in reversed(found)
+        for one in reversed([*found])
     ]
     return _answer({"recordings": rows}, "recordings", is_cut=len(chosen) > len(found))
 
@@ -111,14 +111,16 @@ def schema(context: Context, topic: str | None, recording: str | None) -> Answer
     """The topics of recordings with their types, or the fields of one topic."""
     chosen = context.store.recordings(recording).check()
     if topic is None:
+        found = chosen[-MAX_ROWS:]
         rows: dict[str, dict[str, Any]] = {}
-        for channel in chain.from_iterable(entry.channels for entry in chosen):
+        for channel in chain.from_iterable(entry.channels for entry in found):
             row = rows.setdefault(
                 channel.topic, {"topic": channel.topic, "type": channel.type, "messages": 0}
             )
             row["messages"] += channel.stats.messages
         listed = [rows[name] for name in sorted(rows)]
-        return _answer({"topics": listed[:MAX_ROWS]}, "topics", is_cut=len(listed) > MAX_ROWS)
+        is_cut = len(listed) > MAX_ROWS or len(chosen) > len(found)
+        return _answer({"topics": listed[:MAX_ROWS]}, "topics", is_cut=is_cut)
     query = chosen.topic(topic)
     known = query.field_types()
     if known is None:
@@ -209,7 +211,8 @@ def fetch(context: Context, asked: Asked, fields: list[str], most: int, pictures
             except PayloadError as error:
                 problems.append(f"{format_time(message.log_time_ns)}: {error}")
     count = query.count()
-    values = {"count": count, **_lacks(limited, asked.topic, count), "not_shown": problems}
+    values = {"count": count, **_lacks(query, asked.topic, count), "not_shown": problems}
+    values["lacks"] = [*dict.fromkeys([*limited.remarks(asked.topic), *values["lacks"]])]
     return _answer({**values, "messages": rows}, "messages", tuple(shown), is_cut=count > len(rows))
 
 

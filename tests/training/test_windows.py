@@ -203,7 +203,8 @@ def check_damaged(found: Windows) -> None:
 
 def test_what_does_not_fit_is_refused(plain: Path) -> None:
     with hl.open(plain, mongo="none") as store:
-        for wrong in ({"length": 0}, {"horizon": -1}, {"fps": 0}):
+        own = {"features": {"features": {"is_stale": {"arm": "load"}}}}
+        for wrong in ({"length": 0}, {"horizon": -1}, {"fps": 0}, own):
             with pytest.raises(UsageError):
                 windows(store, **wrong)
         assert len(windows(store, length=100)) == 0

@@ -190,6 +190,9 @@ def test_no_byte_is_written_and_losses_are_told(demo_store: hl.Store, tmp_path: 
             while text not in store.topics() or not store.topic(text).count():
                 assert monotonic() < deadline
             shutil.copytree(store.directory.path, path)
+            with asking(make_server(store)) as ask:  # it counts all, although it gives one
+                (told, *_) = ask("fetch", topic=text, limit=1).values["lacks"]
+                assert told.startswith("cut is being recorded")
     before = content(path)
     with (
         hl.open(path, read_only=True) as store,
