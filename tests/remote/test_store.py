@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -293,6 +294,27 @@ def test_the_cache_heals_and_is_bounded(published: str, proxy: Proxy, tmp_path: 
     assert files.pread(again, about.size, 0) == whole
     assert not [*(tmp_path / "blocks").glob("*.data")]
     assert files.pread(handle, about.size, 0) == whole
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_says_what_to_do(published: str, proxy: Proxy) -> None:
+    with hl.open(published) as store:
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
+            said = []
+            for ask in (store.topic("/arm").to_pandas, lambda: hl.open(published)):
+                try:
+                    ask()
+                except BucketError as error:
+                    said.append("spawn" in str(error))
+            os.write(writing, repr(said).encode())
+            os._exit(0)
+        os.waitpid(child, 0)
+        assert os.read(reading, 100) == b"[True, True]"
+        os.close(reading)
+        os.close(writing)
+        assert store.topic("/arm").count() == 860
 
 
 def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:

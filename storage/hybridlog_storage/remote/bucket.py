@@ -57,6 +57,8 @@ _SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
 
 
 _T = TypeVar("_T")
+_users: Final[dict[str, int]] = {}
+"""The process that has used the library first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +98,8 @@ class Bucket:
         if not is_bucket(address) or not address.partition("://")[2].strip("/"):
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
         self.address = address.rstrip("/")
-        self._pid = os.getpid()
         self._has_conditions = False
         self._reading = _opened(self.address, _READ_S)
-
-    @property
-    def is_usable(self) -> bool:
-        """False in a process that was forked from the one that opened it."""
-        return os.getpid() == self._pid
 
     @lazy
     def _writing(self) -> ObjectStore:
@@ -375,10 +371,7 @@ class Bucket:
         """Raise errors of the library as errors of this program."""
         from obstore import exceptions
 
-        if not self.is_usable:
-            raise BucketError(
-                f"{self.address} was opened before this process was forked. Open it here again."
-            )
+        _check_process(self.address)
         try:
             yield
         except FileNotFoundError as error:
@@ -411,7 +404,17 @@ def joined_ranges(
     return joined
 
 
+def _check_process(address: str) -> None:
+    """Raise in a process that was forked: the library's threads are in its parent alone."""
+    if _users.setdefault("first", os.getpid()) != os.getpid():
+        raise BucketError(
+            f"{address} cannot be read here: this process was forked from one that has read from "
+            "a bucket. Start it by `spawn` instead, as multiprocessing_context='spawn' does."
+        )
+
+
 def _opened(address: str, timeout_s: int) -> ObjectStore:
+    _check_process(address)
     try:
         from obstore.exceptions import BaseError
         from obstore.store import from_url

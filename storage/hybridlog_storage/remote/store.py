@@ -267,7 +267,7 @@ def mount(address: str, cache: BlockCache | None = None) -> BucketFiles:
     path = Path(address)
     with _mounting:
         found = files.mounted.get(path)
-        if not isinstance(found, BucketFiles) or not found.bucket.is_usable:
+        if not isinstance(found, BucketFiles):
             found = files.mounted[path] = BucketFiles(Bucket(address), cache or BlockCache())
         return found
 
