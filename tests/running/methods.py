@@ -596,6 +596,10 @@ METHODS: dict[str, Rule] = {
         lambda s: (_frame(s.topic("said").to_pandas()), _frame(s.topic("arm").to_pandas())),
         lambda k: (_times(k, "/said"), _times(k, "/arm")),
     ),
+    "to_polars": Rule(
+        lambda s: _table(s.topic("said").to_polars().to_arrow(), "log_time", "n"),
+        lambda k: _times(k, "/said"),
+    ),
     "to_tables": Rule(
         lambda s: [row for t in s.topic("said").to_tables() for row in _table(t, "log_time", "n")],
         lambda k: _times(k, "/said"),
