@@ -43,7 +43,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.remote.store import TRIES, RemoteDirectory, address_of, directory_of
+from hybridlog_storage.remote import TRIES, address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
@@ -1220,6 +1220,8 @@ class Store:
         Raises:
             UsageError: The store is a directory, which has nothing of the kind.
         """
+        from hybridlog_storage.remote.store import RemoteDirectory
+
         if not isinstance(self.directory, RemoteDirectory):
             raise UsageError("A store on a disk is tidy: `tidy` is for stores in buckets.")
         found = self.directory.unneeded()

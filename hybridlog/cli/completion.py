@@ -116,7 +116,7 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
 
 def _store(context: click.Context) -> StoreDirectory:
     from hybridlog.store import store_path
-    from hybridlog_storage.remote.store import directory_of
+    from hybridlog_storage.remote import directory_of
 
     value: Path | None = context.params.get("store")
     # The shell has not expanded the tilde of the line that is being completed.

@@ -25,8 +25,8 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import ObjectExistsError, StoreError, unreadable
 from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.lists import RECORDINGS, TABLES, ListedRecording
-from hybridlog_storage.remote.store import TRIES
 from hybridlog_storage.segments.segment_check import SegmentCheck
 
 if TYPE_CHECKING:

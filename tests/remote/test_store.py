@@ -25,11 +25,12 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.remote import address_of
 from hybridlog_storage.remote import bucket as bucket_module
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.lists import StoreList, list_name
-from hybridlog_storage.remote.store import RemoteDirectory, address_of
+from hybridlog_storage.remote.store import RemoteDirectory
 from tests.cli.within import answer
 from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy

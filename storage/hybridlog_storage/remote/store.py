@@ -33,6 +33,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
 from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object
 from hybridlog_storage.remote.lists import (
@@ -50,35 +51,13 @@ from hybridlog_storage.settings import NAME as SETTINGS
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for a newer list, unless this process changes something."""
-TRIES: Final = 10
-"""How often a change begins again if another process was faster."""
 _READ_NS: Final = 3600 * 10**9  # for so long a reader may need what a newer list has not
 _DAY_NS: Final = 86_400 * 10**9
 _MAX_SETTINGS: Final = 1 << 20
-_ADDRESS: Final = re.compile(r"(s3|gs|az):/{1,2}([^/].*)")
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
 _Node = Mapping[str, Any]
 """A folder: an `Object`, a list of them, bytes, or another folder, by name."""
-
-
-def address_of(path: str | Path) -> str | None:
-    """The address of a store in a bucket, which a `Path` may have lost a slash of; else None."""
-    found = _ADDRESS.fullmatch(str(path))
-    return f"{found[1]}://{found[2].rstrip('/')}" if found else None
-
-
-def directory_of(path: str | Path, *, read_only: bool = False) -> StoreDirectory:
-    """The directory of an existing store, here or in a bucket; with `read_only` it never changes.
-
-    Raises:
-        StoreError: It is not a store, has another format, or cannot be read.
-        BucketError: The server does not answer, or refuses.
-    """
-    address = address_of(path)
-    if address is None:
-        return StoreDirectory(Path(path), read_only=read_only)
-    return RemoteDirectory(address, read_only=read_only)
 
 
 class BucketFiles:
