@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import click
 
 from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_cost
-from hybridlog.cli.binder import command, option, repeated
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_recording, complete_topic
 from hybridlog.cli.options import Asking, in_frame, parse_fields, query_of
 from hybridlog.cli.output import notes
@@ -30,50 +30,41 @@ _BESIDE = ("asof", "nearest", "interpolate")
 class _Given(Asking, Tabular):
     needs_topic: ClassVar[bool] = True
     base: str | None = option(
-        "--to",
-        metavar="TOPIC",
+        "The topic whose messages are the rows.",
+        "TOPIC",
+        name="--to",
         shell_complete=complete_topic,
-        help="The topic whose messages are the rows.",
     )
-    step: str | None = option(
-        "--step", metavar="DURATION", help="Instead: rows at regular times, such as 100ms."
-    )
+    step: str | None = option("Instead: rows at regular times, such as 100ms.", "DURATION")
     how: str = option(
-        "--how",
-        type=click.Choice([*_BESIDE, "count", "first", "last", "min", "max", "mean"]),
-        default="asof",
-        help="The last message not after the row, the nearest one, or between the last and the "
+        "The last message not after the row, the nearest one, or between the last and the "
         "next. With --step also of the messages from a row to the next: their number, the first, "
         "the last, or the least, greatest or mean of each number.",
+        type=click.Choice([*_BESIDE, "count", "first", "last", "min", "max", "mean"]),
+        default="asof",
     )
     tolerance: str | None = option(
-        "--tolerance",
-        metavar="DURATION",
-        help="Greatest distance in time, such as 20ms; without, any.",
+        "Greatest distance in time, such as 20ms; without, any.", "DURATION"
     )
     clock: str = option(
-        "--clock",
+        "With --to: the time that is compared.",
         type=click.Choice(["log", "publish", "header"]),
         default="log",
-        help="With --to: the time that is compared.",
     )
-    where: tuple[str, ...] = repeated(  # type: ignore[misc]
-        "--where",
-        metavar="TOPIC: PREDICATE",
-        help="Only messages of this topic that satisfy a predicate; with --step a predicate alone.",
+    where: tuple[str, ...] = option(  # type: ignore[misc]
+        "Only messages of this topic that satisfy a predicate; with --step a predicate alone.",
+        "TOPIC: PREDICATE",
     )
-    beside: tuple[str, ...] = repeated(
-        "--beside",
-        metavar="RECORDING",
-        shell_complete=complete_recording,
-        help="With --to: the topics beside it are of these recordings, whose time may overlap: a "
+    beside: tuple[str, ...] = option(
+        "With --to: the topics beside it are of these recordings, whose time may overlap: a "
         "second robot or recorder. As for --recording; '*' for all.",
+        "RECORDING",
+        shell_complete=complete_recording,
     )
-    fields: tuple[str, ...] = repeated(
-        "--fields",
-        metavar="TOPIC: A,B.C",
-        help="Only these fields of a topic, with commas between them; with --step of all topics, "
+    fields: tuple[str, ...] = option(
+        "Only these fields of a topic, with commas between them; with --step of all topics, "
         "without their names.",
+        "TOPIC: A,B.C",
     )
     frame: str | None = in_frame()
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import click
 
-from hybridlog.cli import options, output
-from hybridlog.cli.binder import option
+from hybridlog.cli import output
+from hybridlog.cli.binder import PATH, option
 from hybridlog.cli.options import VERBOSE, AsJson, Forced, Topics
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
@@ -157,12 +157,12 @@ def format_of(form: str | None, path: Path | None, names: Sequence[str]) -> str:
 def output_option(what: str) -> Any:
     """The option `--output`; `-` is as good as none."""
     return option(
-        "--output",
-        "-o",
-        type=options.PATH,
-        metavar="FILE",
+        f"{what}; - is standard output.",
+        "FILE",
+        name="--output",
+        short="-o",
+        type=PATH,
         callback=lambda _, __, path: None if str(path) == "-" else path,
-        help=f"{what}; - is standard output.",
     )
 
 
@@ -176,15 +176,13 @@ class Tabular(Forced):
 
     formats: ClassVar[Sequence[str]] = TABLE_FORMATS
     form: str | None = option(
-        "--format",
-        "-F",
+        "Without: by the suffix of -o, else a table on a terminal, else jsonl.",
+        name="--format",
+        short="-F",
         type=click.Choice([SCREEN, *TABLE_FORMATS]),
-        help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
     )
     output: Path | None = output_option("Write to this file")
-    limit: int | None = option(
-        "--limit", "-n", type=click.IntRange(min=0), metavar="N", help="At most so many."
-    )
+    limit: int | None = option("At most so many.", "N", short="-n", type=click.IntRange(min=0))
 
     @property
     def to(self) -> Destination:
@@ -209,10 +207,10 @@ class Listing(Tabular, AsJson):
     """Options of commands that answer with rows, which are text unless another form is given."""
 
     form: str | None = option(
-        "--format",
-        "-F",
+        "Without: by the suffix of -o, else a table.",
+        name="--format",
+        short="-F",
         type=click.Choice([SCREEN, *TABLE_FORMATS]),
-        help="Without: by the suffix of -o, else a table.",
     )
 
     @property
@@ -243,6 +241,7 @@ class Listing(Tabular, AsJson):
         columns: Sequence[output.Column],
         cells: Callable[[Any], Sequence[str]],
         spare: Sequence[str] = (),
+        titles: int = 0,
     ) -> None:
         """Print or write rows.
 
@@ -251,6 +250,7 @@ class Listing(Tabular, AsJson):
             columns: Of the table for people.
             cells: Gives the cells of a row.
             spare: Columns that may be left out, see `output.fitted`.
+            titles: Number of cells in the title of a block, see `output.print_rows`.
         """
         from hybridlog.schema.plain import without_nan
 
@@ -259,8 +259,12 @@ class Listing(Tabular, AsJson):
             answer_tables(_tables_of(limited), lambda: None, to)
         elif self.as_json:
             output.print_json_list(map(without_nan, limited))
-        elif spare:
-            output.print_table(*output.fitted(columns, [cells(row) for row in limited], spare))
+        elif titles or spare:
+            shown = [cells(row) for row in limited]
+            if shown and titles:
+                output.print_rows(columns, shown, titles)
+            elif shown:
+                output.print_table(*output.fitted(columns, shown, spare))
         else:
             first = list(islice(limited, 1))
             if first:
@@ -332,10 +336,24 @@ def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = 
     limit = query.question.limit
     answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
     tables = _checked(answered.to_tables(), answered.completeness if strict else None)
+    from hybridlog.record.marks import MARKS
+
+    if answered.topics == (MARKS,):
+        tables = map(_with_times, tables)
     _print_rows(tables, limit, answered.topics)
     counters = answered.counters
     counters.messages = _shown(counters.messages, limit, "message")
     return answered
+
+
+def _with_times(marks: pa.Table) -> pa.Table:
+    """Marks for people: their ends are times, as their beginnings are."""
+    import pyarrow as pa
+
+    if "end" not in marks.column_names:
+        return marks
+    end = marks["end"].cast(pa.timestamp("ns", "UTC"))
+    return marks.set_column(marks.column_names.index("end"), "end", end)
 
 
 def answer_tables(

@@ -10,46 +10,85 @@ import inspect
 from collections.abc import Callable
 from dataclasses import field, fields
 from functools import wraps
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
 
 _MAKE: Final = "hybridlog.parameter"
 _Kind = TypeVar("_Kind")
+PATH: Final = click.Path(readable=False, path_type=Path)
+"""A path that click does not check: the library's errors name a cure and have exit codes."""
+_TYPES: Final = {"int": int, "float": float, "Path": PATH}
 
 
-def option(*names: str, kind: type[click.Option] = click.Option, **settings: Any) -> Any:
-    """A field that is an option, called as the field is.
+def option(
+    help: str,  # noqa: A002 - the word of click
+    metavar: str | None = None,
+    *,
+    name: str | None = None,
+    short: str | None = None,
+    kind: type[click.Option] = click.Option,
+    **settings: Any,
+) -> Any:
+    """A field that is an option; its type says how: `bool` has no value, a tuple is repeatable.
 
     Args:
-        names: Its spellings.
+        help: What it does.
+        metavar: What its value is called.
+        name: Its long spelling; without, made from the name of the field.
+        short: Its short spelling.
         kind: Its class.
         settings: Of the class.
     """
-    return field(metadata={_MAKE: lambda name: kind([name, *names], **settings)})
+
+    def make(field: str, annotation: str) -> click.Parameter:
+        words = help
+        if annotation == "bool":
+            settings["is_flag"] = True
+        elif annotation == "tuple[str, ...]":
+            settings["multiple"], words = True, f"{help} Repeatable."
+        elif (of := annotation.removesuffix(" | None")) in _TYPES:
+            settings.setdefault("type", _TYPES[of])
+        spelled = [field, name or f"--{field.replace('_', '-')}", *([short] if short else [])]
+        return kind(spelled, help=words, metavar=metavar, **settings)
+
+    return field(metadata={_MAKE: make})
 
 
-def repeated(*names: str, **settings: Any) -> Any:
-    """An option that may be given several times; the field is a tuple."""
-    settings["help"] += " Repeatable."
-    return option(*names, multiple=True, **settings)
+def argument(help: str, metavar: str, **settings: Any) -> Any:  # noqa: A002
+    """A field that is an argument; its type says how: a tuple takes any number of words.
 
+    Args:
+        help: What it is.
+        metavar: What the usage line calls it.
+        settings: Of `click.Argument`.
+    """
 
-def flag(*names: str, help: str, **settings: Any) -> Any:  # noqa: A002 - the word of click
-    """An option without a value; the field is a bool."""
-    return option(*names, is_flag=True, help=help, **settings)
+    def make(field: str, annotation: str) -> click.Parameter:
+        of = annotation.removesuffix(" | None")
+        if of.startswith("tuple["):
+            of = of.removeprefix("tuple[").removesuffix(", ...]")
+            settings.setdefault("nargs", -1)
+        settings.setdefault("type", _TYPES.get(of))
+        settings.setdefault("required", None if of == annotation else False)
+        return click.Argument([field], help=help, metavar=metavar, **settings)
 
-
-def argument(**settings: Any) -> Any:
-    """A field that is an argument; its metavar is in the usage line."""
-    return field(metadata={_MAKE: lambda name: click.Argument([name], **settings)})
+    return field(metadata={_MAKE: make})
 
 
 def parameters_of(kind: type) -> list[click.Parameter]:
     """The parameters of a command, those of a class before those of its bases."""
-    names = dict.fromkeys(name for one in kind.__mro__ for name in inspect.get_annotations(one))
+    types: dict[str, str] = {}
+    for one in kind.__mro__:
+        for name, annotation in inspect.get_annotations(one).items():
+            types.setdefault(name, annotation)
     made = {one.name: one.metadata.get(_MAKE) for one in fields(kind)}
-    return [make(name) for name in names if (make := made.get(name)) is not None]
+    return [
+        make(name, annotation)
+        for name, annotation in types.items()
+        if (make := made.get(name)) is not None
+    ]
 
 
 def command(

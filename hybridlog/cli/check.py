@@ -24,22 +24,14 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Check(options.Named, Strict, Topics, Verbose, Listing):
     contract: Path | None = option(
-        "--contract",
-        type=options.PATH,
-        metavar="FILE",
-        help="Judge recordings by the rules in this file; exit code 12 if one is broken.",
+        "Judge recordings by the rules in this file; exit code 12 if one is broken.",
+        "FILE",
     )
     make: Path | None = option(
-        "--make",
-        type=options.PATH,
-        metavar="FILE",
-        help="Write a contract that this good recording keeps, to be edited.",
+        "Write a contract that this good recording keeps, to be edited.", "FILE"
     )
     junit: Path | None = option(
-        "--junit",
-        type=options.PATH,
-        metavar="FILE",
-        help="With --contract: also write the results in JUnit's XML, for CI.",
+        "With --contract: also write the results in JUnit's XML, for CI.", "FILE"
     )
 
 
@@ -106,12 +98,17 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> 
     )
     sys.stdout.flush()
     if not given.quiet:
-        rules = (
-            f"{output.counted(len(results), 'rule')} in {output.counted(recordings, 'recording')}"
-        )
-        output.note(f"{rules}: {len(bad) or 'none'} broken.")
+        output.note(_verdict(results, f" in {output.counted(recordings, 'recording')}"))
     if bad:
         raise click.exceptions.Exit(DIFFERENT)
+
+
+def _verdict(results: Sequence[Result], where: str = "") -> str:
+    from hybridlog.contract.judge import broken
+
+    return (
+        f"{output.counted(len(results), 'rule')}{where}: {len(broken(results)) or 'none'} broken."
+    )
 
 
 def _write(path: Path, text: str) -> None:
@@ -143,22 +140,12 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Diff(InStore, Quiet, Listing):
-    a: str = one_recording(
-        metavar="A", help="A recording, as for --recording, or a glob for several together."
-    )
-    b: str = one_recording(metavar="B", help="The same.")
+    a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
+    b: str = one_recording("The same.", "B")
     tolerance: str = option(
-        "--tolerance",
-        default="0",
-        metavar="SHARE",
-        help="Numbers are equal that differ by at most this, such as 5%.",
+        "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
     )
-    contract: Path | None = option(
-        "--contract",
-        type=options.PATH,
-        metavar="FILE",
-        help="Also compare which rules in this file are broken.",
-    )
+    contract: Path | None = option("Also compare which rules in this file are broken.", "FILE")
 
 
 @command(_Diff)
@@ -174,14 +161,21 @@ def diff_command(given: _Diff) -> None:
     share = parse_share(given.tolerance)
     with given.opened() as store:
         found = store.diff(given.a, given.b, tolerance=share, contract=rules)
+        verdicts = [
+            f"{name}: {_verdict(store.judge(rules, name))}"
+            for name in (given.a, given.b)
+            if rules is not None
+        ]
     names = ("topic", "what", "a", "b")
     given.answer(
         map(asdict, found),
         [(name, "left") for name in names],
         lambda row: [row[name] for name in names],
+        titles=2,
     )
     sys.stdout.flush()
     if not (given.quiet or given.as_json):
+        output.notes(verdicts)
         output.note(output.counted(len(found), "difference") + "." if found else "No difference.")
     if found:
         raise click.exceptions.Exit(DIFFERENT)

@@ -8,27 +8,19 @@ from pathlib import Path
 import click
 
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import PATH
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Given:
     directory: Path = argument(
-        type=PATH,
+        "Directory for the bag and the store of the demo.",
+        "[DIRECTORY]",
         default=Path("hybridlog-demo"),
-        metavar="[DIRECTORY]",
-        help="Directory for the bag and the store of the demo.",
     )
     duration: float = option(
-        "--duration",
-        type=click.FloatRange(min=5),
-        default=60.0,
-        metavar="SECONDS",
-        help="Seconds of robot time.",
+        "Seconds of robot time.", "SECONDS", type=click.FloatRange(min=5), default=60.0
     )
-    seed: int = option(
-        "--seed", type=int, default=1, metavar="N", help="Another number gives another drive."
-    )
+    seed: int = option("Another number gives another drive.", "N", default=1)
 
 
 @command(_Given)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, flag, option, repeated
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.options import (
     AsJson,
@@ -39,10 +39,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Edit(InStore, Quiet):
     recording: str = one_recording()
-    name: str | None = option("--name", metavar="NAME", help="Give it this name.")
-    note: str | None = option(
-        "--note", metavar="TEXT", help="Write a note about it; `info` shows notes."
-    )
+    name: str | None = option("Give it this name.", "NAME")
+    note: str | None = option("Write a note about it; `info` shows notes.", "TEXT")
 
 
 @command(_Edit)
@@ -69,13 +67,12 @@ def edit_command(given: _Edit) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _Tag(Choosing, InStore, AsJson, Quiet):
     words: tuple[str, ...] = argument(
-        nargs=-1,
-        metavar="[RECORDING] [KEY=VALUE]...",
-        shell_complete=complete_recording,
-        help="A recording, as for --recording, unless options choose; and tags to set. Without "
+        "A recording, as for --recording, unless options choose; and tags to set. Without "
         "tags, show them.",
+        "[RECORDING] [KEY=VALUE]...",
+        shell_complete=complete_recording,
     )
-    remove: tuple[str, ...] = repeated("--remove", metavar="KEY", help="Remove this tag.")
+    remove: tuple[str, ...] = option("Remove this tag.", "KEY")
 
 
 @command(_Tag)
@@ -122,16 +119,12 @@ def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[st
 
 @dataclass(frozen=True, kw_only=True)
 class _Mark(Running):
-    text: str = argument(metavar="TEXT", help="What happened.")
-    tags: tuple[str, ...] = repeated("--set-tag", metavar="K=V", help="Add KEY=VALUE to it.")
+    text: str = argument("What happened.", "TEXT")
+    tags: tuple[str, ...] = option("Add KEY=VALUE to it.", "K=V", name="--set-tag")
     at: str | None = option(
-        "--at",
-        metavar="T",
-        help="Mark a recording that has ended, at this time, written as for --between.",
+        "Mark a recording that has ended, at this time, written as for --between.", "T"
     )
-    until: str | None = option(
-        "--until", metavar="T2", help="The mark lasts from --at to this time."
-    )
+    until: str | None = option("The mark lasts from --at to this time.", "T2")
 
 
 @command(_Mark)
@@ -197,7 +190,7 @@ _MAX_ROWS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class _Remove(Named, InStore):
-    yes: bool = flag("--yes", "-y", help="Do not ask.")
+    yes: bool = option("Do not ask.", short="-y")
 
 
 @command(_Remove)

@@ -20,7 +20,7 @@ from hybridlog.cli.answers import (
     print_remarks,
     write_answer,
 )
-from hybridlog.cli.binder import argument, command, flag, option
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.lerobot import LEROBOT, check_options, export_set, lerobot_options
 from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
@@ -49,19 +49,15 @@ _FILES = formats_of("table", "lines", "video")
 @dataclass(frozen=True, kw_only=True)
 class _Given(Topics, Slices):
     target: Path = argument(
-        type=options.PATH,
-        metavar="OUTPUT",
-        help="File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).",
+        "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"
     )
     form: str | None = option(
-        "--format",
-        "-F",
+        f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
+        name="--format",
+        short="-F",
         type=click.Choice([*_LOGS, LEROBOT, *_FILES]),
-        help=f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
     )
-    no_attachments: bool = flag(
-        "--no-attachments", help="Leave out attachments; they are in MCAP files only."
-    )
+    no_attachments: bool = option("Leave out attachments; they are in MCAP files only.")
 
 
 @command(_Given)

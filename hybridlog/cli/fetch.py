@@ -25,10 +25,9 @@ from hybridlog.cli.answers import (
     print_remarks,
     write_following,
 )
-from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
 from hybridlog.cli.signals import Stopped
-from hybridlog.cli.split import pieces
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
 from hybridlog.formats.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
@@ -46,51 +45,30 @@ class _Choices(Asking, Tabular, Slices):
     needs_topic: ClassVar[bool] = True
     formats: ClassVar[Sequence[str]] = _FORMATS
     clock: str = option(
-        "--clock",
-        type=click.Choice(["log", "publish", "header"]),
-        default="log",
-        help="The clock of --between.",
+        "The clock of --between.", type=click.Choice(["log", "publish", "header"]), default="log"
     )
-    at: str | None = option(
-        "--at", metavar="T", help="Only the message that was current at this time."
+    at: str | None = option("Only the message that was current at this time.", "T")
+    every: int = option("Only every n-th message.", "N", type=click.IntRange(min=1), default=1)
+    reverse: bool = option("Latest first.")
+    follow: bool = option(
+        "Of running recordings: print messages as they come, from now on or from the "
+        "beginning of --between, until the recordings end or Ctrl-C."
     )
-    every: int = option(
-        "--every",
-        type=click.IntRange(min=1),
-        default=1,
-        metavar="N",
-        help="Only every n-th message.",
-    )
-    reverse: bool = flag("--reverse", help="Latest first.")
-    follow: bool = flag(
-        "--follow",
-        help="Of running recordings: print messages as they come, from now on or from the "
-        "beginning of --between, until the recordings end or Ctrl-C.",
-    )
-    fields: str | None = option(
-        "--fields", metavar="A,B.C", help="Only these fields, with commas between them."
-    )
+    fields: str | None = option("Only these fields, with commas between them.", "A,B.C")
     frame: str | None = in_frame()
     within: str | None = option(
-        "--within",
-        metavar="DURATION",
-        help="Greatest distance in time of messages of other topics in --where "
+        "Greatest distance in time of messages of other topics in --where "
         "'/odom: twist.twist.linear.x > 0.5'.",
+        "DURATION",
     )
-    before: str | None = option(
-        "--before",
-        metavar="DURATION",
-        help="Instead: start this long before each of these: 5min.",
-    )
-    after: str | None = option(
-        "--after", metavar="DURATION", help="Instead: end this long after each of these."
-    )
-    count: bool = flag("--count", help="Only print how many.")
+    before: str | None = option("Instead: start this long before each of these: 5min.", "DURATION")
+    after: str | None = option("Instead: end this long after each of these.", "DURATION")
+    count: bool = option("Only print how many.")
     form: str | None = option(
-        "--format",
-        "-F",
+        "Without: by the suffix of -o, else a table on a terminal, else jsonl.",
+        name="--format",
+        short="-F",
         type=click.Choice([SCREEN, *_FORMATS]),
-        help="Without: by the suffix of -o, else a table on a terminal, else jsonl.",
     )
     output: Path | None = output_option(
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
@@ -148,6 +126,8 @@ def fetch_command(choices: _Choices) -> None:
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
+    from hybridlog.cli.split import pieces
+
     how = choices.split
     assert to.path is not None
     assert how is not None

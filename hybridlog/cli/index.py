@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, command, flag, option
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
 from hybridlog.cli.progress import Stages, progress_bar
@@ -35,12 +35,7 @@ class _Shared(InStore, AsJson, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class _List(_Shared):
-    topic: str | None = argument(
-        required=False,
-        metavar="[TOPIC]",
-        shell_complete=complete_topic,
-        help="A topic; without, all.",
-    )
+    topic: str | None = argument("A topic; without, all.", "[TOPIC]", shell_complete=complete_topic)
 
 
 @command(_List, "list", to=index_command)
@@ -53,12 +48,9 @@ def list_(given: _List) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Fields(_Shared):
-    topic: str = argument(metavar="TOPIC", shell_complete=complete_topic, help="A topic.")
+    topic: str = argument("A topic.", "TOPIC", shell_complete=complete_topic)
     field: tuple[str, ...] = argument(
-        nargs=-1,
-        required=True,
-        metavar="FIELD...",
-        help="Its fields, the most selective first.",
+        "Its fields, the most selective first.", "FIELD...", required=True
     )
 
 
@@ -166,11 +158,7 @@ def rebuild(given: _Rebuild) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _Watch(_Shared):
     every: str = option(
-        "--every",
-        default="2s",
-        show_default=True,
-        metavar="DURATION",
-        help="Time between two looks at the store.",
+        "Time between two looks at the store.", "DURATION", default="2s", show_default=True
     )
 
 
@@ -237,7 +225,7 @@ def _look(store: Store, told: set[str], *, as_json: bool, quiet: bool) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Trust(InStore):
-    forget: bool = flag("--forget", help="Do not trust this store's server any more.")
+    forget: bool = option("Do not trust this store's server any more.")
 
 
 @command(_Trust, to=index_command)

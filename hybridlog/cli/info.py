@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.info_parts import (
     attachment_as_dict,
     show_attachments,
@@ -61,26 +61,22 @@ class _Given(Choosing, InStore, AsJson, Forced):
         "Instead: the message definition and the fields of this topic. With --losses: only those "
         "of this topic."
     )
-    losses: bool = flag("--losses", help="Instead: what is missing, from when to when, and why.")
+    losses: bool = option("Instead: what is missing, from when to when, and why.")
     sizes: str | None = option(
-        "--sizes",
-        type=click.Choice(["recording", "topic", "both"]),
-        help="Instead: the bytes of each recording, each topic, or each topic of each recording "
+        "Instead: the bytes of each recording, each topic, or each topic of each recording "
         "in segments, tables and MongoDB. Shares of what topics have in common are estimates.",
+        type=click.Choice(["recording", "topic", "both"]),
     )
-    attachments: bool = flag("--attachments", help="Instead: the attachments of the logs.")
+    attachments: bool = option("Instead: the attachments of the logs.")
     attachment: str | None = option(
-        "--attachment",
-        metavar="NAME",
-        help="Instead: the content of this attachment, or with -o those that fit a glob such as "
+        "Instead: the content of this attachment, or with -o those that fit a glob such as "
         "'*.yaml'.",
+        "NAME",
     )
     output: Path | None = option(
-        "--output",
-        "-o",
-        type=options.PATH,
-        metavar="FILE|DIR",
-        help="Write the attachment to this file; several attachments into this directory.",
+        "Write the attachment to this file; several attachments into this directory.",
+        "FILE|DIR",
+        short="-o",
     )
 
 

@@ -9,7 +9,7 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Answering, Listing, answering, print_cost
-from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Asking, parse_fields, recordings_of
 from hybridlog_storage.errors import UsageError
 
@@ -23,64 +23,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _Given(Asking, Listing):
-    changes: str | None = option(
-        "--changes", metavar="A,B.C", help="Instead: when these fields changed."
-    )
+    changes: str | None = option("Instead: when these fields changed.", "A,B.C")
     pause: str | None = option(
-        "--pause",
-        metavar="DURATION",
-        help="With --changes: longest time between steps of one change; without, 1s.",
+        "With --changes: longest time between steps of one change; without, 1s.", "DURATION"
     )
     tolerance: float | None = option(
-        "--tolerance",
-        type=float,
-        metavar="X",
-        help="With --changes: numbers that differ by at most this are equal.",
+        "With --changes: numbers that differ by at most this are equal.", "X"
     )
-    gaps: bool = flag("--gaps", help="Instead: when no message came for long.")
-    longer_than: str | None = option(
-        "--longer-than", metavar="DURATION", help="With --gaps: only longer ones: 500ms."
-    )
+    gaps: bool = option("Instead: when no message came for long.")
+    longer_than: str | None = option("With --gaps: only longer ones: 500ms.", "DURATION")
     periods: float | None = option(
-        "--periods",
-        type=float,
-        metavar="K",
-        help="With --gaps: only those longer than so many usual periods of the topic; without "
-        "both, 5.",
+        "With --gaps: only those longer than so many usual periods of the topic; without both, 5.",
+        "K",
     )
     rehearse: str | None = option(
-        "--rehearse",
-        metavar="TOPIC: PREDICATE",
-        help="Instead: what this trigger of `record --ring` would have kept of what is stored.",
+        "Instead: what this trigger of `record --ring` would have kept of what is stored.",
+        "TOPIC: PREDICATE",
     )
     before: str | None = option(
-        "--before",
-        metavar="DURATION",
-        help="With --rehearse: time before the trigger; without, 10s.",
+        "With --rehearse: time before the trigger; without, 10s.", "DURATION"
     )
-    after: str | None = option(
-        "--after", metavar="DURATION", help="With --rehearse: time after the trigger; without, 0."
-    )
-    at_least: str | None = option(
-        "--at-least", metavar="DURATION", help="Only those of at least this length, such as 60s."
-    )
+    after: str | None = option("With --rehearse: time after the trigger; without, 0.", "DURATION")
+    at_least: str | None = option("Only those of at least this length, such as 60s.", "DURATION")
     length: str | None = option(
-        "--length",
-        metavar="DURATION",
-        help="Cut each into as many of exactly this length as fit, one after the other.",
+        "Cut each into as many of exactly this length as fit, one after the other.", "DURATION"
     )
     max_gap: str | None = option(
-        "--max-gap",
-        metavar="DURATION",
-        help="A message is valid for at most this long; without, until the next one.",
+        "A message is valid for at most this long; without, until the next one.", "DURATION"
     )
     state: str | None = option(
-        "--state",
-        type=click.Choice(["held", "not-held", "unknown"]),
-        help="When it certainly held, certainly did not, or when lost messages leave it open; "
+        "When it certainly held, certainly did not, or when lost messages leave it open; "
         "without, what the stored messages say.",
+        type=click.Choice(["held", "not-held", "unknown"]),
     )
-    count: bool = flag("--count", help="Only print how many.")
+    count: bool = option("Only print how many.")
 
     @property
     def needs_topic(self) -> bool:  # type: ignore[override]

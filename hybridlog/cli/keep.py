@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, flag, option, repeated
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_condition, complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of, recordings_of
 from hybridlog.cli.progress import Stages, progress_bar
@@ -28,58 +28,38 @@ _MAX_PINS = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson, Quiet):
-    quota: str | None = option(
-        "--quota", metavar="SIZE", help="The most that the store may take, such as 200GB."
-    )
-    min_free: str | None = option(
-        "--min-free", metavar="SIZE", help="The least that stays free on the disk."
-    )
-    max_age: str | None = option(
-        "--max-age", metavar="DURATION", help="Payloads older than this go, such as 30d."
-    )
-    topic: tuple[str, ...] = repeated(
-        "--topic",
-        "-t",
-        metavar="TOPIC=AGE",
-        shell_complete=complete_topic,
-        help="Payloads of this topic go at this age, and first when room is short; earlier ones "
+    quota: str | None = option("The most that the store may take, such as 200GB.", "SIZE")
+    min_free: str | None = option("The least that stays free on the disk.", "SIZE")
+    max_age: str | None = option("Payloads older than this go, such as 30d.", "DURATION")
+    topic: tuple[str, ...] = option(
+        "Payloads of this topic go at this age, and first when room is short; earlier ones "
         "before later ones. With --pin: TOPIC alone, to pin only this topic.",
+        "TOPIC=AGE",
+        short="-t",
+        shell_complete=complete_topic,
     )
-    never_tag: tuple[str, ...] = repeated(
-        "--never-tag",
-        metavar="K=V",
-        help="Nothing of recordings with this tag goes; K alone is any value.",
+    never_tag: tuple[str, ...] = option(
+        "Nothing of recordings with this tag goes; K alone is any value.", "K=V"
     )
     fields_age: str | None = option(
-        "--fields-age",
-        metavar="DURATION",
-        help="Recordings older than this go, with fields and counts, such as 2y.",
+        "Recordings older than this go, with fields and counts, such as 2y.", "DURATION"
     )
-    save: bool = flag("--save", help="Write these rules into the store, for recorders too.")
-    dry_run: bool = flag("--dry-run", help="Only say what would go.")
-    pin: bool = flag("--pin", help="Pin recordings, or a time of them: it never goes.")
-    at: str | None = option(
-        "--at", metavar="T", help="With --pin: the time around T, see --before and --after."
-    )
-    when: tuple[str, ...] = repeated(
-        "--when",
-        metavar="TOPIC: PREDICATE",
-        shell_complete=complete_condition,
-        help="With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around "
+    save: bool = option("Write these rules into the store, for recorders too.")
+    dry_run: bool = option("Only say what would go.")
+    pin: bool = option("Pin recordings, or a time of them: it never goes.")
+    at: str | None = option("With --pin: the time around T, see --before and --after.", "T")
+    when: tuple[str, ...] = option(
+        "With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around "
         "messages of a topic alone, or of marks.",
+        "TOPIC: PREDICATE",
+        shell_complete=complete_condition,
     )
-    before: str = option(
-        "--before", default="0s", metavar="TIME", help="With --pin: so much before it, too."
-    )
-    after: str = option(
-        "--after", default="0s", metavar="TIME", help="With --pin: so much after it, too."
-    )
-    reason: str = option("--reason", default="", metavar="TEXT", help="With --pin: why.")
-    unpin: tuple[str, ...] = repeated("--unpin", metavar="PIN", help="Remove a pin.")
-    pins: bool = flag("--pins", help="List the pins.")
-    tidy: bool = flag(
-        "--tidy", help="In a bucket: delete what no list of the last hour and no copy needs."
-    )
+    before: str = option("With --pin: so much before it, too.", "TIME", default="0s")
+    after: str = option("With --pin: so much after it, too.", "TIME", default="0s")
+    reason: str = option("With --pin: why.", "TEXT", default="")
+    unpin: tuple[str, ...] = option("Remove a pin.", "PIN")
+    pins: bool = option("List the pins.")
+    tidy: bool = option("In a bucket: delete what no list of the last hour and no copy needs.")
 
 
 @command(_Given)
@@ -221,10 +201,11 @@ def _show_pins(store: Store, choice: Choice, *, as_json: bool) -> None:
 
 
 def pin_cells(pin: dict[str, Any]) -> list[str]:
-    """From, to, topics and reason of a pin."""
+    """From, to, topics and reason of a pin; where there is little room, times to the second."""
     from hybridlog.query.times import format_time
 
-    times = ["-" if pin[key] is None else format_time(pin[key]) for key in ("from", "to")]
+    shown = output.short_time if output.is_narrow() else format_time
+    times = ["-" if pin[key] is None else shown(pin[key]) for key in ("from", "to")]
     return [*times, "all" if pin["topics"] is None else listed(pin["topics"]), pin["reason"]]
 
 

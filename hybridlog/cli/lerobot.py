@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
+from hybridlog.cli.binder import PATH
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.signals import if_stopped
@@ -23,9 +24,7 @@ if TYPE_CHECKING:
 LEROBOT: Final = "lerobot"
 _FPS: Final = 30
 _OPTIONS: Final = (
-    click.option(
-        "--map", "features", type=options.PATH, help="For lerobot: topics and fields, in YAML."
-    ),
+    click.option("--map", "features", type=PATH, help="For lerobot: topics and fields, in YAML."),
     click.option(
         "--propose-map",
         is_flag=True,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, flag
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
@@ -78,10 +78,9 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Repair(Named, InStore, AsJson, Quiet):
-    moved: bool = flag("--moved", help="The store was moved to here: take its index over.")
-    new_id: bool = flag(
-        "--new-id",
-        help="The store is a copy: give it an id of its own, with the index at --mongo.",
+    moved: bool = option("The store was moved to here: take its index over.")
+    new_id: bool = option(
+        "The store is a copy: give it an id of its own, with the index at --mongo."
     )
 
 
@@ -125,10 +124,8 @@ def repair_command(given: _Repair) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _Compact(Choosing, InStore, AsJson, Quiet):
     topic: tuple[str, ...] = options.topics()
-    drop_mcap: bool = flag(
-        "--drop-mcap", help="Take payloads that are in columns out of the segments."
-    )
-    dry_run: bool = flag("--dry-run", help="Only say what would be done.")
+    drop_mcap: bool = option("Take payloads that are in columns out of the segments.")
+    dry_run: bool = option("Only say what would be done.")
 
 
 @command(_Compact)
@@ -183,7 +180,7 @@ def _told(one: CompactedTopic, *, dry_run: bool) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class _Import(Choosing, InStore, AsJson, Quiet):
-    other: Path = argument(type=options.PATH, metavar="STORE", help="Directory of the other store.")
+    other: Path = argument("Directory of the other store.", "STORE")
 
 
 @command(_Import, "import")

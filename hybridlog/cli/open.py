@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
-from hybridlog.cli.binder import argument, command, flag, option, repeated
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Filtered, Forced, names_argument
 from hybridlog.cli.serve import check_installed, play
 from hybridlog.cli.signals import if_stopped
@@ -54,38 +54,35 @@ _VIEWERS: Final = {
 @dataclass(frozen=True, kw_only=True)
 class _Given(Filtered, Forced):
     viewer: str = argument(
-        type=click.Choice([*sorted(_VIEWERS), _WEBSOCKET]),
-        metavar="VIEWER",
-        help="foxglove, lichtblick or rerun, which is started; websocket plays to those that "
+        "foxglove, lichtblick or rerun, which is started; websocket plays to those that "
         "connect. Where only Lichtblick is installed, foxglove is that.",
+        "VIEWER",
+        type=click.Choice([*sorted(_VIEWERS), _WEBSOCKET]),
     )
     names: tuple[str, ...] = names_argument()  # type: ignore[misc]
     path: Path | None = option(
-        "--output",
-        "-o",
-        type=options.PATH,
-        metavar="FILE",
-        help="Write the slice to this MCAP file; without, into the user's cache.",
+        "Write the slice to this MCAP file; without, into the user's cache.",
+        "FILE",
+        name="--output",
+        short="-o",
     )
     port: int | None = option(
-        "--port",
+        "With websocket: TCP port on this computer, 0 for a free one; without, 8765.",
+        "N",
         type=click.IntRange(0, 65535),
-        metavar="N",
-        help="With websocket: TCP port on this computer, 0 for a free one; without, 8765.",
     )
     speed: float | None = option(
-        "--speed",
+        "With websocket: times as fast as recorded, 0.01 to 100; viewers can change it.",
+        "N",
         type=click.FloatRange(0.01, 100),
-        metavar="N",
-        help="With websocket: times as fast as recorded, 0.01 to 100; viewers can change it.",
     )
-    loop: bool = flag("--loop", help="With websocket: begin again at the end.")
-    paused: bool = flag("--paused", help="With websocket: wait until a viewer plays.")
-    origins: tuple[str, ...] = repeated(
-        "--allow-origin",
-        metavar="URL",
-        help="With websocket: let a web page of this origin connect, such as "
+    loop: bool = option("With websocket: begin again at the end.")
+    paused: bool = option("With websocket: wait until a viewer plays.")
+    origins: tuple[str, ...] = option(
+        "With websocket: let a web page of this origin connect, such as "
         "https://viewer.example; Foxglove and pages of this computer may.",
+        "URL",
+        name="--allow-origin",
     )
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, flag, option, repeated
+from hybridlog.cli.binder import argument, option
 from hybridlog.cli.completion import (
     complete_condition,
     complete_recording,
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from hybridlog.recordings import Recordings
     from hybridlog.store import Store
 
-PATH: Final = click.Path(readable=False, path_type=Path)
-"""A path that click does not check: the library's errors name a cure and have exit codes."""
 VERBOSE: Final = f"{__name__}.verbose"
 """Key in `click.Context.meta`: True with `--verbose`."""
 
@@ -42,12 +40,7 @@ class Place:
     """The option of all commands on a store."""
 
     store: Path | None = option(
-        "--store",
-        type=PATH,
-        envvar="HYBRIDLOG_STORE",
-        show_envvar=True,
-        metavar="DIR",
-        help="Directory of the store.",
+        "Directory of the store.", "DIR", envvar="HYBRIDLOG_STORE", show_envvar=True
     )
 
 
@@ -56,12 +49,11 @@ class InStore(Place):
     """Options of commands that may ask MongoDB."""
 
     mongo: str | None = option(
-        "--mongo",
+        "URI of the MongoDB that holds the index, 'embedded' for our own, or 'none'; "
+        "without, the one that the store was made with.",
+        "URI",
         envvar="HYBRIDLOG_MONGO_URI",
         show_envvar=True,
-        metavar="URI",
-        help="URI of the MongoDB that holds the index, 'embedded' for our own, or 'none'; "
-        "without, the one that the store was made with.",
     )
 
     def opened(self, **how: Any) -> AbstractContextManager[Store]:
@@ -74,30 +66,28 @@ class InStore(Place):
 class AsJson:
     """The option of commands that print JSON."""
 
-    as_json: bool = flag("--json", help="Print JSON, for scripts.")
+    as_json: bool = option("Print JSON, for scripts.", name="--json")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quiet:
     """The option of commands that say more than their answer."""
 
-    quiet: bool = flag("--quiet", "-q", help="No progress, no tables; errors only.")
+    quiet: bool = option("No progress, no tables; errors only.", short="-q")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Forced:
     """The option of commands that write files."""
 
-    force: bool = flag("--force", "-f", help="Overwrite existing files.")
+    force: bool = option("Overwrite existing files.", short="-f")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Strict:
     """The option of commands that can refuse incomplete answers."""
 
-    strict: bool = flag(
-        "--strict", help="Fail, with exit code 11, if the ledger knows of losses in this range."
-    )
+    strict: bool = option("Fail, with exit code 11, if the ledger knows of losses in this range.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,54 +99,41 @@ class Choosing:
     """
 
     names: ClassVar[tuple[str, ...]] = ()
-    recording: tuple[str, ...] = repeated(
-        "--recording",
-        "-r",
-        metavar="RECORDING",
-        shell_complete=complete_recording,
-        help="Only this recording: label, name, the beginning of a label or an id, or a glob "
+    recording: tuple[str, ...] = option(
+        "Only this recording: label, name, the beginning of a label or an id, or a glob "
         "such as 'monday*'.",
+        "RECORDING",
+        short="-r",
+        shell_complete=complete_recording,
     )
-    tag: tuple[str, ...] = repeated(
-        "--tag",
-        metavar="K=V",
-        shell_complete=complete_tag,
-        help="Only recordings with this tag; K alone is any value.",
+    tag: tuple[str, ...] = option(
+        "Only recordings with this tag; K alone is any value.", "K=V", shell_complete=complete_tag
     )
-    has: tuple[str, ...] = repeated(
-        "--has",
-        metavar="TOPIC",
-        shell_complete=complete_topic,
-        help="Only recordings with this topic.",
+    has: tuple[str, ...] = option(
+        "Only recordings with this topic.", "TOPIC", shell_complete=complete_topic
     )
-    types: tuple[str, ...] = repeated(
-        "--type",
-        metavar="TYPE",
+    types: tuple[str, ...] = option(
+        "Only recordings with messages of this type: sensor_msgs/Imu, Imu, or a glob.",
+        "TYPE",
+        name="--type",
         shell_complete=complete_type,
-        help="Only recordings with messages of this type: sensor_msgs/Imu, Imu, or a glob.",
     )
     during: tuple[str, str] | None = option(
-        "--during",
+        "Only recordings with a time in this range: ISO 8601, epoch seconds, now, start, end.",
+        "T0 T1",
         nargs=2,
-        metavar="T0 T1",
-        help="Only recordings with a time in this range: ISO 8601, epoch seconds, now, start, end.",
     )
     last: str | None = option(
-        "--last",
-        metavar="DURATION",
-        help="Only from so long ago until now, such as 30d: recordings, and their messages.",
+        "Only from so long ago until now, such as 30d: recordings, and their messages.", "DURATION"
     )
     older_than: str | None = option(
-        "--older-than",
-        metavar="DURATION",
-        help="Only recordings whose last message is at least this old, such as 30d.",
+        "Only recordings whose last message is at least this old, such as 30d.", "DURATION"
     )
-    conditions: tuple[str, ...] = repeated(
-        "--with",
-        metavar="TOPIC: PREDICATE",
+    conditions: tuple[str, ...] = option(
+        "Only recordings with a message that satisfies this, such as 'scan: ranges.min < 0.5'.",
+        "TOPIC: PREDICATE",
+        name="--with",
         shell_complete=complete_condition,
-        help="Only recordings with a message that satisfies this, such as "
-        "'scan: ranges.min < 0.5'.",
     )
 
     @property
@@ -196,10 +173,7 @@ class Choosing:
 def names_argument(metavar: str = "[RECORDING]...", what: str = "Only these recordings") -> Any:
     """The argument that names recordings."""
     return argument(
-        nargs=-1,
-        metavar=metavar,
-        shell_complete=complete_recording,
-        help=f"{what}, as for --recording; without, all.",
+        f"{what}, as for --recording; without, all.", metavar, shell_complete=complete_recording
     )
 
 
@@ -215,11 +189,10 @@ class Between:
     """The option of commands about a range of time."""
 
     between: tuple[str, str] | None = option(
-        "--between",
-        nargs=2,
-        metavar="T0 T1",
-        help="From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
+        "From T0 up to, not including, T1: ISO 8601 (UTC without a zone), epoch seconds, "
         "integer nanoseconds, +5s or 1m30s from the start, -10s from the end, start, end.",
+        "T0 T1",
+        nargs=2,
     )
 
 
@@ -227,7 +200,7 @@ def topics(
     what: str = "Only this topic: full name, an unambiguous short one (scan), a glob, or re:REGEX.",
 ) -> Any:
     """The option that names topics."""
-    return repeated("--topic", "-t", metavar="TOPIC", shell_complete=complete_topic, help=what)
+    return option(what, "TOPIC", name="--topic", short="-t", shell_complete=complete_topic)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,10 +261,9 @@ class Topics(Between, Choosing, InStore, Quiet):
 class Filtered(Strict, Topics):
     """Options of commands about messages that satisfy predicates."""
 
-    where: tuple[str, ...] = repeated(  # type: ignore[misc]
-        "--where",
-        metavar="PREDICATE",
-        help="Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'.",
+    where: tuple[str, ...] = option(  # type: ignore[misc]
+        "Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'.",
+        "PREDICATE",
     )
 
 
@@ -304,9 +276,7 @@ def _note_verbose(context: click.Context, _: click.Parameter, wanted: bool) -> b
 class Verbose:
     """The option of commands that can tell the cost of an answer."""
 
-    verbose: bool = flag(
-        "--verbose", "-v", callback=_note_verbose, help="Say what the answer has cost."
-    )
+    verbose: bool = option("Say what the answer has cost.", short="-v", callback=_note_verbose)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,10 +284,7 @@ class Asking(Filtered, Verbose):
     """Options of commands that answer about topics."""
 
     words: tuple[str, ...] = argument(  # type: ignore[misc]
-        nargs=-1,
-        metavar="[TOPIC]...",
-        shell_complete=complete_topic,
-        help="Topics, as for --topic.",
+        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
     )
 
 
@@ -325,12 +292,11 @@ class Asking(Filtered, Verbose):
 class Running(InStore, Quiet):
     """Options of commands to a recorder."""
 
-    recording: tuple[str, ...] = repeated(
-        "--recording",
-        "-r",
-        metavar="RECORDING",
+    recording: tuple[str, ...] = option(
+        "Only this recorder (id or name of its recording, or the beginning of the id).",
+        "RECORDING",
+        short="-r",
         shell_complete=complete_running,
-        help="Only this recorder (id or name of its recording, or the beginning of the id).",
     )
 
 
@@ -338,13 +304,11 @@ class Running(InStore, Quiet):
 class Latched:
     """Options about messages from before a slice."""
 
-    no_latched: bool = flag(
-        "--no-latched",
-        help="With --between: leave out the latched messages and frames of video from before it.",
+    no_latched: bool = option(
+        "With --between: leave out the latched messages and frames of video from before it."
     )
-    original_times: bool = flag(
-        "--original-times",
-        help="Latched messages and frames from before the time range keep their log time.",
+    original_times: bool = option(
+        "Latched messages and frames from before the time range keep their log time."
     )
 
 
@@ -353,60 +317,48 @@ class Slices(Latched, Forced):
     """Options of commands that write slices of logs, or tables."""
 
     split: str | None = option(
-        "--split-by",
-        metavar="HOW",
-        help="A file for each `recording`, each `mark`, or each interval in which a predicate "
+        "A file for each `recording`, each `mark`, or each interval in which a predicate "
         "holds: 'odom: twist.twist.linear.x > 0.1'. Their names follow that of the output.",
+        "HOW",
+        name="--split-by",
     )
-    tags: str | None = option(
-        "--tags",
-        metavar="A,B",
-        help="Tags of the recordings as columns, with commas between them.",
-    )
+    tags: str | None = option("Tags of the recordings as columns, with commas between them.", "A,B")
     storage: str | None = option(
-        "--storage",
+        "For rosbag2: the storage of the bag; without, mcap.",
         type=click.Choice(["mcap", "sqlite3"]),
-        help="For rosbag2: the storage of the bag; without, mcap.",
     )
     file_size: str | None = option(
-        "--file-size",
-        metavar="SIZE",
-        help="For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, "
-        "2GiB.",
+        "For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
+        "SIZE",
     )
 
 
-def one_recording(**settings: Any) -> Any:
+def one_recording(
+    what: str = "A recording: label, name, or the beginning of its id.",
+    metavar: str = "RECORDING",
+) -> Any:
     """The argument that names one recording."""
-    return argument(
-        **{
-            "metavar": "RECORDING",
-            "shell_complete": complete_recording,
-            "help": "A recording: label, name, or the beginning of its id.",
-            **settings,
-        }
-    )
+    return argument(what, metavar, shell_complete=complete_recording)
 
 
 def in_frame() -> Any:
     """The option for points and poses in another frame."""
     return option(
-        "--in-frame",
-        metavar="FRAME",
-        help="Points and poses in this frame, such as map, at the times of their headers.",
+        "Points and poses in this frame, such as map, at the times of their headers.",
+        "FRAME",
+        name="--in-frame",
     )
 
 
 def cache_size() -> Any:
     """The option of commands that start the embedded MongoDB for long."""
     return option(
-        "--cache-size",
-        type=int,
+        "Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
+        "made with, or 256.",
+        "MB",
+        name="--cache-size",
         envvar="HYBRIDLOG_CACHE_SIZE",
         show_envvar=True,
-        metavar="MB",
-        help="Size of the embedded MongoDB's cache, from 256; without, the one that the store was "
-        "made with, or 256.",
     )
 
 

@@ -91,18 +91,45 @@ def _print_on_screen(
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=headings)
     # The same columns as those of the rows above, unless they are folded.
-    is_folded = sum(widths) + 2 * len(widths) > console().width
-    for (heading, side), width in zip(columns, widths, strict=True):
+    shared: Sequence[int | None] = widths_within(columns, rows, widths) or [None] * len(widths)
+    for (heading, side), width in zip(columns, shared, strict=True):
         table.add_column(
             Text(heading),
             justify="right" if side == "right" else "left",
             no_wrap=side != "left",
             overflow="fold",
-            min_width=None if is_folded else width,
+            min_width=width,
+            max_width=width,
         )
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console().print(table)
+
+
+def widths_within(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], widths: Sequence[int]
+) -> list[int] | None:
+    """Widths in which a table fits the screen without a broken word; None if there are none.
+
+    Args:
+        columns: Headings, and the side on which the cells stand.
+        rows: Cells.
+        widths: Widths in which no cell is folded.
+    """
+    least = [
+        max(map(len, " ".join([heading, *cells]).split()), default=0) if side == "left" else width
+        for (heading, side), width, cells in zip(
+            columns, widths, zip(*rows, strict=True) if rows else [()] * len(widths), strict=True
+        )
+    ]
+    found, spare = list(widths), console().width - 2 * (len(widths) - 1) - sum(widths)
+    while spare < 0:
+        place = max(range(len(found)), key=lambda n: (found[n] > least[n], found[n]))
+        if found[place] <= least[place]:
+            return None
+        found[place] -= 1
+        spare += 1
+    return found
 
 
 def _lines_of(
@@ -159,6 +186,24 @@ def room(names: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     """
     widths = [max(map(len, cells)) for cells in zip_longest(names, *rows, fillvalue="")]
     return console().width - sum(widths) - 2 * len(widths)
+
+
+def print_rows(columns: Sequence[Column], rows: Sequence[Sequence[str]], titles: int) -> None:
+    """Print a table, or a block for each row where the screen would break words of a table.
+
+    Args:
+        columns: Headings, and the side on which the cells stand.
+        rows: Cells.
+        titles: Number of cells that are the title of a block.
+    """
+    widths = [len(heading) for heading, _ in columns]
+    _widen(widths, rows)
+    if not sys.stdout.isatty() or widths_within(columns, rows, widths) is not None:
+        print_table(columns, rows)
+        return
+    for row in rows:
+        named = zip(columns[titles:], row[titles:], strict=True)
+        print_record("  ".join(row[:titles]), [(heading, cell) for (heading, _), cell in named])
 
 
 def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.answers import answering, check_room, not_written
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Asking, Forced, parse_fields
@@ -36,26 +36,21 @@ _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 class _Given(Asking, Forced):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(
-        "--fields",
-        metavar="A,B.C",
-        help="Fields that are numbers (ranges.min, position[2]), or messages with numbers.",
+        "Fields that are numbers (ranges.min, position[2]), or messages with numbers.", "A,B.C"
     )
     output: Path | None = option(
-        "--output",
-        "-o",
-        type=options.PATH,
-        metavar="FILE",
-        help="Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard "
+        "Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard "
         "output. Without: a line of text for each field.",
+        "FILE",
+        short="-o",
     )
     form: str | None = option(
-        "--format", "-F", type=click.Choice(_FORMATS), help="Without: by the suffix of -o."
+        "Without: by the suffix of -o.", name="--format", short="-F", type=click.Choice(_FORMATS)
     )
     size: str | None = option(
-        "--size",
-        metavar="WxH",
-        help=f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each "
+        f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each "
         "further topic.",
+        "WxH",
     )
 
 

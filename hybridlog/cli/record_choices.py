@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, flag, option, repeated
+from hybridlog.cli.binder import argument, option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import (
-    PATH,
     AsJson,
     Between,
     InStore,
@@ -54,196 +53,120 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     """
 
     paths: tuple[Path, ...] = argument(
-        nargs=-1,
-        type=PATH,
-        metavar="[PATH]...",
-        help="ROS 1 bags, ROS 2 bags (files or directories), MCAP files, and directories with any "
+        "ROS 1 bags, ROS 2 bags (files or directories), MCAP files, and directories with any "
         "of them.",
+        "[PATH]...",
     )
-    topics: tuple[str, ...] = repeated(
-        "--topics",
-        "-t",
-        metavar="TOPIC",
-        help="Only these: name, glob, or re:REGEX.",
+    topics: tuple[str, ...] = option("Only these: name, glob, or re:REGEX.", "TOPIC", short="-t")
+    exclude: tuple[str, ...] = option("Not these.", "TOPIC", short="-x")
+    no_index: tuple[str, ...] = option(
+        "No documents in MongoDB for these: questions about them read tables.", "TOPIC"
     )
-    exclude: tuple[str, ...] = repeated("--exclude", "-x", metavar="TOPIC", help="Not these.")
-    no_index: tuple[str, ...] = repeated(
-        "--no-index",
-        metavar="TOPIC",
-        help="No documents in MongoDB for these: questions about them read tables.",
-    )
-    name: str | None = option(
-        "--name", metavar="NAME", help="Name of the recording; without, the file's."
-    )
-    again: bool = flag("--again", help="Record it even if its content is in the store.")
-    watch: bool = flag(
-        "--watch",
-        help="Go on recording logs that come into the directories, when they are complete, until "
-        "Ctrl-C.",
+    name: str | None = option("Name of the recording; without, the file's.", "NAME")
+    again: bool = option("Record it even if its content is in the store.")
+    watch: bool = option(
+        "Go on recording logs that come into the directories, when they are complete, until Ctrl-C."
     )
     settle: str = option(
-        "--settle",
+        "With --watch: a file that does not say so is complete when unchanged for this time.",
+        "TIME",
         default="60s",
-        metavar="TIME",
-        help="With --watch: a file that does not say so is complete when unchanged for this time.",
     )
     chunk_size: str | None = option(
-        "--chunk-size",
-        metavar="SIZE",
-        help="Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
+        "Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
         "small.",
+        "SIZE",
     )
     compression: str = option(
-        "--compression",
-        type=click.Choice(["zstd", "lz4", "none"]),
-        default="zstd",
-        help="Compression of chunks.",
+        "Compression of chunks.", type=click.Choice(["zstd", "lz4", "none"]), default="zstd"
     )
-    level: int = option(
-        "--level", type=click.IntRange(1, 19), default=3, metavar="N", help="zstd level, 1 to 19."
+    level: int = option("zstd level, 1 to 19.", "N", type=click.IntRange(1, 19), default=3)
+    ros1: bool = option(
+        "Record a running ROS 1 robot; the URI of a master may follow, else ROS_MASTER_URI "
+        "names it."
     )
-    ros1: bool = flag(
-        "--ros1",
-        help="Record a running ROS 1 robot; the URI of a master may follow, else ROS_MASTER_URI "
-        "names it.",
-    )
-    master: str | None = option("--master", metavar="URI", help="The ROS 1 master.")
-    ros2: bool = flag("--ros2", help="Record a running ROS 2 robot; needs rclpy.")
+    master: str | None = option("The ROS 1 master.", "URI")
+    ros2: bool = option("Record a running ROS 2 robot; needs rclpy.")
     qos: Path | None = option(
-        "--qos",
-        type=PATH,
-        metavar="FILE",
-        help="With --ros2: YAML file of QoS overrides, as for rosbag2.",
+        "With --ros2: YAML file of QoS overrides, as for rosbag2.",
+        "FILE",
         kind=LiveOption,
     )
-    foxglove: str | None = option(
-        "--foxglove", metavar="URL", help="Record what a Foxglove WebSocket server sends."
-    )
-    replay: Path | None = option(
-        "--replay",
-        type=PATH,
-        metavar="FILE",
-        help="Play a log at the speed of a robot, and record that.",
-    )
+    foxglove: str | None = option("Record what a Foxglove WebSocket server sends.", "URL")
+    replay: Path | None = option("Play a log at the speed of a robot, and record that.", "FILE")
     speed: float = option(
-        "--speed",
+        "With --replay: N times as fast.",
+        "N",
         type=click.FloatRange(min=0.01),
         default=1.0,
-        metavar="N",
-        help="With --replay: N times as fast.",
         kind=LiveOption,
     )
-    duration: str | None = option(
-        "--duration", metavar="TIME", help="Stop after this time, such as 10m.", kind=LiveOption
-    )
+    duration: str | None = option("Stop after this time, such as 10m.", "TIME", kind=LiveOption)
     max_messages: int | None = option(
-        "--max-messages",
-        type=click.IntRange(min=1),
-        metavar="N",
-        help="Stop after this number of messages.",
-        kind=LiveOption,
+        "Stop after this number of messages.", "N", type=click.IntRange(min=1), kind=LiveOption
     )
     max_size: str | None = option(
-        "--max-size",
-        metavar="SIZE",
-        help="Stop after this size of payloads, such as 10GB.",
-        kind=LiveOption,
+        "Stop after this size of payloads, such as 10GB.", "SIZE", kind=LiveOption
     )
     split_size: str = option(
-        "--split-size",
-        default="1GiB",
-        metavar="SIZE",
-        help="Start a new segment file after this size.",
-        kind=LiveOption,
+        "Start a new segment file after this size.", "SIZE", default="1GiB", kind=LiveOption
     )
     split_duration: str = option(
-        "--split-duration",
-        default="10m",
-        metavar="TIME",
-        help="Start a new segment file after this time.",
-        kind=LiveOption,
+        "Start a new segment file after this time.", "TIME", default="10m", kind=LiveOption
     )
-    use_sim_time: bool = flag(
-        "--use-sim-time",
-        help="Log times are those of /clock, the time of a simulation.",
-        kind=LiveOption,
+    use_sim_time: bool = option(
+        "Log times are those of /clock, the time of a simulation.", kind=LiveOption
     )
-    throttle: tuple[str, ...] = repeated(
-        "--throttle",
-        metavar="TOPIC RATE",
+    throttle: tuple[str, ...] = option(
+        "At most this rate of messages, such as /camera 5Hz.",
+        "TOPIC RATE",
         shell_complete=complete_topic,
-        help="At most this rate of messages, such as /camera 5Hz.",
         kind=LiveOption,
     )
-    priority: tuple[str, ...] = repeated(
-        "--priority",
-        metavar="TOPIC WORD",
-        shell_complete=complete_topic,
-        help="low, normal or high: when more arrives than can be written, payloads of the lowest "
+    priority: tuple[str, ...] = option(
+        "low, normal or high: when more arrives than can be written, payloads of the lowest "
         "priority are dropped first.",
+        "TOPIC WORD",
+        shell_complete=complete_topic,
         kind=LiveOption,
     )
     budget: str | None = option(
-        "--budget",
-        metavar="SIZE",
-        help="Size of payloads in memory; without, a sixteenth of all memory.",
-        kind=LiveOption,
+        "Size of payloads in memory; without, a sixteenth of all memory.", "SIZE", kind=LiveOption
     )
     reserve: str = option(
-        "--reserve",
-        default="1GB",
-        metavar="SIZE",
-        help="Stop when the disk has less than this free.",
-        kind=LiveOption,
+        "Stop when the disk has less than this free.", "SIZE", default="1GB", kind=LiveOption
     )
     flush_interval: str = option(
-        "--flush-interval",
-        default="1s",
-        metavar="TIME",
-        help="The most that a killed recorder can lose.",
-        kind=LiveOption,
+        "The most that a killed recorder can lose.", "TIME", default="1s", kind=LiveOption
     )
     ring: str | None = option(
-        "--ring",
-        metavar="TIME",
-        help="Hold only the last TIME, in memory, and write it to disk at a trigger: --trigger, "
+        "Hold only the last TIME, in memory, and write it to disk at a trigger: --trigger, "
         "SIGUSR1, or `hybridlog trigger`.",
+        "TIME",
         kind=LiveOption,
     )
-    trigger: tuple[str, ...] = repeated(
-        "--trigger",
-        metavar="TOPIC: PREDICATE",
-        help="With --ring: a message that triggers, such as '/diagnostics: status[*].level >= 2'. ",
+    trigger: tuple[str, ...] = option(
+        "With --ring: a message that triggers, such as '/diagnostics: status[*].level >= 2'. ",
+        "TOPIC: PREDICATE",
         kind=LiveOption,
     )
     before: str | None = option(
-        "--before",
-        metavar="TIME",
-        help="With --ring: time before the trigger; without, all.",
-        kind=LiveOption,
+        "With --ring: time before the trigger; without, all.", "TIME", kind=LiveOption
     )
-    after: str | None = option(
-        "--after", metavar="TIME", help="With --ring: time after the trigger.", kind=LiveOption
-    )
+    after: str | None = option("With --ring: time after the trigger.", "TIME", kind=LiveOption)
     contract: Path | None = option(
-        "--contract",
-        type=PATH,
-        metavar="FILE",
-        help="Tell and mark topics that are silent for longer than the rules in this file allow, "
+        "Tell and mark topics that are silent for longer than the rules in this file allow, "
         "and judge the recording at its end.",
+        "FILE",
         kind=LiveOption,
     )
     on_breach: str | None = option(
-        "--on-breach",
-        metavar="COMMAND",
-        help="With --contract: run this when a topic is silent; topic, rule and seconds follow.",
+        "With --contract: run this when a topic is silent; topic, rule and seconds follow.",
+        "COMMAND",
         kind=LiveOption,
     )
-    shared: bool = flag(
-        "--shared",
-        help="If this makes the store: let the group of its directory write it.",
-    )
-    set_tag: tuple[str, ...] = repeated("--set-tag", metavar="K=V", help="Store KEY=VALUE with it.")
+    shared: bool = option("If this makes the store: let the group of its directory write it.")
+    set_tag: tuple[str, ...] = option("Store KEY=VALUE with it.", "K=V")
     cache_size: int | None = cache_size()
     live_options: tuple[str, ...] = ()
 

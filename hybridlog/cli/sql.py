@@ -15,19 +15,14 @@ from hybridlog.cli.signals import if_stopped
 @dataclass(frozen=True, kw_only=True)
 class _Given(InStore, Tabular, Strict, Quiet):
     query: str | None = argument(
-        metavar="[QUERY]",
-        required=False,
-        help="A query; without, a prompt on a terminal, else standard input.",
+        "A query; without, a prompt on a terminal, else standard input.", "[QUERY]"
     )
     memory: str | None = option(
-        "--memory",
-        metavar="SIZE",
-        help="Memory that the query may use, such as 4GiB; without, 1 GiB. hybridlog takes at "
+        "Memory that the query may use, such as 4GiB; without, 1 GiB. hybridlog takes at "
         "most 512 MiB more for itself.",
+        "SIZE",
     )
-    timeout: str | None = option(
-        "--timeout", metavar="DURATION", help="Stop a query that takes longer."
-    )
+    timeout: str | None = option("Stop a query that takes longer.", "DURATION")
 
 
 @command(_Given)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answer_tables, answering
-from hybridlog.cli.binder import command, flag, option
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Asking, parse_fields
 from hybridlog_storage.errors import UsageError
 
@@ -20,14 +20,10 @@ _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
 @dataclass(frozen=True, kw_only=True)
 class _Given(Asking, Listing):
     fields: str | None = option(
-        "--fields",
-        metavar="A,B.C",
-        help="Only these fields, also summaries and arrays; without, all that are numbers.",
+        "Only these fields, also summaries and arrays; without, all that are numbers.", "A,B.C"
     )
-    rate: bool = flag("--rate", help="Instead: how many messages came in a second.")
-    window: str | None = option(
-        "--window", metavar="DURATION", help="With --rate: a row for each so long, such as 1s."
-    )
+    rate: bool = option("Instead: how many messages came in a second.")
+    window: str | None = option("With --rate: a row for each so long, such as 1s.", "DURATION")
 
     @property
     def needs_topic(self) -> bool:  # type: ignore[override]
@@ -49,8 +45,18 @@ def stats_command(given: _Given) -> None:
         if given.rate:
             asked.is_empty = False
             completeness = asked.query.completeness if given.strict else None
-            rates = [asked.query.rate(given.window)]
-            answer_tables(rates, lambda: None, given.table, completeness)
+            rates = asked.query.rate(given.window)
+            if not given.as_json:
+                answer_tables([rates], lambda: None, given.table, completeness)
+                return
+            if completeness is not None:
+                completeness().check()
+            times = [rates[name].cast("int64").to_pylist() for name in ("begin", "end")]
+            rows = rates.drop_columns(["begin", "end"]).to_pylist()
+            output.print_json_list(
+                {"begin_ns": begin, "end_ns": end, **row}
+                for begin, end, row in zip(*times, rows, strict=True)
+            )
             return
         found = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
         if given.strict:

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Given(Choosing, InStore, AsJson):
     topic: str = argument(
-        metavar="TOPIC",
-        shell_complete=complete_topic,
-        help="Full name, or an unambiguous short one (scan).",
+        "Full name, or an unambiguous short one (scan).", "TOPIC", shell_complete=complete_topic
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
-from hybridlog.cli.binder import argument, command, option, repeated
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_recording, complete_topic
 from hybridlog.cli.options import Between, InStore, Quiet, Strict, Verbose
 from hybridlog.cli.output import notes, print_table, short_duration
@@ -26,35 +26,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _Given(Between, InStore, Tabular, Strict, Quiet, Verbose):
-    target: str | None = argument(
-        required=False, metavar="[TARGET]", help="The frame of the results."
-    )
+    target: str | None = argument("The frame of the results.", "[TARGET]")
     source: str | None = argument(
-        required=False,
-        metavar="[SOURCE]",
-        help="The frame to transform from; with -t, without, that of the topic's messages.",
+        "The frame to transform from; with -t, without, that of the topic's messages.", "[SOURCE]"
     )
-    at: tuple[str, ...] = repeated("--at", metavar="TIME", help="At this time.")
-    step: str | None = option("--step", metavar="DURATION", help="At regular times, such as 100ms.")
+    at: tuple[str, ...] = option("At this time.", "TIME")
+    step: str | None = option("At regular times, such as 100ms.", "DURATION")
     topic: str | None = option(
-        "--topic",
-        "-t",
-        metavar="TOPIC",
+        "At the header stamps of a topic, or the log times of one without.",
+        "TOPIC",
+        short="-t",
         shell_complete=complete_topic,
-        help="At the header stamps of a topic, or the log times of one without.",
     )
     extrapolate: str | None = option(
-        "--extrapolate",
-        metavar="DURATION",
-        help="So long before its first and after its last, a transform holds; without, it does "
-        "not.",
+        "So long before its first and after its last, a transform holds; without, it does not.",
+        "DURATION",
     )
     recording: str | None = option(
-        "--recording",
-        "-r",
-        metavar="RECORDING",
+        "The recording; without, the only one.",
+        "RECORDING",
+        short="-r",
         shell_complete=complete_recording,
-        help="The recording; without, the only one.",
     )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, command, flag, option, repeated
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.live_table import LiveTable, drawn
 from hybridlog.cli.options import AsJson, InStore
@@ -39,22 +39,20 @@ class _Field:
 @dataclass(frozen=True, kw_only=True)
 class _Given(InStore, AsJson):
     recording: str | None = argument(
-        required=False,
-        metavar="[RECORDING]",
+        "One of several recorders: id or name of its recording, or the beginning of the id.",
+        "[RECORDING]",
         shell_complete=complete_running,
-        help="One of several recorders: id or name of its recording, or the beginning of the id.",
     )
-    field: tuple[str, ...] = repeated(
-        "--field",
-        metavar="TOPIC:FIELD",
+    field: tuple[str, ...] = option(
+        "Least, mean and greatest of a field in the last seconds, such as scan:ranges.min.",
+        "TOPIC:FIELD",
         shell_complete=complete_field,
-        help="Least, mean and greatest of a field in the last seconds, such as scan:ranges.min.",
     )
     window: str = option(
-        "--last", default="5s", metavar="TIME", help="The time that --field covers, up to now."
+        "The time that --field covers, up to now.", "TIME", name="--last", default="5s"
     )
-    once: bool = flag("--once", help="Show it once and end.")
-    as_json: bool = flag("--json", help="A line of JSON a second, for scripts.")
+    once: bool = option("Show it once and end.")
+    as_json: bool = option("A line of JSON a second, for scripts.", name="--json")
 
 
 @command(_Given)

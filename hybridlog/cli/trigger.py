@@ -12,7 +12,7 @@ from hybridlog_storage.errors import UsageError
 
 @dataclass(frozen=True, kw_only=True)
 class _Given(Running):
-    name: str = argument(metavar="NAME", help="The reason, in a word.")
+    name: str = argument("The reason, in a word.", "NAME")
 
 
 @command(_Given)

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import command, flag, option, repeated
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, InStore, one_recording
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 
@@ -21,24 +21,21 @@ _MAX_FOLDERS = 1000
 @dataclass(frozen=True, kw_only=True)
 class _Given(InStore, AsJson):
     recording: str | None = one_recording(
-        required=False,
-        metavar="[RECORDING]",
-        help="Show this one first; without, the list of recordings.",
+        "Show this one first; without, the list of recordings.", "[RECORDING]"
     )
     port: int = option(
-        "--port",
+        "Port of 127.0.0.1 to serve on.",
         type=click.IntRange(0, 65535),
         default=0,
         show_default="any free one",
-        help="Port of 127.0.0.1 to serve on.",
     )
-    opens: bool = flag("--open", help="Open the page in the browser.")
-    mcap: bool = flag("--mcap", help="Also serve selections as MCAP, to Foxglove and Lichtblick.")
-    origins: tuple[str, ...] = repeated(
-        "--allow-origin",
-        metavar="URL",
-        help="With --mcap: let web pages of this origin read them, such as "
+    opens: bool = option("Open the page in the browser.", name="--open")
+    mcap: bool = option("Also serve selections as MCAP, to Foxglove and Lichtblick.")
+    origins: tuple[str, ...] = option(
+        "With --mcap: let web pages of this origin read them, such as "
         "http://localhost:8080; those of Foxglove may.",
+        "URL",
+        name="--allow-origin",
     )
 
 

@@ -13,10 +13,11 @@ from typing import cast
 import click
 import pytest
 
-from hybridlog.cli import options
 from hybridlog.cli.app import COMMANDS, GROUPS, MOVED, app
+from hybridlog.cli.binder import PATH
 from hybridlog.cli.installed import NEEDED_FOR
 from hybridlog.cli.main import EXIT_CODES
+from tests.json_schemas import misfit, schema_of, schemas
 
 from .running import COMMAND, complete, environment, run
 
@@ -60,7 +61,8 @@ def test_help_imports_little() -> None:
 
 def test_looking_imports_no_table_libraries(store: Path) -> None:
     for command in (("ls",), ("info", "robot")):
-        assert not packages_of(*command, "--store", store) & {"pandas", "pyarrow", "rosbags"}
+        unneeded = {"pandas", "pyarrow", "pymongo", "rosbags"}
+        assert not packages_of(*command, "--store", store) & unneeded
 
 
 def test_help_names_commands_and_exit_codes() -> None:
@@ -192,9 +194,9 @@ def test_paths_are_checked_by_the_library() -> None:
     ]
     assert len(paths) > 10
     for name, parameter in paths:
-        assert parameter.type is options.PATH, (name, parameter.name)
-    assert not options.PATH.exists
-    assert not options.PATH.readable
+        assert parameter.type is PATH, (name, parameter.name)
+    assert not PATH.exists
+    assert not PATH.readable
 
 
 def test_mistyped_names_get_suggestions() -> None:
@@ -305,6 +307,17 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
         ("info", "-t", "scan"),
         ("intervals", "-t", "scan", "-r", "robot", "--where", "ranges.min < 1"),
         ("intervals", "scan", "-r", "robot", "--changes", "ranges.min"),
+        ("intervals", "scan", "--gaps"),
+        ("stats", "scan", "--rate"),
+        ("stats", "scan", "-r", "robot"),
+        ("check", "-r", "robot"),
+        ("diff", "robot", "torn"),
+        ("tables", "scan"),
+        ("info", "--sizes", "both"),
+        ("info", "--attachments"),
+        ("compact", "--dry-run"),
+        ("keep", "--max-age", "9y", "--dry-run"),
+        ("index", "address"),
         ("index", "list"),
         ("verify", "robot"),
         ("repair", "robot"),
@@ -313,8 +326,21 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
     ids=" ".join,
 )
 def test_json_is_all_that_is_on_standard_output(arguments: tuple[str, ...], store: Path) -> None:
-    done = run(*arguments, "--json", store=store)
-    assert isinstance(done.json, dict | list)
+    done = run(*arguments, "--json", store=store, code=12 if arguments[0] == "diff" else 0)
+    assert not misfit(done.json, schema_of(arguments))
+
+
+def test_every_command_with_json_has_a_schema() -> None:
+    have = {
+        name
+        for name, command in commands().items()
+        if any(parameter.name == "as_json" for parameter in command.params)
+    }
+    assert have - {"record", "top"} <= {name.split()[0] for name in schemas()}
+    (group,) = [one for one in commands().values() if isinstance(one, click.Group)]
+    for name, one in group.commands.items():
+        if any(parameter.name == "as_json" for parameter in one.params):
+            assert schema_of(["index", name])
 
 
 def test_a_terminal_encoding_without_a_character_is_no_error(store: Path) -> None:

@@ -123,6 +123,14 @@ def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
         assert "\x07" not in shown
 
 
+def test_no_word_is_broken_at_eighty_columns(store: Path) -> None:
+    rows = run("diff", "robot", "torn", "--json", store=store, code=12).json
+    code, shown = on_terminal("diff", "robot", "torn", "--store", store, width=80)
+    assert code == 12
+    words = {word for row in rows for word in (row["topic"], *row["what"].split())}
+    assert words - {""} <= {*plain(shown).split()}
+
+
 def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
     topics = {one["topic"] for one in run("check", "-r", "robot", "--json", store=store).json}
     for command in (("info", "robot"), ("check", "-r", "robot")):

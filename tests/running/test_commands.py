@@ -12,6 +12,7 @@ from hybridlog.cli import app, open_store
 from hybridlog_storage.settings import NONE
 from tests.cli.running import run
 from tests.cli.within import Answer, answer
+from tests.json_schemas import misfit, schema_of
 from tests.running.commands import COMMANDS, EXEMPT, Asked, place_for
 from tests.running.methods import LABEL, same
 from tests.running.running import Running, begun
@@ -68,6 +69,8 @@ def test_at_rest(
     done = answer(*words, store=running.path, code=one.code)
     found, wanted = one.read(done, out), one.right(running.flushed())
     assert same(found, wanted), (found, wanted, done.err)
+    if "--json" in words:
+        assert not misfit(done.json, schema_of(words))
 
 
 @asked_in_turn([rules[0] for rules in COMMANDS.values()])
