@@ -22,6 +22,7 @@ from hybridlog_storage.errors import (
     BucketError,
     HybridlogError,
     ObjectExistsError,
+    ResourceError,
     StoreError,
     UsageError,
 )
@@ -295,6 +296,9 @@ def test_the_cache_heals_and_is_bounded(published: str, proxy: Proxy, tmp_path: 
     assert files.pread(again, about.size, 0) == whole
     assert not [*(tmp_path / "blocks").glob("*.data")]
     assert files.pread(handle, about.size, 0) == whole
+    (tmp_path / "file").touch()
+    with pytest.raises(ResourceError, match="XDG_CACHE_HOME"):
+        BlockCache(tmp_path / "file").open(bucket, about)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")

@@ -14,14 +14,14 @@ import os
 import struct
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 from weakref import WeakValueDictionary
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.user_directories import user_directory
-from hybridlog_storage.errors import BucketError
+from hybridlog_storage.errors import BucketError, ResourceError
 from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.remote.bucket import Bucket, Object, joined_ranges
 
@@ -103,6 +103,7 @@ class Blocks:
 
         Raises:
             BucketError: The server does not answer, or has another version of the object.
+            ResourceError: The cache cannot be written.
         """
         size = self.about.size
         wanted: set[int] = set()
@@ -118,7 +119,8 @@ class Blocks:
                 self._inode, self._proved = inode, set()
             wanted -= self._proved
             if wanted:
-                self._fetch(fd, sorted(wanted))
+                with self._cache.writing():
+                    self._fetch(fd, sorted(wanted))
 
     def _fetch(self, fd: int, wanted: list[int]) -> None:
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
@@ -193,15 +195,27 @@ class BlockCache:
         """A handle of the cached file of an object.
 
         Raises:
-            OSError: The file cannot be made.
+            ResourceError: The file cannot be made.
         """
-        self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
         with self._lock:
             key = bucket.address, about
             blocks = self._known.get(key)
             if blocks is None:
                 blocks = self._known[key] = Blocks(self, bucket, about)
-        return blocks.open()
+        with self.writing():
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            return blocks.open()
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Name the cure if the cache cannot be written: no object is damaged by that."""
+        try:
+            yield
+        except OSError as error:
+            raise ResourceError(
+                f"The cache {self.path} cannot be written: {error.strerror}. Make room there, or "
+                "set XDG_CACHE_HOME to another directory."
+            ) from error
 
     def added(self, size: int) -> None:
         """Count fetched bytes, and make room now and then."""

@@ -165,7 +165,7 @@ class Bucket:
         begin, end = wanted
         if begin == end:
             return b""
-        _, data = self._get(name, {"range": (begin, end)}, version)
+        _, data = self._get(name, {"range": (begin, end)}, version, end - begin)
         if len(data) != end - begin:
             raise ObjectChangedError(f"{self._place(name)} is shorter than it was.")
         return data
@@ -180,7 +180,7 @@ class Bucket:
         return self._get(name, {}, None, most)
 
     def _get(
-        self, name: str, options: dict[str, Any], version: str | None, most: int | None = None
+        self, name: str, options: dict[str, Any], version: str | None, most: int
     ) -> tuple[Object, bytes]:
         import obstore
 
@@ -438,9 +438,7 @@ def _allows_http() -> bool:
     return any(os.environ.get(name, "").lower() in {"1", "true"} for name in names)
 
 
-def _content(answer: GetResult, most: int | None) -> bytes:
-    if most is None:
-        return bytes(answer.bytes())
+def _content(answer: GetResult, most: int) -> bytes:
     found = bytearray()
     for piece in answer.stream(1 << 20):
         found += piece

@@ -82,7 +82,7 @@ class BucketFiles:
         self._settings: bytes | None = None
         self._looked_at = 0.0
         self._tables: tuple[Mapping[str, Object], _Node] = {}, {}  # of a list, and as folders
-        self.lock = threading.RLock()
+        self.lock = taken_by_forks(threading.RLock())
         self.is_changing = False
 
     # Lists.
@@ -119,7 +119,7 @@ class BucketFiles:
         """
         place = f"{self.bucket.address}/{about.name}"
         number = number_of(about.name)
-        if number is None or about.size > MAX_LIST:
+        if number is None:
             raise StoreError(f"{place} is no list.")
         return StoreList.from_bytes(store, number, self._content([about]), place)
 
@@ -174,6 +174,8 @@ class BucketFiles:
 
     def _content(self, objects: Sequence[Object]) -> bytes:
         """Small objects, one behind the other."""
+        if sum(one.size for one in objects) > MAX_LIST:
+            raise StoreError(f"{self.bucket.address}/{objects[0].name} is too large.")
         parts = []
         for one in objects:
             handle = self._cache.open(self.bucket, one)
