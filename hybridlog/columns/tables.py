@@ -320,6 +320,15 @@ class Tables:
         }
         return len(found) == 1
 
+    def sections_of(self, recording: RecordingEntry) -> list[tuple[ColumnFile, int, Section]]:
+        """The files with rows of a recording, the first of these rows, and what they are."""
+        topics = sorted({channel.topic for channel in recording.channels})
+        with self._lock:
+            self._look(recording, topics)
+            known = [rows for topic in topics for rows in self._known_rows(recording, topic)]
+        found = {id(rows): (rows.file, rows.begin, rows.section) for rows in known}
+        return [*found.values()]
+
     def lacking(self, recording: RecordingEntry, topics: Collection[str]) -> set[str]:
         """Topics of which files lack messages, whatever their definitions are."""
         try:

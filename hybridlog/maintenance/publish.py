@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import IN_PAYLOADS, IN_TYPE, SHARED, SUFFIX
 from hybridlog.columns.payload_files import open_file
+from hybridlog.columns.tables import Tables
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.opening import describe_now, open_catalog
 from hybridlog_storage import journal
@@ -44,6 +45,8 @@ def publish(
     entry: RecordingEntry,
     target: RemoteDirectory,
     progress: Progress | None = None,
+    *,
+    tables: Tables | None = None,
 ) -> tuple[str, bool]:
     """Put an ended recording into a store in a bucket.
 
@@ -53,6 +56,7 @@ def publish(
         entry: The recording.
         target: The store in a bucket.
         progress: Called with the bytes that have arrived.
+        tables: The fields in the source, if they are known.
 
     Returns:
         Its label there, and whether it was put there now.
@@ -67,13 +71,13 @@ def publish(
     if label := target.label_of_id(entry.id):
         return label, False
     listed = _bring(source, entry, target, progress)
-    tables = _bring_fields(source, entry, target)
+    fields = _bring_fields(tables or Tables(source.path), entry, target)
     for _ in range(TRIES):
         with suppress(ObjectExistsError), target.changing():
             if label := target.label_of_id(entry.id):  # another process was faster
                 return label, False
             label = target.free_label(entry.label)
-            target.add_recording(label, listed, tables)
+            target.add_recording(label, listed, fields)
             own = open_catalog(target)
             _bring_results(catalog, entry, own)
             described = describe_now(target, own, label)
@@ -153,33 +157,32 @@ def _sent(path: Path, place: str, name: str, target: RemoteDirectory, *, depth: 
 
 
 def _bring_fields(
-    source: StoreDirectory, entry: RecordingEntry, target: RemoteDirectory
+    tables: Tables, entry: RecordingEntry, target: RemoteDirectory
 ) -> Mapping[str, Object]:
     """Create the objects of a recording's fields; each file has no other recording."""
     found: dict[str, Object] = {}
     with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
         root = Path(place)
-        for folder, paths in _fields(source, entry, root).items():
+        for folder, paths in _fields(tables, entry, root).items():
             for number, path in enumerate(paths):
                 name = f"{folder}/{entry.id}-{number}{SUFFIX}"
                 found[name] = _sent(path, TABLES, name, target, depth=IN_TYPE)
     return found
 
 
-def _fields(
-    source: StoreDirectory, entry: RecordingEntry, root: Path
-) -> Mapping[str, Sequence[Path]]:
+def _fields(tables: Tables, entry: RecordingEntry, root: Path) -> Mapping[str, Sequence[Path]]:
     """Files with a recording's fields by folder; of shared ones its rows alone, below `root`."""
     found: dict[str, list[Path]] = {}
-    for reader in files_of(source.path):
-        begin, folder = 0, reader.path.parent.name
-        for section in reader.about.recordings:
-            if section.id == entry.id and not reader.path.name.startswith(SHARED):
-                found.setdefault(folder, []).append(reader.path)
-            elif section.id == entry.id:
-                rows = reader.table().slice(begin, section.rows)
-                TableFolders(root, entry.id).add({folder: Addition(rows, section)})
-            begin += section.rows
+    for file, begin, section in tables.sections_of(entry):
+        folder = file.path.parent.name
+        if not section.segments.items() <= entry.digests.items():
+            continue  # they are of what it was before
+        if not file.path.name.startswith(SHARED):
+            found.setdefault(folder, []).append(file.path)
+            continue
+        with suppress(StoreError):  # what is damaged is left out: messages answer, too
+            rows = file.table().slice(begin, section.rows)
+            TableFolders(root, entry.id).add({folder: Addition(rows, section)})
     for reader in files_of(root):
         found.setdefault(reader.path.parent.name, []).append(reader.path)
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import zlib
@@ -227,6 +228,21 @@ def test_old_objects_are_not_taken_for_own(
     monkeypatch.setattr(bucket_module, "UNLISTED_DAYS", 1)
     with pytest.raises(ObjectExistsError):
         bucket.create("a", b"1")
+
+
+def test_damaged_fields_are_left_out(
+    here: Path, address: str, proxy: Proxy, tmp_path: Path
+) -> None:
+    source = Path(shutil.copytree(here, tmp_path / "source"))
+    shared = [*source.glob("tables/*/shared-*.parquet")]
+    for path in shared:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+    publish_all(source, address, ("short-0", "short-1"))
+    with hl.open(address) as store:
+        assert store.topic("/arm").where("x >= 5").count() == 20
+    assert shared
 
 
 def test_changed_objects_are_an_error(here: Path, address: str, proxy: Proxy) -> None:
