@@ -213,6 +213,12 @@ def test_only_known_packages_are_imported() -> None:
         assert not wrong, f"say in ALLOWED where these belong: {_places(name, wrong)}"
 
 
+def test_nothing_needs_pandas_by_the_way() -> None:
+    """Commands load no pandas, which `to_pandas_dtype` imports in pyarrow before 26."""
+    for path in sorted((ROOT / "hybridlog").rglob("*.py")):
+        assert ".to_pandas_dtype" not in path.read_text("utf-8"), path
+
+
 # rclpy belongs to the robot's own environment: the process that imports it runs there.
 @pytest.mark.parametrize(
     "package", sorted({*ALLOWED, "numpy"} - {*sys.stdlib_module_names, "rclpy"})

@@ -52,6 +52,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")])
 SHOWN = [ROOT / "README.md", *sorted([*DOCS.glob("*.md"), *DOCS.glob("*.ipynb")])]
+TUTORIAL = DOCS / "tutorial.md"
+"""It goes on where the README ends."""
 # A terminal of this many columns.
 COLUMNS = 150
 START_NS = 1_748_937_600_000_000_000
@@ -323,7 +325,8 @@ def take(page: Path, directory: Path, bag: Path) -> Iterator[tuple[Step, int, st
     try:
         with elsewhere(directory, page) as uri:
             shell.setenv("MONGO_URI", uri)
-            for step in steps(page):
+            before = steps(ROOT / "README.md") if page == TUTORIAL else []
+            for step in [*before, *steps(page)]:
                 if step.kind == "shell":
                     yield step, *shell.run(step.text)
                 else:
@@ -376,6 +379,16 @@ def troubles(
 def test_what_is_shown_runs(page: Path, troubles: dict[Path, Future[str]]) -> None:
     found = troubles[page].result()
     assert not found, found
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
+def test_a_page_disturbs_no_other(page: Path) -> None:
+    """All pages can be taken after the README: each but the tutorial has its own directory."""
+    commands = [step.text for step in steps(page) if step.kind == "shell"]
+    uses = [text for text in commands if "hybridlog-demo" in text]
+    if page.parent == DOCS and page != TUTORIAL:
+        assert all(text.startswith(f"mkdir -p {page.stem} && ln ") for text in uses)
+        assert uses or "robot.bag" not in " ".join(commands)
 
 
 def test_the_skeleton_keeps_words_and_drops_numbers() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import numbers
-from hybridlog.schema.arrow_types import is_number
+from hybridlog.schema.arrow_types import is_number, numpy_type
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -96,7 +96,7 @@ def _like(
         if column.null_count:
             missing |= column.is_null().to_numpy()
     kind = before.type if _types.is_floating(before.type) else pa.float64()
-    found = values.astype(kind.to_pandas_dtype())
+    found = values.astype(numpy_type(kind))
     return pa.array(found, kind, mask=missing) if missing.any() else numbers(found)
 
 

@@ -29,7 +29,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.formats.writing import FileWriter, Sink, Target, failures
-from hybridlog.schema.arrow_types import converted, is_bytes, is_list, is_numeric, is_text, is_time
+from hybridlog.schema.arrow_types import (
+    converted,
+    is_bytes,
+    is_list,
+    is_numeric,
+    is_text,
+    is_time,
+    numpy_type,
+)
 from hybridlog_storage.disk.unfinished import scratch_directory
 from hybridlog_storage.errors import UsageError
 
@@ -229,7 +237,7 @@ class _Column:
 class _Numbers(_Column):
     def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
         super().__init__(name, kind, spools)
-        self._spool = _Spool(name, _dtype(kind), spools)
+        self._spool = _Spool(name, numpy_type(kind), spools)
 
     def _append(self, array: pa.Array) -> None:
         if array.null_count:
@@ -330,7 +338,7 @@ class _FixedLists(_Column):
     def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
         super().__init__(name, kind, spools)
         self._size = kind.list_size
-        self._spool = _Spool(name, _dtype(kind.value_type), spools)
+        self._spool = _Spool(name, numpy_type(kind.value_type), spools)
         self._rows = 0
 
     def _append(self, array: pa.Array) -> None:
@@ -409,11 +417,6 @@ def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
     raise UsageError(
         f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
     )
-
-
-def _dtype(kind: pa.DataType) -> np.dtype[Any]:
-    dtype: np.dtype[Any] = np.dtype(kind.to_pandas_dtype())
-    return dtype
 
 
 def _filler(kind: pa.DataType) -> pa.Scalar:

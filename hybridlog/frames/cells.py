@@ -60,7 +60,9 @@ def _forms(
 
 def _exact(value: pa.Scalar) -> str:
     """The shortest digits that give a number back in its type."""
-    return str(value.type.to_pandas_dtype()(value.as_py())).removesuffix(".0")
+    from hybridlog.schema.arrow_types import numpy_type
+
+    return str(numpy_type(value.type).type(value.as_py())).removesuffix(".0")
 
 
 def _time(value: pa.Scalar) -> str:

@@ -81,6 +81,12 @@ def is_numeric(kind: pa.DataType) -> bool:
     return is_number(kind) or bool(_types.is_boolean(kind))
 
 
+def numpy_type(kind: pa.DataType) -> np.dtype[Any]:
+    """The type of its values in numpy; `to_pandas_dtype` would need pandas in older pyarrow."""
+    dtype: np.dtype[Any] = pa.array([], kind).to_numpy(zero_copy_only=False).dtype
+    return dtype
+
+
 def is_summary(kind: pa.DataType) -> bool:
     """True for the type of a summary of an array."""
     return bool(_types.is_struct(kind)) and tuple(f.name for f in kind) in _SUMMARIES
