@@ -11,13 +11,14 @@ import os
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.columns.layout import PAYLOAD_PARTS
+from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
@@ -28,7 +29,8 @@ from hybridlog_storage.catalog import (
     channel_totals,
 )
 from hybridlog_storage.disk.directory import PAYLOADS
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.journal import PayloadFile
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
-    from hybridlog_storage.journal import JournalState, PayloadFile, SealedSegment
+    from hybridlog_storage.journal import JournalState, SealedSegment
     from hybridlog_storage.segments.chunk_table import ChunkTable
 
     Stamps = Callable[[RecordingEntry, int, ChunkTable], NDArray[Any] | None]
@@ -94,6 +96,8 @@ class Inventory:
             summaries have the digest of the segment as it was before.
         misfits: Files that differ from the journal.
         lost: Listed segments that are missing or changed.
+        joined: Joined files of fields that a lost journal has listed.
+        replaced: Files that these were joined of.
     """
 
     label: str
@@ -103,6 +107,8 @@ class Inventory:
     stored: dict[int, tuple[str, int]] = field(default_factory=dict)
     misfits: list[Misfit] = field(default_factory=list)
     lost: list[SealedSegment] = field(default_factory=list)
+    joined: dict[str, PayloadFile] = field(default_factory=dict)
+    replaced: dict[str, PayloadFile] = field(default_factory=dict)
 
     @property
     def id(self) -> str:
@@ -119,10 +125,10 @@ class Inventory:
         for summary in self.summaries.values():
             files = (summary.compacted or {}).get("files", ())
             found.update({file.file: file for file in files})
-        if self.state is None:
-            return found
-        found = {path: file for path, file in found.items() if path not in self.state.deleted}
-        return found | self.state.payloads
+        if self.state is not None:
+            found = {path: file for path, file in found.items() if path not in self.state.deleted}
+            found |= self.state.payloads
+        return {path: f for path, f in found.items() if path not in self.replaced} | self.joined
 
     def stored_file(self, number: int) -> tuple[str, int]:
         """Digest and size of the file of a valid segment."""
@@ -160,12 +166,16 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
     found = Inventory(label, listing, state)
     listed = state.sealed if state is not None else {}
     numbers = {sealed.digest: number for number, sealed in listed.items()}
+    unmarked = state.unmarked if state is not None else set()
     for number, name in listing.sealed.items():
+        if number in unmarked:
+            continue  # it is about to be removed
         try:
             found.summaries[number] = read_summary(path / name, number)
         except SegmentError as error:
             found.misfits.append(Misfit(number, name, str(error)))
     recording = found.id
+    _find_joined(found, path / PAYLOADS)
     for number, summary in list(found.summaries.items()):
         name = listing.sealed[number]
         problem = _difference(found, summary, number, recording)
@@ -184,6 +194,25 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
                 found.misfits.append(Misfit(number, "", f"{sealed.file} is missing"))
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
+
+
+def _find_joined(inventory: Inventory, folder: Path) -> None:
+    """Find what took the place of files of fields that are missing; the journal may be lost."""
+    listed, there = inventory.payloads, inventory.listing.payloads
+    if all(path in there for path, file in listed.items() if file.has_fields):
+        return
+    from hybridlog.columns.column_file import ColumnFile
+
+    for path in there.keys() - listed.keys():
+        with suppress(StoreError, FileNotFoundError, LookupError, ValueError, TypeError):
+            file = ColumnFile(folder / path, depth=IN_PAYLOADS)
+            (section,) = file.about.recordings
+            ((topic, counts),) = section.topics.items()
+            replaced = {*file.about.payloads["replaces"]} & listed.keys()
+            if section.id == inventory.id and replaced:
+                about = PayloadFile(path, file.size_bytes, file.digest, topic, counts.rows)
+                inventory.joined[path] = about
+                inventory.replaced |= {one: listed[one] for one in replaced}
 
 
 def _difference(
@@ -536,12 +565,18 @@ def unlisted_lines(inventory: Inventory) -> list[journal.Event]:
 
 
 def _compacted_lines(inventory: Inventory) -> list[journal.Event]:
-    files = [asdict(file) for file in inventory.payloads.values()]
+    replaced = inventory.replaced
+    files = [asdict(file) for file in (*replaced.values(), *inventory.payloads.values())]
     segments = [
         {"segment": number, "digest": digest, "bytes": size}
         for number, (digest, size) in inventory.stored.items()
     ]
-    return [journal.event(journal.COMPACTED, files=files, segments=segments)] if files else []
+    lines: list[journal.Event] = []
+    if files:
+        lines.append(journal.event(journal.COMPACTED, files=files, segments=segments))
+    if replaced:
+        lines.append(journal.event(journal.EXPIRED, deleted=[*replaced]))
+    return lines
 
 
 def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:

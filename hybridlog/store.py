@@ -1401,6 +1401,28 @@ class Store:
         self.session.catch_up(entry.id)
         return self.entry(entry.id)
 
+    def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
+        """Remove marks of a recording that were set after its end.
+
+        Args:
+            recording: Label, name, or id.
+            note: Text of the marks.
+            moment: Log time, as for `Query.between`; None for any.
+
+        Raises:
+            TimeError: `moment` is invalid.
+            UsageError: There is no such mark.
+        """
+        from hybridlog.maintenance import edit
+
+        self.session.catch_up()
+        (entry,) = self.select([recording])
+        start, end = extent_of(entry)
+        time = None if moment is None else parse_time(moment, start=start, end=end)
+        edit.unmark(self.directory, self.catalog, entry, time, text=text(note))
+        self.session.catch_up(entry.id)
+        return self.entry(entry.id)
+
     def import_from(
         self,
         other: str | Path,

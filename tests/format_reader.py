@@ -145,6 +145,7 @@ _KEYS: dict[str, dict[str, type]] = {
     "tagged": {"key": str, "value": str},
     "untagged": {"key": str},
     "noted": {"at": int, "text": str},
+    "unmarked": {"segment": int},
     "marked": {"time": int, "text": str, "tags": dict, "segment": int},
     "adopted": {"store": str},
     "removing": {},
@@ -219,6 +220,9 @@ class Journal:
                 self.notes.append((line["at"], line["text"]))
             case "marked":
                 self.marks.append(line)
+            case "unmarked":
+                self.marks = [m for m in self.marks if m["segment"] != line["segment"]]
+                self.sealed.pop(line["segment"])
             case "adopted":
                 self.store = line["store"]
             case "compacted" | "expired":

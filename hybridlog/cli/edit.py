@@ -125,6 +125,9 @@ class _Mark(Running):
         "Mark a recording that has ended, at this time, written as for --between.", "T"
     )
     until: str | None = option("The mark lasts from --at to this time.", "T2")
+    remove: bool = option(
+        "Remove what --at has set with this text; with --at only what begins at this time."
+    )
 
 
 @command(_Mark)
@@ -139,6 +142,12 @@ def mark_command(given: _Mark) -> None:
         raise UsageError("A mark needs a text: say what happened.")
     if given.until is not None and at is None:
         raise UsageError("--until ends a mark that begins at a time: add --at.")
+    if given.remove:
+        if len(given.recording) != 1 or tags or given.until is not None:
+            raise UsageError("--remove needs --recording, one, and takes --at besides.")
+        with given.opened() as store:
+            store.unmark(given.recording[0], given.text, at)
+        return
     if at is None:
         labels = _mark_running(given.text, tags, given.recording, given.store)
     elif len(given.recording) == 1:

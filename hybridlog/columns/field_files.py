@@ -63,10 +63,12 @@ class FieldColumns:
         self._codec = codec_for(channel)
         self._is_reduced = state_of(channel.message_encoding) is State.REDUCED
         self._shape = FieldShape()
+        self.replaces: Sequence[str] = ()
+        """Paths of the files whose rows the new one has, if there are any."""
 
     def about(self, layout: object) -> dict[str, Any]:
         """Further metadata of a file."""
-        return {}
+        return {"replaces": [*self.replaces]} if self.replaces else {}
 
     def piece(
         self, chunk: StoredChunk, rows: NDArray[np.intp], has_publish_time: Mapping[int, bool]
@@ -110,7 +112,17 @@ class FieldColumns:
 
 
 class FieldFile(ChunkFile):
-    """One file with what is left of the expired messages of a topic. Thread safe."""
+    """One file with what is left of the expired messages of a topic. Thread safe.
+
+    Attributes:
+        replaces: Paths of the files that it was joined of.
+    """
+
+    replaces: frozenset[str] = frozenset()
+
+    def _take(self, values: Mapping[str, Any]) -> None:
+        super()._take(values)
+        self.replaces = frozenset(map(str, values.get("replaces", ())))
 
     def rows(self, segment: int, chunk: int) -> pa.StructArray:
         """The rows of a chunk; a struct has all columns.

@@ -38,6 +38,12 @@ THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 _REBUILT_BYTES: Final = 32 << 20  # messages in memory: neighbouring chunks share a row group
 
 
+def next_number(state: JournalState) -> int:
+    """The least number that no file of columns of a recording has had."""
+    names = (name.rpartition("-")[2] for name in state.payloads.keys() | state.deleted)
+    return 1 + max((int(name.partition(".")[0]) for name in names), default=-1)
+
+
 def publish(recording: Path, state: JournalState | None) -> None:
     """Give finished files their names, remove the folder of unfinished files, and deleted ones.
 

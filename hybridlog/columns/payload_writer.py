@@ -98,7 +98,7 @@ class TopicWriter:
     ) -> None:
         self._folder = folder
         self._recording = recording
-        self._channel = channel
+        self.channel = channel
         self.columns = columns
         self._number = number
         self._open: dict[PointLayout | pa.Schema | None, _OpenFile] = {}
@@ -119,7 +119,7 @@ class TopicWriter:
         """
         file = self._open.get(piece.layout)
         if file is None:
-            schema = table_schema_of(self._channel)
+            schema = table_schema_of(self.channel)
             name = payload_file(self.columns.folder, schema, self._number())
             if len(self._open) >= _MAX_OPEN:
                 first = next(iter(self._open))
@@ -179,13 +179,13 @@ class TopicWriter:
             "zones": file.zones,
             "is_ordered": file.writer.is_ordered,
         }
-        topics = {self._channel.topic: TopicCounts(file.rows)}
+        topics = {self.channel.topic: TopicCounts(file.rows)}
         section = Section(self._recording, 0, file.segments, topics)
         try:
             size, digest = file.writer.close([section], payloads=payloads, sync=True)
         except OSError as error:
             raise durability.explain(error, file.writer.path, "writing") from error
-        self.written.append(PayloadFile(file.name, size, digest, self._channel.topic, file.rows))
+        self.written.append(PayloadFile(file.name, size, digest, self.channel.topic, file.rows))
 
 
 def encodings_of(table: pa.Table) -> dict[str, str]:

@@ -14,12 +14,12 @@ from hybridlog.entries import (
     take_inventory,
 )
 from hybridlog.maintenance.decoding import decode_again
-from hybridlog.maintenance.opening import finish_renaming, put_entry
+from hybridlog.maintenance.opening import finish_renaming, put_entry, remove_marks
 from hybridlog.record.marks import mark_channel, mark_payload
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import StoreError, TimeError
+from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.messages import EXPIRED_IDS, Batch, Channel
 from hybridlog_storage.segments.chunk import pack
@@ -119,6 +119,49 @@ def mark(
             segment.abandon()
             _take_back(segment)
             raise
+        now = put_entry(directory, catalog, label)
+        if entry.is_decoded:
+            decode_again(directory, catalog, now)
+
+
+def unmark(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    moment: int | None,
+    *,
+    text: str,
+) -> None:
+    """Remove the marks of a text: lines of the journal, then their segments.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entry: The recording.
+        moment: Log time of the mark, ns; None for any.
+        text: Text of the mark.
+
+    Raises:
+        StoreError: The recording is being written.
+        TopicError: It is gone.
+        UsageError: It has no such mark.
+    """
+    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        path = directory.recording(label)
+        state = journal.read(path)
+        marks = state.marks if state is not None else []
+        gone = [m for m in marks if m["text"] == text and moment in {None, m["time"]}]
+        if not gone:
+            when = "" if moment is None else " at this time"
+            raise UsageError(
+                f"{label} has no mark {text!r}{when}. Those that were set while it was recorded "
+                "are messages, and stay."
+            )
+        lines = [journal.event(journal.UNMARKED, segment=mark["segment"]) for mark in gone]
+        Journal(path).append(*lines)
+        state = journal.read(path)
+        assert state is not None
+        remove_marks(path, state)
         now = put_entry(directory, catalog, label)
         if entry.is_decoded:
             decode_again(directory, catalog, now)

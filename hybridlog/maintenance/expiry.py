@@ -12,6 +12,8 @@ A crash before the first line leaves files that the next opening removes. After 
 chunks that are still there do no harm: readers use them for expired chunks alone, and the
 next expiry writes them anew.
 
+Each expiry writes files of fields; where a topic has many, they are joined (`columns/joining.py`).
+
 Columns of payloads belong to a whole recording. A file of them is deleted when the last of its
 messages expires; until then it keeps the others, and room is freed in segments only.
 """
@@ -28,13 +30,13 @@ import numpy as np
 
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of
-from hybridlog.columns.payload_files import RecordingPayloads, walk
+from hybridlog.columns.payload_files import RecordingPayloads, next_number, walk
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.thinning import replace_chunks
 from hybridlog_storage import journal
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE, expired_record
 from hybridlog_storage.settings import EXPIRED
@@ -56,6 +58,8 @@ if TYPE_CHECKING:
 
 MIN_BYTES: Final = 256
 """Stored bytes a message below which payloads stay: what is left would take as much room."""
+MAX_FILES: Final = 16
+"""Small files of fields of a topic; where there are more, they are joined."""
 _Key = tuple[str, str, bool]
 """A topic, a hash of its definition, and whether its messages are reduced."""
 
@@ -88,6 +92,7 @@ def expire(
     log: Journal | None = None,
     progress: Progress | None = None,
     min_bytes: int = MIN_BYTES,
+    max_files: int = MAX_FILES,
 ) -> Expired:
     """Delete payloads in sealed segments of a recording that this process has locked.
 
@@ -102,6 +107,7 @@ def expire(
         log: The journal of a running recording, which its recorder appends to; None to open it.
         progress: Called after each chunk.
         min_bytes: Chunks with fewer stored bytes a message stay.
+        max_files: Small files of fields that a topic may have.
 
     Raises:
         StoreError: Files cannot be read or written; what was not announced is as before.
@@ -109,7 +115,12 @@ def expire(
     """
     path = directory.recording(label)
     work = _Expiry(path, sorted(segments), topics, log or Journal(path), min_bytes)
-    return work.run(directory, label, progress)
+    done = work.run(directory, label, progress)
+    with suppress(
+        HybridlogError, OSError
+    ):  # they stay as they are, and the next expiry tries again
+        done.freed += work.join(max_files)
+    return done
 
 
 class _Expiry:
@@ -133,7 +144,7 @@ class _Expiry:
         self._writers: dict[_Key, TopicWriter] = {}
         self._written: dict[tuple[int, int], list[int]] = {}  # checksums by segment and chunk
         self._made: list[PayloadFile] = []
-        self._numbers = count(sum(file.has_fields for file in self._state.payloads.values()))
+        self._numbers = count(next_number(self._state))
         for segment in walk(path, segments):
             self._choose(segment)
 
@@ -262,6 +273,15 @@ class _Expiry:
             found = TopicWriter(folder, self._state.id, channel, columns, number)
             self._writers[key] = found
         return found
+
+    def join(self, max_files: int) -> int:
+        """Join the files of fields of topics that have many; returns the bytes that became free."""
+        if not self._writers:
+            return 0
+        from hybridlog.columns.joining import join
+
+        channels = {(topic, schema): w.channel for (topic, schema, _), w in self._writers.items()}
+        return join(self._path, channels.values(), max_files)
 
     def _announce(self, made: list[PayloadFile]) -> None:
         """List the files in the journal."""

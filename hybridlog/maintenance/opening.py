@@ -40,6 +40,8 @@ from hybridlog_storage.journal import Journal
 from hybridlog_storage.segments.segment_file import sealed_name
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import RepairReport
     from hybridlog_storage.catalog import Described, RecordingEntry
@@ -425,6 +427,8 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         Journal(path).append()
     if PAYLOAD_PARTS in listing.others or (state is not None and state.deleted):
         payload_files.publish(path, state)
+    if state is not None and state.unmarked & listing.sealed.keys():
+        remove_marks(path, state)
     thinned = state.thinned if state is not None else {}
     payload_files.replace_segments(path, listing.others, thinned)
     recovered = _recover_segments(directory, label, listing, state)
@@ -577,6 +581,21 @@ def _recover_segments(
         else:
             recovered.append(recover_segment(path / name, announce, recording=said))
     return recovered
+
+
+def remove_marks(path: Path, state: JournalState) -> None:
+    """Remove the segments of removed marks of a recording that this process has locked.
+
+    Raises:
+        HybridlogError: One cannot be removed.
+    """
+    try:
+        for number in state.unmarked:
+            with suppress(FileNotFoundError):
+                files.unlink(path / sealed_name(number))
+        files.sync_folder(path)
+    except OSError as error:
+        raise durability.explain(error, path, "removing marks of") from error
 
 
 def _end_of(inventory: Inventory) -> dict[str, Any]:

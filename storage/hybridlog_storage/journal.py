@@ -42,6 +42,7 @@ TAGGED: Final = "tagged"
 UNTAGGED: Final = "untagged"
 NOTED: Final = "noted"
 MARKED: Final = "marked"
+UNMARKED: Final = "unmarked"
 ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
@@ -150,6 +151,7 @@ class JournalState:
         tags: The present tags.
         notes: Notes in the order of writing: `at` and `text`.
         marks: Marks set after the end: `time`, `text`, `tags`, `segment`; those that last, `end`.
+        unmarked: Numbers of the segments of removed marks: their files are removed, too.
         pins: Pins by id: `id`, `from` and `to` (log times, ns), `topics`, `reason`; None for all.
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
@@ -177,6 +179,7 @@ class JournalState:
     tags: dict[str, str] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
     marks: list[dict[str, Any]] = field(default_factory=list)
+    unmarked: set[int] = field(default_factory=set)
     pins: dict[str, dict[str, Any]] = field(default_factory=dict)
     sealed: dict[int, SealedSegment] = field(default_factory=dict)
     replaced: list[tuple[SealedSegment, SealedSegment]] = field(default_factory=list)
@@ -235,6 +238,8 @@ class JournalState:
             self.notes.append(_values(line, {"at": _time, "text": _text}))
         elif name == MARKED:
             self._mark(line)
+        elif name == UNMARKED:
+            self._unmark(_segment(line["segment"]))
         elif name == PINNED:
             self._pin(line)
         elif name == UNPINNED:
@@ -264,6 +269,14 @@ class JournalState:
         self.marks = [m for m in self.marks if m["segment"] in self.sealed]
         self.marks.append(mark)
 
+    def _unmark(self, number: int) -> None:
+        left = [mark for mark in self.marks if mark["segment"] != number]
+        if len(left) == len(self.marks) or number not in self.sealed:
+            raise ValueError("it is no mark")
+        self.marks = left
+        del self.sealed[number]
+        self.unmarked.add(number)
+
     def _pin(self, line: Event) -> None:
         pin = {name: check(line.get(name)) for name, check in _PIN.items()}
         if None not in (pin["from"], pin["to"]) and pin["to"] < pin["from"]:
@@ -285,6 +298,7 @@ class JournalState:
         if before is not None and before.digest != sealed.digest:
             self.replaced.append((before, sealed))
         self.sealed[number] = sealed
+        self.unmarked.discard(number)
 
     def _compact(self, line: Event) -> None:
         found = payload_files(line.get("files", ()))

@@ -34,13 +34,16 @@ def expire(
     topics: Collection[str] | None = None,
     *,
     is_worth: bool = False,
+    max_files: int = expiry.MAX_FILES,
 ) -> Expired:
     """Delete payloads of the only recording of a store."""
     with hl.open(store) as opened:
         (entry,) = opened.recordings()
         with opened.directory.writing(entry.label, entry.id) as label:
             least = expiry.MIN_BYTES if is_worth else 0
-            found = expiry.expire(opened.directory, label, segments, topics, min_bytes=least)
+            found = expiry.expire(
+                opened.directory, label, segments, topics, min_bytes=least, max_files=max_files
+            )
             put_entry(opened.directory, opened.catalog, label)
     return found
 
@@ -69,6 +72,10 @@ def answers(path: Path) -> dict[str, Any]:
 
 def recording_of(store: Path) -> Path:
     return store / "recordings" / "log"
+
+
+def field_files(store: Path) -> list[Path]:
+    return [*recording_of(store).glob("payloads/*/*")]
 
 
 def payloads(path: Path, topic: str) -> list[bytes | str]:
@@ -154,7 +161,7 @@ def die_at(step: int, work: Callable[[], object]) -> bool:
 
 
 @pytest.mark.parametrize(
-    "stride", [15, pytest.param(1, marks=pytest.mark.exhaustive)], ids=["some", "all"]
+    "stride", [25, pytest.param(1, marks=pytest.mark.exhaustive)], ids=["some", "all"]
 )
 def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, stride: int) -> None:
     with hl.open(copy, mongo="none") as store:
@@ -164,7 +171,7 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
     while not lived:
         place = tmp_path / f"at {step}"
         shutil.copytree(copy, place)
-        lived = die_at(step, partial(expire, place, [0, 1]))
+        lived = die_at(step, partial(expire, place, [0, 1], max_files=0))
         with hl.open(place, mongo="none") as store:  # finishes or undoes it
             assert {one.place for one in store.verify().findings} <= {"catalog"}
             states = [message.state.value for message in store.all_topics()]
@@ -214,6 +221,36 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
         assert store.topic("/scan").count() == COUNT
         store.remove("log")
         assert not store.recordings()
+
+
+def test_files_of_fields_are_joined(copy: Path, tmp_path: Path) -> None:
+    before = answers(copy)
+    for segment in (0, 1):
+        expire(copy, [segment], max_files=0)
+    listed = journal.read(recording_of(copy))
+    assert listed is not None
+    assert sorted(file.topic for file in listed.payloads.values()) == TOPICS
+    assert len(listed.deleted) > len(TOPICS)
+    there = {str(p.relative_to(recording_of(copy) / "payloads")) for p in field_files(copy)}
+    assert there == {*listed.payloads}
+    assert answers(copy) == before
+    with hl.open(copy, mongo="none") as store, hl.open(tmp_path / "o", create=True) as other:
+        assert store.verify().findings == []
+        other.import_from(copy)
+        assert other.verify().findings == []
+    # Without its journal a recording knows which files the others were joined to.
+    (recording_of(copy) / "journal").unlink()
+    with hl.open(copy, mongo="none") as store:
+        store.repair()
+        found = [one.place for one in store.verify().findings]
+        assert found in ([], ["journal"])
+    rebuilt = journal.read(recording_of(copy))
+    assert rebuilt is not None
+    assert rebuilt.payloads.keys() == listed.payloads.keys()
+    after = answers(copy)
+    assert {key: after[key] for key in before if key != "status"} == {
+        key: before[key] for key in before if key != "status"
+    }
 
 
 def test_payloads_stay_where_that_frees_no_room(copy: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage import journal
 from hybridlog_storage.errors import TimeError, UsageError
+from tests.cli.within import answer
 
 S = 10**9
 BEGIN = 1000
@@ -75,6 +77,39 @@ def test_marks_are_intervals_of_questions(store: hl.Store) -> None:
     assert times(said.where("not /json: end_time.sec > 0", within="0s"))[49:52] == [49, 51, 52]
     with pytest.raises(UsageError, match="needs a length"):
         said.windows()
+
+
+def test_a_mark_is_removed(store: hl.Store, tmp_path: Path) -> None:
+    path = Path(shutil.copytree(store.directory.path, tmp_path / "store"))
+    with hl.open(path, mongo="none") as opened:
+        opened.mark("drive", "+70s", "carpet")
+        opened.mark("drive", "+80s", "stairs")
+        with pytest.raises(UsageError, match="no mark 'floor'"):
+            opened.unmark("drive", "floor")
+        with pytest.raises(UsageError, match="at this time"):
+            opened.unmark("drive", "carpet", "+71s")
+    answer("mark", "carpet", "-r", "drive", "--at", "+70s", "--remove", store=path)
+    answer("mark", "carpet", "-r", "drive", "--until", "+70s", "--remove", store=path, code=2)
+    marks = "/hybridlog/marks"
+    folder = path / "recordings" / "drive"
+    with hl.open(path, mongo="none") as opened:
+        assert [m["text"] for m in opened.entry("drive").marks] == ["carpet", "stairs"]
+        assert times(opened.topic(marks)) == [60, 80]
+        opened.unmark("drive", "carpet")
+        # A crash has left the segment; nothing answers from it, and it goes.
+        number = opened.entry("drive").marks[0]["segment"]
+        left = (folder / f"{number:06d}.mcap").read_bytes()
+        opened.unmark("drive", "stairs")
+        assert marks not in opened.topics()
+        assert opened.verify().findings == []
+    (folder / f"{number:06d}.mcap").write_bytes(left)
+    with hl.open(path, mongo="none") as opened:
+        opened.repair()
+        assert marks not in opened.topics()
+        opened.mark("drive", "+90s", "end")  # in a segment of the same number
+        assert times(opened.topic(marks)) == [90]
+        assert opened.verify().findings == []
+        assert len(opened.topic("log").to_arrow()) == 100
 
 
 def test_marks_in_sql_and_in_the_timeline(store: hl.Store) -> None:
