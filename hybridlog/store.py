@@ -63,8 +63,9 @@ if TYPE_CHECKING:
     from hybridlog.formats.reading import Source
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
-    from hybridlog.maintenance.imports import ImportReport
+    from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.maintenance.keep import Kept
+    from hybridlog.maintenance.places import DirectoryPlace, Place
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
@@ -165,6 +166,21 @@ def open_store(
         store.close()
         raise
     return store
+
+
+@contextmanager
+def _place(to: str | Path, options: CopyOptions) -> Iterator[Place]:
+    """The place that recordings are copied to."""
+    from hybridlog.maintenance.ssh import is_ssh, ssh_place
+
+    if is_ssh(str(to)):
+        with ssh_place(str(to), options.ssh, options.program) as server:
+            yield server
+    elif "://" in str(to):
+        raise UsageError(f"{to} is no place to copy to: give a directory, or ssh://user@host/path.")
+    else:
+        with open_store(to, create=True) as store, store.receiving() as place:
+            yield place
 
 
 def _again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -1423,41 +1439,114 @@ class Store:
         self.session.catch_up(entry.id)
         return self.entry(entry.id)
 
+    def copy(
+        self,
+        to: str | Path,
+        recordings: Choice | Names | None = None,
+        options: CopyOptions | None = None,
+        progress: Progress | None = None,
+    ) -> CopyReport:
+        """Copy recordings to another store; what is there already is not copied again.
+
+        Every byte is proved there before a recording gets its name. After an interruption the
+        next call goes on where this one stopped.
+
+        Args:
+            to: The other store: a directory, which is made, or `ssh://user@host/path`.
+            recordings: The recordings, or what they must satisfy; None for all.
+            options: What is copied of them, and how.
+            progress: Called with the bytes copied of all that are to be copied.
+
+        Returns:
+            What was copied; recordings that are damaged or have not ended are refused.
+
+        Raises:
+            StoreError: The place is not reached, or cannot be written.
+            DiskFullError: It has no room; what arrived stays.
+        """
+        from hybridlog.maintenance.copying import CopyOptions, run
+
+        wanted = options or CopyOptions()
+        if wanted.only_fields and wanted.then_expire:
+            raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
+        if wanted.then_expire:
+            self.directory.check_writable()
+        self.session.catch_up()
+        chosen, proved = self._chosen(recordings), list[str]()
+        with _place(to, wanted) as place:
+            report = run(
+                self.directory, place, chosen, wanted, progress=progress, proved=proved.append
+            )
+            for recording in proved:
+                self._expire(recording, place.name, report, progress)
+        return report
+
+    def _expire(
+        self, recording: str, where: str, report: CopyReport, progress: Progress | None
+    ) -> None:
+        """Let the payloads of a recording go that were proved elsewhere."""
+        from hybridlog.maintenance.keep import Keeper
+        from hybridlog.maintenance.retention import Rules
+
+        rules = Rules.of(self.directory.settings.retention)
+        keeper = Keeper(self.directory, self.remove)
+        try:
+            kept = keeper.expire_all(recording, rules, f"it was copied to {where}", progress)
+        finally:
+            self.session.catch_up(recording)
+        report.freed_bytes += kept.freed_bytes
+        report.problems += kept.problems
+
     def import_from(
         self,
         other: str | Path,
         recordings: Choice | Names | None = None,
         progress: Progress | None = None,
-    ) -> ImportReport:
-        """Import recordings from another store; earlier copies are not repeated.
-
-        Recordings that have not ended are left out; the report says why.
+    ) -> CopyReport:
+        """Copy recordings in from another store; see `copy`.
 
         Args:
             other: The other store's directory.
             recordings: The recordings, or what they must satisfy; None for all.
-            progress: Called while files are copied and checked.
+            progress: Called with the bytes copied of all that are to be copied.
 
         Raises:
-            StoreError: It is not a store, or a recording of it is damaged.
+            StoreError: It is not a store, or this one cannot be written.
         """
-        from hybridlog.maintenance import imports, tables
+        from hybridlog.maintenance.copying import run
 
         there = directory_of(other)
-        with Store(there, mongo=NONE if there.is_remote else EMBEDDED) as source:
-            chosen: Sequence[RecordingEntry]
-            if isinstance(recordings, Choice):
-                chosen = source.choose(recordings)
-                chosen = chosen if recordings.is_everything else chosen.check()
-            else:
-                chosen = source.select(recordings)
-            self.session.catch_up()
-            present = {one.id: one.label for one in self.session.snapshot().summaries}
-            report = imports.run(source.directory, self.directory, chosen, present, progress)
+        with (
+            Store(there, mongo=NONE if there.is_remote else EMBEDDED) as source,
+            self.receiving() as place,
+        ):
+            return run(source.directory, place, source._chosen(recordings), progress=progress)
+
+    @contextmanager
+    def receiving(self) -> Iterator[DirectoryPlace]:
+        """This store as a place that recordings are copied to."""
+        from hybridlog.maintenance import tables
+        from hybridlog.maintenance.places import DirectoryPlace
+
+        def known() -> dict[str, str]:
+            return {one.id: one.label for one in self.session.snapshot().summaries}
+
         self.session.catch_up()
-        for entry in self.select(report.imported):  # so that other readers find them
+        place = DirectoryPlace(self.directory, known)
+        yield place
+        self.session.catch_up()
+        for entry in self.select(place.published):  # so that other readers find them
             tables.make(self.directory, entry, is_new=True)
-        return report
+
+    def _chosen(self, recordings: Choice | Names | None) -> Sequence[RecordingSummary]:
+        """Recordings that are to be copied."""
+        if isinstance(recordings, Choice):
+            chosen = self.choose(recordings)
+            return (chosen if recordings.is_everything else chosen.check()).summaries
+        if recordings is None:
+            return self.summaries()
+        ids = {entry.id for entry in self.select(recordings)}
+        return [one for one in self.summaries() if one.id in ids]
 
     def repair(
         self, recordings: Names | None = None, progress: Progress | None = None

@@ -403,7 +403,7 @@ FORMAT_2 = [
         ),
     ),
     *_of(
-        "hybridlog/maintenance/imports.py",
+        "hybridlog/maintenance/places.py",
         (
             "an-import-is-not-checked",
             "return not any(True for _ in check.problems())",
@@ -411,16 +411,19 @@ FORMAT_2 = [
             f"{IDENTITY}::test_what_is_damaged_is_not_imported",
         ),
         (
-            "an-import-begins-anew",
-            "    if is_whole():\n        return 0\n",
-            "",
-            f"{IDENTITY}::test_an_import_goes_on_where_it_was_stopped",
-        ),
-        (
             "an-import-is-not-adopted",
-            "        Journal(path).append(journal.event(journal.ADOPTED, store=target.settings.store_id))\n",
-            "",
+            'content = lines + b"".join(map(journal.encode, added))',
+            "content = lines",
             f"{IDENTITY}::test_import",
+        ),
+    ),
+    *_of(
+        "hybridlog/maintenance/copying.py",
+        (
+            "an-import-begins-anew",
+            "        if there == file.bytes and place.prove(file):\n",
+            "        if False:\n",
+            f"{IDENTITY}::test_an_import_goes_on_where_it_was_stopped",
         ),
     ),
     *_of(
@@ -627,22 +630,22 @@ MAINTENANCE = [
         ),
     ),
     *_of(
-        "hybridlog/maintenance/imports.py",
+        "hybridlog/maintenance/places.py",
         (
             "copied-columns-are-not-checked",
-            "        open_file(folder, file).check()\n",
-            "        open_file(folder, file)\n",
+            "open_file(recording / PAYLOADS, listed).check()\n",
+            "open_file(recording / PAYLOADS, listed)\n",
             IMPORT,
         ),
         (
             "more-than-the-listed-bytes-is-copied",
-            "os.read(fd, min(size, _PIECE))",
-            "os.read(fd, _PIECE)",
+            "fetched = min(at + _FETCHED, end)",
+            "fetched = at + _FETCHED",
             f"{IMPORT}::test_only_what_is_listed_is_copied",
         ),
         (
             "what-an-earlier-import-left-stays",
-            "                if number not in inventory.summaries:\n                    files.unlink(path / name)\n",
+            "                files.remove_tree(path / name, depth=files.IN_RECORDING)\n",
             "                pass\n",
             f"{IMPORT}::test_what_an_earlier_import_left_is_checked",
         ),

@@ -636,7 +636,7 @@ def documented_classes() -> list[type]:
     from hybridlog.attachments import StoredAttachment
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
-    from hybridlog.maintenance.imports import ImportReport
+    from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.report import RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
@@ -652,10 +652,10 @@ def documented_classes() -> list[type]:
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
-    checks = [Verification, Finding, Repaired, RepairReport, ImportReport, LerobotReport]
+    checks = [Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
     answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, StoredAttachment, Windows, *answers]
-    recording = [hl.RecordOptions, LiveOptions, LiveRecording, SegmentSettings]
+    recording = [hl.RecordOptions, CopyOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 
 

@@ -217,7 +217,10 @@ def test_an_import_says_where_payloads_are(store: Path, recorded: Path, tmp_path
     keep("--max-age", "0s", store=store)
     assert answer("import", store, store=whole).out == "run is here already\n"
     assert payloads(whole)[0] == image(0)
-    assert "deleted here to make room were not copied" in answer("import", whole, store=store).out
+    assert (
+        "payloads that were deleted here were not copied"
+        in answer("import", whole, store=store).out
+    )
     answer("import", store, store=tmp_path / "copy")
     assert payloads(tmp_path / "copy") == payloads(store)
 

@@ -52,7 +52,7 @@ GROUPS: Final = {
         "mark": "edit",
         "trigger": "trigger",
         "top": "top",
-        "import": "maintain",
+        "import": "copy",
     },
     "Look": {"ls": "ls", "info": "info", "view": "view", "open": "open", "plot": "plot"},
     "Ask": {
@@ -65,7 +65,7 @@ GROUPS: Final = {
         "check": "check",
         "diff": "check",
     },
-    "Export": {"export": "export", "mcp": "mcp"},
+    "Export": {"export": "export", "copy": "copy", "mcp": "mcp"},
     "Maintain": {
         "tag": "edit",
         "edit": "edit",

@@ -1,22 +1,20 @@
-"""`hybridlog verify`, `repair`, `compact` and `import`."""
+"""`hybridlog verify`, `repair` and `compact`."""
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, StoreError, UsageError, WithoutMongoError
+from hybridlog_storage.errors import DatabaseError, UsageError, WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import CompactedTopic
@@ -176,34 +174,3 @@ def _told(one: CompactedTopic, *, dry_run: bool) -> str:
     if one.kept:
         parts.append(f"{one.kept} without columns: {one.reason}")
     return f"{one.recording} {one.topic}: {'; '.join(parts)}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Import(Choosing, InStore, AsJson, Quiet):
-    other: Path = argument("Directory of the other store.", "STORE")
-
-
-@command(_Import, "import")
-def import_command(given: _Import) -> None:
-    """Copy recordings from another store.
-
-    Every byte is checked. After an interruption, run it again: copied recordings stay.
-    """
-    with (
-        given.opened(create=True, quiet=given.quiet) as store,
-        if_stopped("Run the command again: copied recordings are not copied again."),
-        progress_bar("import", 0, quiet=given.quiet) as bar,
-    ):
-        report = store.import_from(given.other, given.choice, Stages(bar))
-    if given.as_json:
-        output.print_json(asdict(report))
-    elif not given.quiet:
-        for label in report.imported:
-            output.say(f"imported {label}")
-        for label in report.known:
-            lacks = label in report.lacking
-            more = "; payloads that were deleted here to make room were not copied" if lacks else ""
-            output.say(f"{label} is here already{more}")
-    if report.refused:
-        sys.stdout.flush()
-        raise StoreError(" ".join(report.refused.values()))

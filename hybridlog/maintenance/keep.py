@@ -114,12 +114,7 @@ class Keeper:
         Raises:
             HeldError: Another process makes a pass.
         """
-        with self._directory.retaining() as is_alone:
-            if not is_alone:
-                raise HeldError(
-                    "Another process makes room in this store already.", is_recording=False
-                )
-            self._failed.clear()
+        with self._alone():
             found = Kept(self.plan(rules))
             planned = found.plan
             for _ in range(_MAX_ROUNDS):
@@ -133,6 +128,42 @@ class Keeper:
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
         return found
+
+    def expire_all(
+        self, recording: str, rules: Rules, reason: str, progress: Progress | None = None
+    ) -> Kept:
+        """Let the payloads of a recording go, but for what pins and rules keep.
+
+        Args:
+            recording: Its id.
+            rules: Rules whose `never_tag` holds.
+            reason: Why they go.
+            progress: Called while payloads are replaced.
+
+        Raises:
+            HeldError: Another process makes a pass.
+        """
+        with self._alone():
+            found, now = Kept(self.plan(Rules())), time.time_ns()
+            for held in self._held(now):
+                if held.id == recording and not rules.is_never(held.tags):
+                    numbers = tuple(one.number for one in held.segments if not one.pinned)
+                    size = sum(one.size for one in held.segments if not one.pinned)
+                    if numbers:
+                        step = Step(held.label, held.id, numbers, (), size, reason, now)
+                        found.plan.steps.append(step)
+                        self._do(step, found, progress)
+        return found
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        with self._directory.retaining() as is_alone:
+            if not is_alone:
+                raise HeldError(
+                    "Another process makes room in this store already.", is_recording=False
+                )
+            self._failed.clear()
+            yield
 
     def _held(self, now: int) -> Iterator[Held]:
         """The content of the recordings; damaged ones are left alone."""

@@ -146,6 +146,7 @@ class JournalState:
     Attributes:
         id: The recording's id, 32 hexadecimal digits; empty if no line states it.
         store: Id of the store that it belongs to.
+        lacks_payloads: Whether it is a copy whose payloads have not been copied yet.
         begun: The first event; empty if it is lost.
         name: The present name.
         tags: The present tags.
@@ -174,6 +175,7 @@ class JournalState:
 
     id: str = ""
     store: str = ""
+    lacks_payloads: bool = False
     begun: dict[str, Any] = field(default_factory=dict)
     name: str = ""
     tags: dict[str, str] = field(default_factory=dict)
@@ -219,6 +221,7 @@ class JournalState:
             self._rename(line)
         elif name == ADOPTED:
             self.store = _text(line["store"])
+            self.lacks_payloads |= line.get("lacks") == "payloads"
         elif name in {COMPACTED, EXPIRED}:
             self._compact(line)
         elif name in {REMOVING, REBUILT}:

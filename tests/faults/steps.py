@@ -449,8 +449,8 @@ def _serve() -> NoReturn:
 
     import hybridlog.columns.tables
     import hybridlog.formats.mcap.reader
+    import hybridlog.maintenance.copying
     import hybridlog.maintenance.edit
-    import hybridlog.maintenance.imports
     import hybridlog.maintenance.index
     import hybridlog.maintenance.removal
     import hybridlog.maintenance.repair

@@ -19,7 +19,7 @@ SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("tag", "torn", "write journal", 0, False),
     ("mark", "die", "write journal", 0, False),
     ("mark", "ENOSPC", "sync journal", 0, False),
-    ("import", "torn", "write .00000", 0, False),
+    ("import", "torn", "write 000000", 0, False),
     ("repair", "die", "rename 000000.mcap", 0, True),
     ("compact", "die", "write journal", 0, False),
     ("compact", "ENOSPC", "write", 1, False),

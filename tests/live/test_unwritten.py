@@ -130,7 +130,7 @@ def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
         done = run("import", path, store=other, code=5)
         assert done.lines == ["imported before", "imported zulu"]
         assert "'live' of" in done.err
-        assert "is being written. Import it when it has ended." in done.err
+        assert "is being written. Copy it when it has ended." in done.err
     with hl.open(other, mongo=NOWHERE) as store:
         assert [one.label for one in store.recordings()] == ["before", "zulu"]
 

@@ -160,7 +160,7 @@ def test_damage_of_columns_is_found(plain: Path, copy: Path) -> None:
 @pytest.mark.exhaustive
 def test_columns_follow_a_recording(compacted: hl.Store, tmp_path: Path) -> None:
     with hl.open(tmp_path / "other", create=True) as store:
-        assert store.import_from(compacted.directory.path).imported == ["log"]
+        assert store.import_from(compacted.directory.path).copied == ["log"]
         copied = {
             str(p.relative_to(store.directory.path)): p.read_bytes()
             for p in store.directory.path.rglob("*.parquet")

@@ -399,6 +399,7 @@ EXEMPT: dict[str, str] = {
     "record": "it makes recordings",
     "top": "it asks the recorder, not the store",
     "import": "it copies recordings that have ended, from a store",
+    "copy": "it copies recordings that have ended, to a store",
     "view": "it serves until it is stopped; see tests/view",
     "trigger": "it asks the recorder, not the store",
     "mcp": "it serves until it is stopped; see tests/view/test_tools.py",

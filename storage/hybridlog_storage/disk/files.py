@@ -100,6 +100,10 @@ class System:
         """Rename a file; replaces a file of the new name."""
         os.rename(old, new, src_dir_fd=folder, dst_dir_fd=new_folder)
 
+    def link(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+        """Give a file a second name."""
+        os.link(old, new, src_dir_fd=folder, dst_dir_fd=new_folder, follow_symlinks=False)
+
     def unlink(self, name: str, *, folder: int) -> None:
         """Remove a file."""
         os.unlink(name, dir_fd=folder)
@@ -379,6 +383,22 @@ def rename(
             return
         with folder(new.parent, new_depth - 1) as new_fd:
             system.rename(old.name, new.name, folder=fd, new_folder=new_fd)
+
+
+def link(old: Path, new: Path, *, depth: int = IN_RECORDING, new_depth: int) -> None:
+    """Give a file of the store a second name.
+
+    Args:
+        old: Its name.
+        new: The second one.
+        depth: As for `open_file`.
+        new_depth: The same of `new`.
+
+    Raises:
+        OSError: It does not exist, or the file system has no links.
+    """
+    with folder(old.parent, depth - 1) as fd, folder(new.parent, new_depth - 1) as new_fd:
+        system.link(old.name, new.name, folder=fd, new_folder=new_fd)
 
 
 def unlink(path: Path, *, depth: int = IN_RECORDING) -> None:

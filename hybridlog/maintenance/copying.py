@@ -1,0 +1,387 @@
+"""Copies recordings from a store to a place, with checks; resumes after an interruption.
+
+`Store.copy` and `Store.import_from` are this from two sides. A file is sent from the byte on
+that the place has of it; the place then proves the whole file (`places.py`). The journal goes
+last.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+from hybridlog.entries import take_inventory
+from hybridlog.maintenance.places import (
+    Copied,
+    CopiedFile,
+    digest_of,
+    expired_in,
+    files_of,
+    pieces_of,
+)
+from hybridlog_storage import journal
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.errors import HeldError, StoreError, unreadable
+from hybridlog_storage.journal import JOURNAL, JournalState
+from hybridlog_storage.stopping import pause
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hybridlog.maintenance.places import Place
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
+
+_READ: Final = 1 << 20  # bytes read at once
+_ASKED_AT_ONCE: Final = 1000  # recordings in a question
+_TRIES: Final = 3  # of a recording that is compacted or expires meanwhile
+_SENDING: Final = ".copying-"  # prefix of the folder of a recording whose fields are copied
+
+
+@dataclass(frozen=True, slots=True)
+class CopyOptions:
+    """How recordings are copied.
+
+    Attributes:
+        only_fields: Leave the payloads for later: the copy is like an expired recording.
+        then_expire: Delete the payloads here that were proved there; pinned ones stay.
+        limit_rate: Bytes a second, at most; None for no limit.
+        ssh: The program, with options, that reaches `ssh://` places; None for `ssh`.
+        program: hybridlog on the other side.
+        piece: Bytes sent at once; what a cut costs.
+    """
+
+    only_fields: bool = False
+    then_expire: bool = False
+    limit_rate: float | None = None
+    ssh: str | None = None
+    program: str = "hybridlog"
+    piece: int = 256 << 10
+
+
+@dataclass(slots=True)
+class CopyReport:
+    """The result of `copy` and `import`.
+
+    Attributes:
+        copied: Labels, in the place, of the copied recordings.
+        known: Labels of recordings that were there already.
+        lacking: Those of them whose payloads were deleted there, and are here.
+        refused: Why recordings were not copied, by their labels here.
+        bytes_copied: Bytes copied now, without those that were there after an interruption.
+        freed_bytes: Bytes that became free here, because payloads were proved there.
+        problems: Why payloads did not expire here, in sentences.
+    """
+
+    copied: list[str] = field(default_factory=list)
+    known: list[str] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+    bytes_copied: int = 0
+    freed_bytes: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+class _RefusedError(StoreError):
+    """A recording that is not copied; others are."""
+
+
+def run(
+    source: StoreDirectory,
+    place: Place,
+    chosen: Iterable[RecordingEntry | RecordingSummary],
+    options: CopyOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    proved: Callable[[str], None] = lambda _: None,
+) -> CopyReport:
+    """Copy recordings of a store to a place.
+
+    Args:
+        source: The store to read.
+        place: Where they go.
+        chosen: Recordings of `source`.
+        options: How they are copied.
+        progress: Called with the bytes copied and checked, of all that are to be copied.
+        proved: Called with the id of each recording that is there with its payloads.
+
+    Raises:
+        StoreError: The place cannot be written or reached; what was copied stays there.
+        DiskFullError: No room; the copy can be run again.
+    """
+    work = _Copying(source, place, options or CopyOptions(), progress, proved)
+    return work.run([*chosen])
+
+
+class _Copying:
+    """The steps of a copy."""
+
+    def __init__(
+        self,
+        source: StoreDirectory,
+        place: Place,
+        options: CopyOptions,
+        progress: Progress | None,
+        proved: Callable[[str], None],
+    ) -> None:
+        self._source = source
+        self._place = place
+        self._options = options
+        self._progress = progress
+        self._proved = proved
+        self._report = CopyReport()
+        self._done = self._total = 0
+        self._due = 0.0  # time from which more may be sent
+
+    def run(self, chosen: Sequence[RecordingEntry | RecordingSummary]) -> CopyReport:
+        there: dict[str, Copied] = {}
+        for begin in range(0, len(chosen), _ASKED_AT_ONCE):
+            asked = chosen[begin : begin + _ASKED_AT_ONCE]
+            there |= self._place.have([one.id for one in asked])
+        wanted = [one for one in chosen if not self._is_known(one.id, there.get(one.id))]
+        self._total = sum(one.stored_bytes for one in wanted)
+        missing = {one.id for one in wanted}
+        for one in chosen:
+            if one.id not in missing:
+                self._note_known(one.id, there[one.id])
+        for one in wanted:
+            try:
+                self._copy(one)
+            except (_RefusedError, HeldError) as error:
+                self._report.refused[one.label] = str(error)
+                self._total -= one.stored_bytes
+            finally:
+                self._place.leave()
+        return self._report
+
+    def _is_known(self, recording: str, there: Copied | None) -> bool:
+        """True if the place has all that would be copied."""
+        if there is None or not there.lacks_payloads or self._options.only_fields:
+            return there is not None
+        return self._state(recording).lacks_payloads
+
+    def _state(self, recording: str) -> JournalState:
+        """The journal of a recording here; an empty one if it cannot be read."""
+        with suppress(StoreError):
+            for label in self._source.labels_of(recording):
+                return journal.read(self._source.recording(label)) or JournalState()
+        return JournalState()
+
+    def _note_known(self, recording: str, known: Copied) -> None:
+        self._report.known.append(known.label)
+        may_lack = known.expired and not known.lacks_payloads
+        if may_lack and known.expired > expired_in(self._state(recording)):
+            self._report.lacking.append(known.label)
+        if self._options.then_expire:
+            problems = self._place.problems(recording)
+            if known.lacks_payloads or known.expired:
+                problems.append("payloads of it have expired there")
+            if problems:
+                self._report.problems.append(
+                    f"Payloads of {known.label} stay: its copy in {self._place.name} is not "
+                    f"whole: {'; '.join(problems[:3])}."
+                )
+            else:
+                self._proved(recording)
+
+    def _copy(self, one: RecordingEntry | RecordingSummary) -> None:
+        """Copy a recording, whatever label it has now.
+
+        Raises:
+            _RefusedError: It has not ended, or is damaged.
+        """
+        name = f"Recording {one.label!r} of {self._source.path}"
+        if one.status == "open":
+            raise _RefusedError(f"{name} is being written. Copy it when it has ended.")
+        if one.status == "unfinished":
+            raise _RefusedError(
+                f"{name} was cut short by a crash. Open that store once with write permission, "
+                "which recovers it, then copy it."
+            )
+        only_fields = self._options.only_fields
+        begun = self._place.begin(one.id, wants_payloads=not only_fields)
+        if begun.known is not None:  # another process has copied it meanwhile
+            self._note_known(one.id, begun.known)
+            return
+        left, sizes = _TRIES, begun.sizes
+        while True:
+            label, sent = self._source.label_now(one.label, one.id), None
+            try:
+                with self._sent(label, one.id) as sent:
+                    self._total += sent.bytes - one.stored_bytes
+                    for file in sent.files:
+                        self._bring(sent, file, sizes.get(file.file, 0))
+                break
+            except StoreError:
+                left -= 1
+                has_changed = left > 0 and sent is not None and sent.has_changed()
+                if self._source.has_label(label, one.id) and not has_changed:
+                    raise
+                sizes = {}
+        there = self._place.publish(one.label, sent.lines, lacks_payloads=sent.lacks_payloads)
+        self._report.copied.append(there)
+        if self._options.then_expire and not only_fields:
+            self._proved(one.id)
+
+    def _bring(self, sent: _Sent, file: CopiedFile, there: int) -> None:
+        """Send what a place lacks of a file.
+
+        Raises:
+            _RefusedError: It is damaged here.
+        """
+        place, path = self._place, file.below(sent.path)
+        if there == file.bytes and place.prove(file):
+            self._total -= file.bytes
+            return
+        at = 0
+        if 0 < there < file.bytes:
+            here = digest_of(sent.pieces(file, 0, there, _READ))
+            at = there if place.digest(file, there) == here else 0
+        self._total -= at
+        piece, limit = self._options.piece, self._options.limit_rate
+        if limit is not None:  # a server must not take a slow one for a dead one
+            piece = max(min(piece, int(limit / 4)), 1)
+        for data in sent.pieces(file, at, file.bytes, piece):
+            place.append(file, at, data)
+            at += len(data)
+            self._count(sent.label, len(data))
+        if not place.prove(file):
+            raise _RefusedError(
+                f"{path} is damaged: what was copied does not match its checksums. "
+                "`hybridlog verify` shows where."
+            )
+
+    def _count(self, label: str, size: int) -> None:
+        """Count bytes that were sent, and wait as long as the limit of the rate asks for."""
+        self._report.bytes_copied += size
+        self._done += size
+        if self._progress is not None:
+            self._progress(label, self._done, max(self._total, self._done))
+        if self._options.limit_rate is not None:
+            now = time.monotonic()
+            self._due = max(self._due, now) + size / self._options.limit_rate
+            pause(max(self._due - now, 0.0))
+
+    @contextmanager
+    def _sent(self, label: str, recording: str) -> Iterator[_Sent]:
+        """The recording as it is sent."""
+        if not self._options.only_fields:
+            yield _Sent(self._source, label, recording)
+            return
+        whole = _Sent(self._source, label, recording)
+        with _with_fields(self._source, whole) as scratch:
+            sent = _Sent(scratch, label, recording)
+            sent.lacks_payloads = sent.lines != whole.lines  # small messages stay whole
+            yield sent
+
+
+class _Sent:
+    """A recording as it is sent: its files, and its journal by which they are checked.
+
+    Args:
+        directory: Its store.
+        label: Its label.
+        recording: Its id.
+
+    Attributes:
+        lacks_payloads: Whether payloads are left for later.
+
+    Raises:
+        _RefusedError: It is incomplete.
+    """
+
+    def __init__(self, directory: StoreDirectory, label: str, recording: str) -> None:
+        self.label = label
+        self.lacks_payloads = False
+        self.path = directory.recording(label)
+        inventory = take_inventory(directory, label)
+        if inventory.id != recording or inventory.misfits or not inventory.is_proven:
+            raise _RefusedError(
+                f"Recording {label!r} of {directory.path} is incomplete: `hybridlog verify "
+                f"--store {directory.path} {label}` shows what is missing. It was not copied."
+            )
+        assert inventory.state is not None  # it is proven
+        self._state: JournalState = inventory.state
+        self.files = files_of(inventory)
+        self.segments = [*inventory.summaries]
+        self.bytes = sum(file.bytes for file in self.files)
+        self.lines = self._read()
+        if replace(journal.parse(self.lines), torn=self._state.torn) != self._state:
+            raise StoreError(f"{self.path} has changed meanwhile. Run it again.")
+
+    def _read(self) -> bytes:
+        path = self.path / JOURNAL
+        try:
+            return files.read_file(path, journal.MAX_JOURNAL)[: self._state.length]
+        except OSError as error:
+            raise unreadable(error, path) from error
+
+    def pieces(self, file: CopiedFile, at: int, end: int, piece: int) -> Iterator[bytes]:
+        """The bytes of a file, a piece at a time.
+
+        Raises:
+            _RefusedError: It cannot be read.
+        """
+        try:
+            yield from pieces_of(file.below(self.path), at, end, piece, depth=file.depth)
+        except StoreError as error:
+            raise _RefusedError(str(error)) from error
+
+    def has_changed(self) -> bool:
+        """True if files of it were replaced since: the journal says so."""
+        state = journal.read(self.path)
+        return state is not None and (state.thinned, state.payloads, state.sealed) != (
+            self._state.thinned,
+            self._state.payloads,
+            self._state.sealed,
+        )
+
+
+@contextmanager
+def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory]:
+    """A store, in a hidden folder, with a recording all of whose payloads have expired.
+
+    Its files are second names of the files of the recording: expiry replaces them by new
+    ones, and the recording keeps its own.
+    """
+    from hybridlog.maintenance.expiry import expire
+
+    source.check_writable()
+    _remove_stale(source)
+    folder = source.path / f"{_SENDING}{secrets.token_hex(4)}"
+    held = ExitStack()
+    try:
+        scratch = StoreDirectory.create(folder)
+        held.enter_context(scratch.retaining())
+        path = scratch.recording(sent.label)
+        files.make_folder(path, depth=files.IN_FOLDER)
+        for file in sent.files:
+            target = file.below(path)
+            files.make_folders(target.parent, depth=file.depth - 1)
+            files.link(file.below(sent.path), target, depth=file.depth, new_depth=file.depth)
+        files.write_file(path / JOURNAL, sent.lines)
+        expire(scratch, sent.label, sent.segments)
+        yield scratch
+    except OSError as error:
+        raise durability.explain(error, folder, "preparing fields in") from error
+    finally:
+        with held, suppress(OSError):
+            files.remove_tree(folder, depth=files.IN_STORE)
+
+
+def _remove_stale(source: StoreDirectory) -> None:
+    """Remove hidden folders of copies that were stopped; those in use are locked."""
+    for name in files.names(source.path, depth=0):
+        if name.startswith(_SENDING):
+            with (
+                suppress(StoreError, OSError),
+                StoreDirectory(source.path / name).retaining() as is_unused,
+            ):
+                if is_unused:
+                    files.remove_tree(source.path / name, depth=files.IN_STORE)

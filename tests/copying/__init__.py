@@ -1,0 +1,1 @@
+"""Copies of recordings: to directories, servers and buckets."""

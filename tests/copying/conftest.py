@@ -1,0 +1,180 @@
+"""A robot's store with a recording in each state, and places to copy it to."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any, cast
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance import expiry
+from hybridlog.maintenance.places import Place
+from hybridlog.maintenance.ssh import Server, serve
+from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.payloads.logs import robot, write_log
+
+SETTINGS = SegmentSettings(chunk_size=8 << 10, segment_size=14 << 10)
+STATES = ("recorded", "compacted", "dropped", "expired", "noted")
+PlaceAt = Callable[[Path], AbstractContextManager[Place]]
+
+
+@pytest.fixture(scope="session")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with a small recording in each state."""
+    path = tmp_path_factory.mktemp("robot")
+    with hl.open(path / "store", create=True, mongo="none") as store:
+        for number, name in enumerate(STATES):
+            log = write_log(path / f"{name}.mcap", robot(20 + number))
+            store.record(log, name=name, settings=SETTINGS)
+        store.compact(["compacted"])
+        store.compact(["dropped"], drop_mcap=True)
+        expire(store, "expired")
+        store.tag("noted", place="field")
+        store.note("noted", "it rained")
+        store.mark("noted", "start", "here")
+        store.pin("noted", reason="to keep")
+    return path / "store"
+
+
+def expire(store: hl.Store, label: str) -> None:
+    """Delete the payloads of a recording."""
+    directory = store.directory
+    with directory.writing(label):
+        numbers = [*directory.listing(label).sealed]
+        expiry.expire(directory, label, numbers, min_bytes=0)
+    store.session.catch_up()
+
+
+@contextmanager
+def directory_at(path: Path) -> Iterator[Place]:
+    """A store's directory."""
+    with hl.open(path, mongo="none", create=True) as store, store.receiving() as place:
+        yield place
+
+
+@contextmanager
+def server_at(path: Path, bytes_sent: int | None = None) -> Iterator[Place]:
+    """A store behind a connection, which may be cut.
+
+    Args:
+        path: The store.
+        bytes_sent: Bytes that arrive before the connection is cut; None for all.
+    """
+    ends = [*os.pipe(), *os.pipe()]
+    requests, to_server, answers, to_client = (
+        os.fdopen(fd, mode, 0) for fd, mode in zip(ends, ("rb", "wb", "rb", "wb"), strict=True)
+    )
+
+    def run() -> None:
+        with suppress(HybridlogError, OSError), requests, to_client, directory_at(path) as place:
+            serve(place, requests, to_client)  # type: ignore[arg-type]
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        sent = to_server if bytes_sent is None else _Cut(to_server, bytes_sent)
+        yield Server("server", cast("IO[bytes]", sent), answers)  # type: ignore[arg-type]
+    finally:
+        to_server.close()
+        thread.join(60)
+        answers.close()
+
+
+class _Cut:
+    """A stream that ends after some bytes."""
+
+    def __init__(self, stream: Any, left: int) -> None:
+        self._stream = stream
+        self._left = left
+
+    def write(self, data: bytes) -> None:
+        part = memoryview(data)[: self._left]
+        self._left -= len(part)
+        self._stream.write(part)
+        if len(part) < len(data):
+            self._stream.close()
+            raise BrokenPipeError
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+
+class Disturbed:
+    """A place that fails after some requests, or in the middle of bytes.
+
+    Args:
+        place: The place.
+        requests: Requests that it answers; None for all.
+        bytes_taken: Bytes that it takes; None for all.
+
+    Attributes:
+        asked: Names of the requests.
+        taken: Bytes it took.
+    """
+
+    def __init__(
+        self, place: Place, requests: int | None = None, bytes_taken: int | None = None
+    ) -> None:
+        self.name = place.name
+        self.asked: list[str] = []
+        self.taken = 0
+        self._place = place
+        self._requests = requests
+        self._bytes = bytes_taken
+
+    def __getattr__(self, what: str) -> Any:
+        ask = getattr(self._place, what)
+
+        def asked(*arguments: Any, **options: Any) -> Any:
+            if what != "leave":
+                self.asked.append(what)
+                if self._requests is not None and len(self.asked) > self._requests:
+                    raise StoreError("cut")
+            if what == "append":
+                file, at, data = arguments
+                left = len(data) if self._bytes is None else self._bytes - self.taken
+                part = memoryview(data)[:left]
+                self.taken += len(part)
+                ask(file, at, part)
+                if len(part) < len(data):
+                    raise StoreError("cut")
+                return None
+            return ask(*arguments, **options)
+
+        return asked
+
+
+def answers(path: Path, label: str) -> dict[str, Any]:
+    """What a recording answers."""
+    with hl.open(path, mongo="none") as store:
+        (entry,) = store.recordings(label)
+        of = store.recordings(label)
+        found: dict[str, Any] = {
+            "entry": (entry.id, entry.status, entry.messages, entry.span, entry.tags),
+            "notes": entry.notes,
+            "pins": entry.pins,
+            "marks": [(mark["time"], mark["text"]) for mark in entry.marks],
+            "near": of.topic("/scan").where("ranges.min < 1.5").count(),
+            "rings": of.topic("/cloud").fields("width", "height").to_arrow().to_pylist(),
+        }
+        for message in of.topic("/cloud", "/image", "/number", "/scan"):
+            with suppress(PayloadError):
+                key = (message.topic, message.log_time_ns, message.seq, message.publish_time_ns)
+                found[str(key)] = message.raw
+        return found
+
+
+def files_in(recording: Path) -> dict[str, str]:
+    """Digests of the files of a recording, but for its journal and its lock."""
+    return {
+        path.relative_to(recording).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(recording.rglob("*"))
+        if path.is_file() and path.name not in {"journal", "writer.lock"}
+    }

@@ -1,0 +1,91 @@
+"""`hybridlog copy` as a user runs it: over a client program in the place of ssh, and watching."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.running import run, started, wait_for
+from tests.copying.conftest import answers
+from tests.json_schemas import misfit, schema_of
+
+HYBRIDLOG = f"{sys.executable} -m hybridlog"
+_SSH = """
+import os, subprocess, sys
+
+words = sys.argv[1:]
+while words[0].startswith("-"):
+    words = words[2:]
+host, command = words
+assert host == "me@lab"
+os.chdir(PLACE)
+left = int(os.environ.get("CUT", 0))
+if not left:
+    os.execvp("sh", ["sh", "-c", command])
+there = subprocess.Popen(["sh", "-c", command], stdin=subprocess.PIPE)
+while left and (data := os.read(0, left)):
+    there.stdin.write(data)
+    there.stdin.flush()
+    left -= len(data)
+there.stdin.close()
+there.wait()
+"""
+
+
+@pytest.fixture
+def ssh(tmp_path: Path) -> Path:
+    """A program that is called like ssh, and runs the command here.
+
+    With CUT it passes on so many bytes only.
+    """
+    path = tmp_path / "ssh"
+    path.write_text(f"#!{sys.executable}\nPLACE = {str(tmp_path)!r}\n{_SSH}")
+    path.chmod(0o755)
+    return path
+
+
+def test_copies_to_a_directory(robots: Path, tmp_path: Path) -> None:
+    done = run("copy", "noted", "-r", "exp*", tmp_path / "lab", "--store", robots)
+    assert sorted(done.lines) == ["copied expired", "copied noted"]
+    again = run("copy", tmp_path / "lab", "--store", robots, "--tag", "place", "--json")
+    assert again.json["known"] == ["noted"]
+    assert not misfit(again.json, schema_of(["copy"]))
+    assert again.json["bytes_copied"] == 0
+    assert answers(tmp_path / "lab", "noted") == answers(robots, "noted")
+    for wrong in ("ftp://x/y", "ssh://", "ssh://-oProxyCommand=x/y", "ssh://a:b@c/d"):
+        assert run("copy", wrong, "--store", robots, code=2).err
+    assert run("copy", tmp_path / "x", "--store", robots, "--limit-rate", "0", code=2).err
+    assert run("copy", "nosuch", tmp_path / "x", "--store", robots, code=2).err
+
+
+def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:
+    url = "ssh://me@lab:22/~/lab%20store"
+    words = ("copy", "dropped", url, "--store", robots, "--ssh", f"{ssh} -x y")
+    missing = run(*words, "--program", "nosuch-program", code=5)
+    assert "Name hybridlog on the server" in missing.err
+    cut = run(*words, "--program", HYBRIDLOG, code=5, CUT="9000")
+    assert "run the command again" in cut.err
+    assert run(*words, "--program", HYBRIDLOG).lines == ["copied dropped"]
+    assert run(*words, "--program", HYBRIDLOG).lines == ["dropped is there already"]
+    there = tmp_path / "lab store"
+    assert answers(there, "dropped") == answers(robots, "dropped")
+    garbage = run("copy", "ssh://me@lab/x", "--store", robots, "--ssh", str(ssh), "--program",
+                  "echo welcome to the lab;", code=5)  # fmt: skip
+    assert "does not answer as hybridlog does" in garbage.err
+
+
+def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
+    store, lab, told = tmp_path / "robot", tmp_path / "lab", tmp_path / "told"
+    run("record", robots.parent / "noted.mcap", "--store", store, "--mongo", "none")
+    words = ("copy", lab, "--store", store, "--watch")
+    with started(*words, output=told) as process:
+        wait_for(lambda: told.read_text().splitlines() == ["copied noted"])
+        run("record", robots.parent / "dropped.mcap", "--store", store, "--mongo", "none")
+        wait_for(lambda: told.read_text().splitlines() == ["copied noted", "copied dropped"])
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    assert "What arrived stays there" in told.read_text()
+    assert answers(lab, "dropped") == answers(store, "dropped")

@@ -1,0 +1,309 @@
+"""Copies to places: cut anywhere and resumed, in all states of a recording."""
+
+from __future__ import annotations
+
+import errno
+import random
+import shutil
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
+from hybridlog.maintenance.places import CopiedFile, Place
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
+from tests.copying.conftest import (
+    STATES,
+    Disturbed,
+    PlaceAt,
+    answers,
+    directory_at,
+    files_in,
+    server_at,
+)
+
+PLACES: dict[str, PlaceAt] = {"directory": directory_at, "server": server_at}
+ROUNDS = 10
+SEED = 20_261_128
+
+
+@pytest.fixture(params=PLACES)
+def place_at(request: pytest.FixtureRequest) -> PlaceAt:
+    return PLACES[request.param]
+
+
+def copied(source: Path, place: Any, *labels: str, **options: Any) -> CopyReport:
+    """Copy recordings of a store; all without labels."""
+    with hl.open(source, mongo="none") as store:
+        chosen = [one for one in store.summaries() if not labels or one.label in labels]
+        return run(store.directory, place, chosen, CopyOptions(**options))
+
+
+def labels_in(path: Path) -> list[str]:
+    with hl.open(path, mongo="none") as store:
+        return sorted(one.label for one in store.summaries())
+
+
+def test_all_places_answer_like_the_robot(robots: Path, tmp_path: Path) -> None:
+    here = robots
+    for name, at in PLACES.items():
+        with at(tmp_path / name) as place:
+            report = copied(here, place)
+            assert sorted(report.copied) == sorted(STATES)
+            counted = Disturbed(place)
+            again = copied(here, counted)
+        assert (again.copied, sorted(again.known)) == ([], sorted(STATES))
+        assert counted.asked == ["have"]  # of all that are there already
+        here = tmp_path / name
+    for label in STATES:
+        right = answers(robots, label)
+        for name in PLACES:
+            assert answers(tmp_path / name, label) == right, (name, label)
+            there = tmp_path / name / "recordings" / label
+            assert files_in(there) == files_in(robots / "recordings" / label)
+    with hl.open(here, mongo="none") as store:
+        assert not store.verify().findings
+
+
+def test_a_copy_that_was_cut_goes_on(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
+    label = "dropped"  # segments, and files of columns
+    with place_at(tmp_path / "whole") as place:
+        whole = Disturbed(place)
+        total = copied(robots, whole, label).bytes_copied
+    draw = random.Random(SEED)
+    cuts = [(None, draw.randrange(total)) for _ in range(ROUNDS)]
+    cuts += [(number, None) for number in range(1, len(whole.asked))]
+    right = files_in(robots / "recordings" / label)
+    for number, (requests, size) in enumerate(cuts):
+        target = tmp_path / str(number)
+        with suppress(StoreError), place_at(target) as place:
+            cut = Disturbed(place, requests, size)
+            copied(robots, cut, label)
+        # Nothing is believed before all of it is there.
+        assert not [*(target / "recordings").glob("[!.]*")]
+        with place_at(target) as place:
+            report = copied(robots, place, label)
+        assert report.copied == [label]
+        assert report.bytes_copied == total - cut.taken
+        assert files_in(target / "recordings" / label) == right
+        assert [path.name for path in (target / "recordings").iterdir()] == [label]
+        shutil.rmtree(target)
+
+
+def test_a_connection_is_cut_at_any_byte(robots: Path, tmp_path: Path) -> None:
+    draw = random.Random(SEED)
+    arrived = 0
+    for number in range(ROUNDS):
+        with suppress(StoreError), server_at(tmp_path / "lab", draw.randrange(20_000)) as place:
+            copied(robots, place, "noted", piece=1000)
+        hidden = [*(tmp_path / "lab" / "recordings").glob(".importing-*/*.mcap")]
+        before, arrived = arrived, sum(path.stat().st_size for path in hidden)
+        assert arrived >= before, number
+    with server_at(tmp_path / "lab") as place:
+        assert copied(robots, place, "noted").copied == ["noted"]
+    assert answers(tmp_path / "lab", "noted") == answers(robots, "noted")
+
+
+def test_what_is_there_is_proved_before_it_is_believed(
+    robots: Path, tmp_path: Path, place_at: PlaceAt
+) -> None:
+    """Bytes that a cut copy has left, and that changed since, are copied again."""
+    with suppress(StoreError), place_at(tmp_path / "lab") as place:
+        copied(robots, Disturbed(place, bytes_taken=30_000), "recorded")
+    hidden = sorted((tmp_path / "lab" / "recordings").glob(".importing-*/*.mcap"))
+    assert len(hidden) == 2
+    for path in hidden:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+    with place_at(tmp_path / "lab") as place:
+        assert copied(robots, place, "recorded").copied == ["recorded"]
+    there, here = (at / "recordings" / "recorded" for at in (tmp_path / "lab", robots))
+    assert files_in(there) == files_in(here)
+
+
+def test_damaged_recordings_are_refused_and_others_are_copied(
+    robots: Path, tmp_path: Path, place_at: PlaceAt
+) -> None:
+    source = tmp_path / "damaged"
+    shutil.copytree(robots, source)
+    path = source / "recordings" / "recorded" / "000001.mcap"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 1
+    path.write_bytes(data)
+    (source / "recordings" / "noted" / "000000.mcap").unlink()
+    with place_at(tmp_path / "lab") as place:
+        report = copied(source, place)
+    assert sorted(report.copied) == ["compacted", "dropped", "expired"]
+    assert "does not match its checksums" in report.refused["recorded"]
+    assert "is incomplete" in report.refused["noted"]
+    assert labels_in(tmp_path / "lab") == ["compacted", "dropped", "expired"]
+
+
+def test_a_place_believes_nothing(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
+    with hl.open(robots, mongo="none") as store:
+        recording = store.entry("recorded").id
+    lines = (robots / "recordings" / "recorded" / "journal").read_bytes()
+    other = lines.replace(recording.encode(), b"0" * 32)
+    file = CopiedFile("000000.mcap", 4, "sha256:0")
+    with place_at(tmp_path / "lab") as place:
+        place.begin(recording, wants_payloads=True)
+        for journal, why in ((lines, "was not copied"), (other, "damaged, or of another")):
+            with pytest.raises(StoreError, match=why):
+                place.publish("x", journal, lacks_payloads=False)
+        place.append(file, 0, b"abcd")
+        assert not place.prove(file)
+        for at, data, why in ((9, b"abcd", "does not have 9 bytes"), (0, b"abcde", "more came")):
+            with pytest.raises(StoreError, match=why):
+                _append(place, file, at, data)
+    assert labels_in(tmp_path / "lab") == []
+
+
+def _append(place: Place, file: CopiedFile, at: int, data: bytes) -> None:
+    place.append(file, at, data)
+    place.prove(file)  # a server says only now that it failed
+
+
+@pytest.mark.parametrize(
+    "name", ["../../x", "../000000.mcap", "journal", "/etc/x", "a/../b", "a/..", "..", "a/b/c"]
+)
+def test_a_server_writes_only_its_store(robots: Path, tmp_path: Path, name: str) -> None:
+    with server_at(tmp_path / "lab") as place:
+        place.begin("0" * 32, wants_payloads=True)
+        with pytest.raises(StoreError, match="has ended"):
+            _append(place, CopiedFile(name, 4, "sha256:0"), 0, b"abcd")
+    assert {path.name for path in tmp_path.iterdir()} == {"lab"}
+    assert [*(tmp_path / "lab" / "recordings").glob("*/*")] == [
+        tmp_path / "lab" / "recordings" / f".importing-{'0' * 32}" / "writer.lock"
+    ]
+
+
+def test_fields_come_first_and_payloads_later(
+    robots: Path, tmp_path: Path, place_at: PlaceAt
+) -> None:
+    lab = tmp_path / "lab"
+    before = sorted(path.name for path in robots.iterdir())
+    with place_at(lab) as place:
+        report = copied(robots, place, "recorded", "dropped", "noted", only_fields=True)
+        assert len(report.copied) == 3
+        assert copied(robots, place, only_fields=True).copied == ["compacted", "expired"]
+    assert sorted(path.name for path in robots.iterdir()) == before
+    right = answers(robots, "noted")
+    fields = answers(lab, "noted")
+    assert fields == {key: value for key, value in right.items() if key in fields}
+    assert len(fields) < len(right), "payloads are not there"
+    with hl.open(lab, mongo="none") as store:
+        assert not store.verify().findings
+        store.tag("noted", place="lab")
+        store.note("noted", "seen")
+        store.mark("noted", "end", "there")
+        store.rename("recorded", "drive")
+    # What was added there stays, and the robot's own later tags do not come.
+    with place_at(lab) as place:
+        report = copied(robots, place)
+    assert sorted(report.copied) == ["compacted", "drive", "dropped", "noted"]
+    assert report.known == ["expired"]
+    for there, here in (("dropped", "dropped"), ("drive", "recorded"), ("noted", "noted")):
+        found, right = answers(lab, there), answers(robots, here)
+        own = {"entry", "notes", "marks"} if there == "noted" else set()
+        assert {k: v for k, v in found.items() if k not in own} == {
+            k: v for k, v in right.items() if k not in own
+        }
+    with hl.open(lab, mongo="none") as store:
+        entry = store.entry("noted")
+        assert entry.tags == {"place": "lab"}
+        assert [note["text"] for note in entry.notes] == ["it rained", "seen"]
+        assert [mark["text"] for mark in entry.marks] == ["here", "there"]
+        assert not store.verify().findings
+
+
+def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path: Path) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    right = {label: answers(robot, label) for label in STATES}
+    with hl.open(robot, mongo="none") as store:
+        store.copy(lab, ["compacted"])
+        path = lab / "recordings" / "compacted" / "000000.mcap"
+        data = bytearray(path.read_bytes())
+        data[len(data) // 3] ^= 1
+        path.write_bytes(data)
+        report = store.copy(lab, None, CopyOptions(then_expire=True))
+        assert len(report.problems) == 1
+        assert "compacted stay" in report.problems[0]
+        assert report.freed_bytes > 0
+        with pytest.raises(UsageError, match="cannot expire"):
+            store.copy(lab, None, CopyOptions(then_expire=True, only_fields=True))
+    for label in STATES:
+        is_gone = label in {"recorded", "dropped"}  # a pin keeps the noted one
+        found = answers(robot, label)
+        assert (found != right[label]) == is_gone, label
+        assert found == {key: value for key, value in right[label].items() if key in found}
+        if label != "compacted":
+            assert answers(lab, label) == right[label]
+
+
+def test_a_full_disk_there_keeps_what_arrived(
+    robots: Path, tmp_path: Path, place_at: PlaceAt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(files.System):
+        left = 20_000
+
+        def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+            if len(parts[0]) == 1000:  # a piece of a file
+                self.left -= 1000
+            if self.left < 0:
+                raise OSError(errno.ENOSPC, "full")
+            return super().writev(fd, parts)
+
+    monkeypatch.setattr(files, "system", Full())
+    with place_at(tmp_path / "lab") as place, pytest.raises(DiskFullError):
+        copied(robots, place, "recorded", piece=1000)
+    monkeypatch.undo()
+    arrived, size = (
+        sum(path.stat().st_size for path in store.glob("*.mcap"))
+        for store in (*(tmp_path / "lab" / "recordings").iterdir(), robots / "recordings/recorded")
+    )
+    with place_at(tmp_path / "lab") as place:
+        report = copied(robots, place, "recorded")
+    assert arrived >= 20_000
+    assert report.bytes_copied == size - arrived
+    assert answers(tmp_path / "lab", "recorded") == answers(robots, "recorded")
+
+
+def test_two_copies_at_once_end_with_one(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
+    """And who reads there meanwhile sees it."""
+    lab = tmp_path / "lab"
+    with hl.open(lab, mongo="none", create=True) as reader:
+        barrier = threading.Barrier(2)
+
+        def copy(_: int) -> CopyReport:
+            with place_at(lab) as place:
+                barrier.wait()
+                return copied(robots, place, "dropped", piece=1000)
+
+        with ThreadPoolExecutor(2) as pool:
+            found = [*pool.map(copy, range(2))]
+        assert sorted([*one.copied, *one.known] for one in found) == [["dropped"]] * 2
+        assert [one.label for one in reader.summaries()] == ["dropped"]
+        assert reader.topic("/number").count() > 20
+    assert answers(lab, "dropped") == answers(robots, "dropped")
+
+
+def test_the_rate_is_limited(robots: Path, tmp_path: Path) -> None:
+    sizes = []
+
+    class Counted(Disturbed):
+        def append(self, file: CopiedFile, at: int, data: bytes) -> None:
+            sizes.append(len(data))
+            self._place.append(file, at, data)
+
+    with directory_at(tmp_path / "lab") as place:
+        copied(robots, Counted(place), "recorded", limit_rate=100_000)
+    assert max(sizes) <= 25_000
