@@ -432,7 +432,8 @@ class DirectoryPlace:
             elif line["event"] in _EDITS:
                 found.append(line)
         now = journal.parse(data)
-        for number in {line["segment"] for line in found if line["event"] == journal.SEALED}:
+        marked = {line["segment"] for line in found if line["event"] == journal.SEALED}
+        for number in marked - now.unmarked:
             name = sealed_name(number)
             if number in state.sealed or number not in now.sealed:
                 raise StoreError(f"Recording {label!r} was marked here and there: copy it by hand.")
