@@ -15,10 +15,14 @@ def each(*cases: Any) -> list[Any]:
     return [pytest.param(case, marks=EXHAUSTIVE) for case in cases]
 
 
-def in_turn(ones: Sequence[Any], others: Sequence[Any]) -> list[Any]:
-    """All pairs, by the others; by default each of the ones is in one of them."""
+def in_turn(ones: Sequence[Any], others: Sequence[Any], every: int = 1) -> list[Any]:
+    """All pairs, by the others; by default each of the ones, or every n-th, is in one of them."""
     return [
-        pytest.param(one, other, marks=[] if place == number % len(others) else EXHAUSTIVE)
+        pytest.param(
+            one,
+            other,
+            marks=EXHAUSTIVE if number % every or place != number // every % len(others) else [],
+        )
         for place, other in enumerate(others)
         for number, one in enumerate(ones)
     ]

@@ -29,11 +29,11 @@ def _id(one: Asked) -> str:
 KINDS = ("one", "many")
 
 
-def asked_in_turn(rules: list[Asked]) -> pytest.MarkDecorator:
-    """Each rule about one kind of recording; `-m exhaustive`: about each."""
+def asked_in_turn(rules: list[Asked], every: int = 1) -> pytest.MarkDecorator:
+    """Each rule, or every n-th, about one kind of recording; `-m exhaustive`: about each."""
     return pytest.mark.parametrize(
         ("one", "running"),
-        in_turn(rules, KINDS),
+        in_turn(rules, KINDS, every),
         indirect=["running"],
         ids=lambda it: it if isinstance(it, str) else _id(it),
     )
@@ -73,7 +73,7 @@ def test_at_rest(
         assert not misfit(done.json, schema_of(words))
 
 
-@asked_in_turn([rules[0] for rules in COMMANDS.values()])
+@asked_in_turn([rules[0] for rules in COMMANDS.values()], every=4)
 def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -> None:
     words, out = place_for(one.words, tmp_path / "out")
     done = run(*words, store=running.path, code=one.code)
