@@ -1,0 +1,104 @@
+"""Options that all commands of a kind share."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+import hybridlog as hl
+from hybridlog.cli.app import GROUPS
+from hybridlog_storage.messages import Channel
+
+from .within import answer
+
+CHANNEL = Channel("/n", "json", None, {})
+ABOUT_TOPICS = {"fetch", "intervals", "stats", "align"}
+
+
+def test_topics_are_arguments_or_options(store: Path) -> None:
+    chosen = ("-r", "robot", "--json")
+    for words in (
+        ("intervals", "--where", "ranges.min < 5"),
+        ("intervals", "--gaps"),
+        ("stats", "--fields", "ranges.min"),
+        ("stats", "--rate"),
+    ):
+        found = answer(*words, "scan", *chosen, store=store).json
+        assert found == answer(*words, "-t", "scan", *chosen, store=store).json
+    assert answer("fetch", "scan", "odom", "--count", "-r", "robot", store=store).out == (
+        answer("fetch", "-t", "scan", "-t", "odom", "--count", "-r", "robot", store=store).out
+    )
+    for command in ABOUT_TOPICS:
+        assert command in GROUPS["Ask"]
+        more = ("--to", "scan") if command == "align" else ()
+        assert "Missing TOPIC" in str(_error(command, *more, store=store))
+
+
+def _error(*words: str, store: Path) -> str:
+    with pytest.raises(AssertionError) as caught:
+        answer(*words, store=store)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("intervals", "scan", "-r", "robot", "--where", "ranges.min < 5"),
+        ("stats", "scan", "odom", "-r", "robot"),
+        ("stats", "scan", "odom", "-r", "robot", "--rate"),
+        ("check", "robot"),
+        ("diff", "robot", "torn"),
+    ],
+    ids=" ".join,
+)
+def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path) -> None:
+    code = None if words[0] == "diff" else 0
+    rows = answer(*words, "--json", store=store, code=code).json
+    assert rows
+    file = tmp_path / "rows.parquet"
+    answer(*words, "-o", file, "-q", store=store, code=code)
+    assert pq.read_table(file).num_rows == len(rows)
+    lines = answer(*words, "-F", "jsonl", "-n", "1", store=store, code=code).lines
+    assert len(lines) == 1
+    if "--rate" not in words:  # its times have other names in JSON
+        assert _set(json.loads(lines[0])) == _set(rows[0])
+        assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
+        assert "--json is a form" in _error(*words, "--json", "-F", "csv", store=store)
+
+
+def _set(row: dict[str, object]) -> dict[str, object]:
+    """The row without its nulls, which few of the forms have."""
+    return {name: value for name, value in row.items() if value is not None}
+
+
+def test_ages_choose(tmp_path: Path) -> None:
+    now = time.time_ns()
+    day = 86_400 * 10**9
+    with hl.open(tmp_path / "s", create=True) as opened:
+        for name, ages in (("old", (40, 35)), ("both", (35, 1)), ("new", (2, 1))):
+            with opened.start(name) as recording:
+                for age in ages:
+                    text = json.dumps({"age": age}).encode()
+                    recording.write(CHANNEL, text, log_time=now - age * day)
+        labels = [one.label for one in opened.recordings(older_than="30d")]
+        assert labels == ["old"]
+
+    def found(*words: str) -> list[str]:
+        return [
+            one["recording"] for one in answer("ls", *words, "--json", store=tmp_path / "s").json
+        ]
+
+    assert found("--last", "30d") == ["both", "new"]
+    assert found("--older-than", "30d") == ["old"]
+    assert found("--older-than", "12h", "--last", "30d") == ["both", "new"]
+    # Messages of day 35 are in a recording of the last thirty days, and are none of them.
+    assert answer("fetch", "n", "--last", "30d", "--count", store=tmp_path / "s").out == "3\n"
+    assert answer("stats", "n", "--last", "30d", "--json", store=tmp_path / "s").json[0]["max"] == 2
+    for other in ("--between", "--during"):
+        assert "give one of them" in _error(
+            "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s"
+        )
