@@ -1452,7 +1452,8 @@ class Store:
         next call goes on where this one stopped.
 
         Args:
-            to: The other store: a directory, which is made, or `ssh://user@host/path`.
+            to: The other store: a directory, which is made, `ssh://user@host/path`, or a place in
+                a bucket such as `s3://lab/store`.
             recordings: The recordings, or what they must satisfy; None for all.
             options: What is copied of them, and how.
             progress: Called with the bytes copied of all that are to be copied.
@@ -1473,12 +1474,46 @@ class Store:
             self.directory.check_writable()
         self.session.catch_up()
         chosen, proved = self._chosen(recordings), list[str]()
+        address = address_of(to)
+        if address is not None:
+            return self._publish(address, chosen, wanted, progress)
         with _place(to, wanted) as place:
             report = run(
                 self.directory, place, chosen, wanted, progress=progress, proved=proved.append
             )
             for recording in proved:
                 self._expire(recording, place.name, report, progress)
+        return report
+
+    def _publish(
+        self,
+        address: str,
+        chosen: Sequence[RecordingSummary],
+        options: CopyOptions,
+        progress: Progress | None,
+    ) -> CopyReport:
+        """Copy recordings into a bucket."""
+        from hybridlog.maintenance.copying import CopyReport
+        from hybridlog.maintenance.publish import publish
+        from hybridlog_storage.remote.store import RemoteDirectory
+
+        if options.only_fields or options.then_expire or options.limit_rate:
+            raise UsageError(
+                "--only-fields, --then-expire and --limit-rate are for directories and servers: "
+                "recordings go into a bucket as a whole."
+            )
+        target, report = RemoteDirectory.create_in(address), CopyReport()
+        tables = self.session.tables
+        for entry in self.session.entries(chosen):
+            try:
+                label, is_new = publish(
+                    self.directory, self.catalog, entry, target, progress, tables=tables
+                )
+            except StoreError as error:
+                report.refused[entry.label] = str(error)
+                continue
+            (report.copied if is_new else report.known).append(label)
+            report.bytes_copied += entry.stored_bytes if is_new else 0
         return report
 
     def _expire(

@@ -15,7 +15,7 @@ from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
 from hybridlog.cli.progress import LateBar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import parse_size
-from hybridlog_storage.errors import ResourceError, StoreError, UsageError
+from hybridlog_storage.errors import BucketError, ResourceError, StoreError, UsageError
 from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ _RETRY_S = 10.0  # after a broken connection
 @dataclass(frozen=True, kw_only=True)
 class _Copy(Choosing, InStore, AsJson, Quiet):
     names: tuple[str, ...] = options.names_argument()  # type: ignore[misc]
-    to: str = argument("A directory, or ssh://user@host/path.", "TO")
+    to: str = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "TO")
     only_fields: bool = option("Fields first; a later copy adds the payloads.")
     then_expire: bool = option(
         "Delete payloads here once their copy is proved there; pinned ones stay."
@@ -49,7 +49,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
 
 @command(_Copy, "copy")
 def copy_command(given: _Copy) -> None:
-    """Copy recordings to a directory, or to a server over ssh.
+    """Copy recordings to a directory, to a server over ssh, or into a bucket.
 
     Every byte is proved there before a recording gets its name. After a cut, run it again: it
     goes on where it stopped. A recording that is there already is not copied again.
@@ -96,7 +96,7 @@ def _watch(store: Store, given: _Copy, how: CopyOptions) -> NoReturn:
             done.update(new)
             seen = now
             pause(_WATCH_S)
-        except (StoreError, ResourceError) as error:
+        except (StoreError, BucketError, ResourceError) as error:
             output.note(f"{error} Trying again in {_RETRY_S:.0f} s.")
             pause(_RETRY_S)
 

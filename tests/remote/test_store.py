@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from hybridlog.maintenance.copying import CopyOptions
 from hybridlog.maintenance.publish import publish
 from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
@@ -127,6 +128,20 @@ def test_edits(here: Path, address: str, proxy: Proxy) -> None:
         assert not store.verify().findings
     answer("tag", "A-new-run", "why=test", store=Path(address))
     assert "why=test" in answer("ls", store=Path(address)).out
+
+
+def test_the_command_copies(here: Path, address: str, proxy: Proxy) -> None:
+    said = answer("copy", "-r", "short-*", address, "--json", store=here).json
+    assert (said["copied"], said["known"]) == (["short-0", "short-1", "short-2"], [])
+    proxy.requests.clear()
+    said = answer("copy", "-r", "short-*", address, "--json", store=here).json
+    assert (said["copied"], said["known"]) == ([], ["short-0", "short-1", "short-2"])
+    assert len(proxy.requests) <= 3 + 3
+    with pytest.raises(UsageError, match="as a whole"):
+        with hl.open(here, mongo="none") as store:
+            store.copy(address, options=CopyOptions(only_fields=True))
+    with hl.open(address) as store:
+        assert store.topic("/arm").count() == 60
 
 
 def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
