@@ -102,3 +102,22 @@ def test_ages_choose(tmp_path: Path) -> None:
         assert "give one of them" in _error(
             "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s"
         )
+
+
+def test_what_people_read(store: Path, tmp_path: Path) -> None:
+    """A contract's verdict in a comparison, and ends of marks as times."""
+    rules = tmp_path / "rules.yaml"
+    answer("check", "robot", "--make", rules, store=store)
+    told = answer("diff", "robot", "torn", "--contract", rules, store=store, code=None).err
+    assert "robot: " in told
+    assert "rules: none broken." in told
+    assert told.count(" broken.") == 2
+    with hl.open(tmp_path / "s", create=True) as opened:
+        with opened.start("run") as recording:
+            for second in range(3):
+                recording.write(CHANNEL, b'{"age": 1}', log_time=(5 + second) * 10**9)
+        opened.mark("run", "+1s", "slipped", until="+2s")
+    shown = answer("fetch", "marks", "-F", "table", store=tmp_path / "s").lines[1]
+    assert shown.split() == ["1970-01-01T00:00:06Z", "slipped", "1970-01-01T00:00:07Z"]
+    (line,) = answer("fetch", "marks", "-F", "jsonl", store=tmp_path / "s").lines
+    assert json.loads(line)["end"] == 7 * 10**9
