@@ -49,7 +49,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
 
 @command(_Copy, "copy")
 def copy_command(given: _Copy) -> None:
-    """Copy recordings to a directory, to a server over ssh, or into a bucket.
+    """Copy recordings to a directory, a server over ssh, or a bucket.
 
     Every byte is proved there before a recording gets its name. After a cut, run it again: it
     goes on where it stopped. A recording that is there already is not copied again.
