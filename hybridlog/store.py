@@ -1504,7 +1504,10 @@ class Store:
             )
         target, report = RemoteDirectory.create_in(address), CopyReport()
         tables = self.session.tables
-        for entry in self.session.entries(chosen):
+        target.refresh()
+        there = {one.id: target.label_of_id(one.id) for one in chosen}
+        report.known += filter(None, there.values())
+        for entry in self.session.entries([one for one in chosen if not there[one.id]]):
             try:
                 label, is_new = publish(
                     self.directory, self.catalog, entry, target, progress, tables=tables
