@@ -74,10 +74,18 @@ def publish(
     fields = _bring_fields(tables or Tables(source.path), entry, target)
     for _ in range(TRIES):
         with suppress(ObjectExistsError), target.changing():
-            if label := target.label_of_id(entry.id):  # another process was faster
-                return label, False
-            label = target.free_label(entry.label)
-            target.add_recording(label, listed, fields)
+            label, found = target.label_of_id(entry.id), listed.files
+            if label:  # another process was faster
+                there = target.files_of(label)
+                # Of large files the last one to come replaced what the other one had sent.
+                newer = {
+                    path: one for path, one in found.items() if _replaces(one, there.get(path))
+                }
+                if not newer:
+                    return label, False
+                found = {**there, **newer}
+            label = label or target.free_label(entry.label)
+            target.add_recording(label, ListedRecording(entry.id, found), fields)
             own = open_catalog(target)
             _bring_results(catalog, entry, own)
             described = describe_now(target, own, label)
@@ -89,6 +97,10 @@ def publish(
             own.put(described)
             return label, True
     raise StoreError(f"{target.source.bucket.address} changes all the time. Copy again.")
+
+
+def _replaces(one: Object, other: Object | None) -> bool:
+    return other is not None and other.name == one.name and other.version != one.version
 
 
 def _bring(

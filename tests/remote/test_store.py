@@ -193,6 +193,9 @@ def test_publishing_goes_on_after_each_request(
         else:
             pytest.fail("it never ends")
         assert allowed > 8
+        assert not [
+            name for method, name, _ in proxy.requests if method == "GET" and "parq" in name
+        ]
         proxy.reset()
         assert publish(*arguments) == ("moved", False)
         assert len(proxy.requests) == 1
@@ -243,6 +246,35 @@ def test_old_objects_are_not_taken_for_own(
     monkeypatch.setattr(bucket_module, "UNLISTED_DAYS", 1)
     with pytest.raises(ObjectExistsError):
         bucket.create("a", b"1")
+
+
+def test_two_who_send_large_files_at_once(
+    here: Path, address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Some servers give a new version to the same bytes when they come again."""
+    target = RemoteDirectory.create_in(address)
+    create, is_first = Bucket.create, True
+
+    def created(bucket: Bucket, name: str, content: Any) -> str:
+        nonlocal is_first
+        version = create(bucket, name, content)
+        if name.endswith(".mcap") and is_first:
+            is_first = False
+            assert publish(*arguments) == ("short-0", True)  # by another process
+            other = bucket._put(name, content, "overwrite")
+            assert other != version
+            version = other
+        return version
+
+    with hl.open(here, mongo="none") as store:
+        arguments = store.directory, store.catalog, store.entry("short-0"), target
+        monkeypatch.setattr(Bucket, "create", created)
+        publish(*arguments)
+    files.mounted.clear()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "elsewhere"))
+    with hl.open(address) as store:
+        assert len(list(store.topic("/arm"))) == 20
+        assert len(store.recordings()) == 1
 
 
 def test_damaged_fields_are_left_out(

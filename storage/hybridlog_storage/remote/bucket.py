@@ -11,6 +11,7 @@ reads them (`AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL`, `AWS_ALLOW_HTTP`, `GOOGLE_â
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import re
 import secrets
@@ -313,6 +314,8 @@ class Bucket:
         if time.time_ns() - about.modified > (UNLISTED_DAYS - 1) * _DAY_NS:
             return None
         if isinstance(content, bytes):
+            if about.version.strip('"') == hashlib.md5(content, usedforsecurity=False).hexdigest():
+                return about.version  # so it is on most servers that speak S3
             pieces: Iterator[bytes] = iter([content])
         else:
             file = content

@@ -474,6 +474,10 @@ class RemoteDirectory(StoreDirectory):
         """The label of a recording, by its id; empty if it is not here."""
         return next((name for name, one in self._now.recordings.items() if one.id == recording), "")
 
+    def files_of(self, label: str) -> Mapping[str, Object]:
+        """The object of each file of a recording."""
+        return self._now.recordings[label].files
+
     def add_file(self, recording: str, path: str, content: bytes | BinaryIO) -> Object:
         """Create the object of a file, under another name if what a crash left has its own.
 
