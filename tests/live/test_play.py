@@ -254,14 +254,14 @@ def account(path: Path, sent: dict[str, Sent], killed: dict[str, int], seconds: 
                     assert sum(row["count"] for row in ours) == len(gone)
                     assert {row["cause"] for row in ours} <= {"disk"}
                     assert all(any(r["from"] <= at <= r["to"] for r in ours) for at in gone)
-        marks = [m.fields for m in store.topic(MARKS)]
-        causes = Counter(mark["tags"].get("cause", mark["text"]) for mark in marks)
-        rows = store.recordings("full")[0].end["losses"]
-        lost = sum(row["count"] for row in rows if row["topic"] == MARKS)
-        assert causes["slipped"] + causes["contract"] + lost == 6
-        assert causes["slipped"] >= 2
-        assert causes["contract"] >= 2
-        assert causes["clock"] >= 1
+            # Of a short part a kill may take all marks: they were not flushed yet.
+            if part == "full" or (part in killed and seconds > 100):
+                marks = [m.fields for m in store.query([MARKS], [part])]
+                causes = Counter(mark["tags"].get("cause", mark["text"]) for mark in marks)
+                rows = entry.end["losses"] if part == "full" else ()
+                lost = sum(row["count"] for row in rows if row["topic"] == MARKS)
+                assert causes["slipped"] + causes["contract"] + lost >= 2
+                assert causes["clock"] or part != "clock"
         assert store.verify().findings == []
     return expired
 
