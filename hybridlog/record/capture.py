@@ -6,6 +6,7 @@ recording, provides its writer, and completes or removes the recording.
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +14,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import BoundedSemaphore
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import new_id, recording_metadata, sealed_event, text
@@ -21,10 +22,11 @@ from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
 from hybridlog.maintenance.retention import Rules
+from hybridlog.wording import parse_size
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError
+from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
@@ -37,6 +39,10 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.segments.segment_file import Sealed
+
+_REMOTE_SEGMENT: Final = "128MiB"
+_REMOTE_SEGMENTS: Final = 64 << 20, 256 << 20
+"""Least and greatest size in bytes: what a cut costs again, and what requests cost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +110,12 @@ class Capture:
         self._directory = directory
         self._no_index = no_index or (lambda _: False)
         self._sync = settings.sync != "never"
-        largest = Rules.of(directory.settings.retention).segment_size
-        settings = replace(settings, segment_size=int(min(settings.segment_size, largest)))
+        largest = min(
+            settings.segment_size,
+            Rules.of(directory.settings.retention).segment_size,
+            remote_segment_size(directory.settings.remote),
+        )
+        settings = replace(settings, segment_size=int(largest))
         self._end: Mapping[str, Any] | None = None
         self._turn = 1
         self._held = ExitStack()
@@ -298,6 +308,21 @@ class Capture:
             self._directory.sweep(self._directory.hide(label))
             raise
         return entry
+
+
+def remote_segment_size(table: Mapping[str, Any] | None) -> float:
+    """The greatest size of a new segment by the store's table `[remote]`.
+
+    Raises:
+        UsageError: The table is malformed.
+    """
+    if table is None:
+        return math.inf
+    size = parse_size(str(table.get("segment-size", _REMOTE_SEGMENT)))
+    least, most = _REMOTE_SEGMENTS
+    if table.keys() - {"segment-size"} or not least <= size <= most:
+        raise UsageError("[remote] in hybridlog.toml has segment-size, from 64MiB to 256MiB.")
+    return size
 
 
 def origin() -> dict[str, Any]:

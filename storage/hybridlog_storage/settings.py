@@ -62,6 +62,7 @@ class StoreSettings:
         optional: Features that a reader may ignore.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
         retention: The table `[retention]`, as it stands there.
+        remote: The table `[remote]`, the same; None without it.
     """
 
     store_id: str
@@ -71,6 +72,7 @@ class StoreSettings:
     optional: tuple[str, ...] = ()
     cache_mb: int | None = None
     retention: Mapping[str, Any] = field(default_factory=dict)
+    remote: Mapping[str, Any] | None = None
 
 
 def read_settings(path: Path) -> StoreSettings:
@@ -120,10 +122,17 @@ def read_settings(path: Path) -> StoreSettings:
         except UsageError as error:
             raise StoreError(str(error)) from None
     optional = _names(file, values, "optional")
-    retention = values.get("retention", {})
-    if not isinstance(retention, dict):
-        raise StoreError(f"{file}: retention must be a table, [retention].")
-    return StoreSettings(store_id, mongo, shared, requires, optional, cache_mb, retention)
+    retention, remote = _table(file, values, "retention"), _table(file, values, "remote")
+    return StoreSettings(
+        store_id, mongo, shared, requires, optional, cache_mb, retention or {}, remote
+    )
+
+
+def _table(file: Path, values: Mapping[str, Any], name: str) -> dict[str, Any] | None:
+    table = values.get(name)
+    if table is not None and not isinstance(table, dict):
+        raise StoreError(f"{file}: {name} must be a table, [{name}].")
+    return table
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
@@ -157,9 +166,10 @@ def settings_text(settings: StoreSettings) -> bytes:
     for name, features in (("requires", settings.requires), ("optional", settings.optional)):
         if features:
             lines.append(f"{name} = {_as_toml(features)}")
-    if settings.retention:
-        lines.append("\n[retention]")
-        lines += [f"{_quoted(k)} = {_as_toml(v)}" for k, v in settings.retention.items()]
+    for name, table in (("retention", settings.retention or None), ("remote", settings.remote)):
+        if table is not None:
+            lines.append(f"\n[{name}]")
+            lines += [f"{_quoted(k)} = {_as_toml(v)}" for k, v in table.items()]
     return ("\n".join(lines) + "\n").encode()
 
 
