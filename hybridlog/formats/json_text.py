@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_types import is_bytes, is_list, is_text, is_time
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -90,9 +91,13 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         return array.cast(pa.string())
     if pa.types.is_floating(kind):
         return _floats(array)
-    if is_time(kind):
-        unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
-        return array.cast(unit).cast(pa.int64()).cast(pa.string())
+    if pa.types.is_temporal(kind):
+        try:
+            return _times(array)
+        except (OverflowError, pa.ArrowInvalid) as error:
+            raise UsageError(
+                f"A {kind} is too far away for JSON ({error}). In SQL, `::varchar` makes it text."
+            ) from error
     if is_text(kind):
         # Usually few strings are distinct: each is quoted once.
         words = array.dictionary_encode()
@@ -100,10 +105,17 @@ def _values(array: pa.Array) -> pa.Array:  # noqa: PLR0911 - a case a type
         return pa.array(quoted, pa.string()).take(words.indices)
     if is_bytes(kind):
         return pc.binary_join_element_wise('"', base64_column(array), '"', "")
-    if pa.types.is_temporal(kind):  # dates, times of day, intervals
-        texts = [None if value is None else _temporal(value) for value in array.to_pylist()]
-        return pa.array(texts, pa.string())
     return _nested(array)
+
+
+def _times(array: pa.Array) -> pa.Array:
+    kind = array.type
+    if is_time(kind):
+        unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
+        return array.cast(unit).cast(pa.int64()).cast(pa.string())
+    # Dates, times of day, intervals.
+    texts = [None if value is None else _temporal(value) for value in array.to_pylist()]
+    return pa.array(texts, pa.string())
 
 
 def _temporal(value: object) -> str:

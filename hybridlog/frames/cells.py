@@ -34,7 +34,10 @@ def _cell(value: pa.Scalar, *, exact: bool) -> str:
     for applies, shown in _forms(exact=exact):
         if applies(value.type):
             return shown(value)
-    return _cut(str(value.as_py()), _MAX_CELL)
+    try:
+        return _cut(str(value.as_py()), _MAX_CELL)
+    except OverflowError:  # DuckDB has infinite dates
+        return f"{value.value} days"
 
 
 @functools.cache

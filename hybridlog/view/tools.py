@@ -19,8 +19,9 @@ from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of
+from hybridlog.schema.plain import without_nan
 from hybridlog.view.context import SQL_MEMORY
-from hybridlog_storage.errors import PayloadError, TimeError, TopicError
+from hybridlog_storage.errors import PayloadError, TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -168,7 +169,12 @@ def sql(context: Context, text: str, seconds: float) -> Answer:
     try:
         answer = connection.query(text, timeout=seconds)
         table, is_cut = answer.first(MAX_ROWS, MAX_BYTES)
-        values = [one.to_pylist(maps_as_pydicts="strict") for one in table.columns]
+        try:
+            values = [one.to_pylist(maps_as_pydicts="strict") for one in table.columns]
+        except (OverflowError, ValueError) as error:  # such as a date that is infinite
+            raise UsageError(
+                f"A value has no plain form ({error}): `::varchar` makes it text."
+            ) from error
         rows = [*map(list, zip(*values, strict=True))]
         found = {"columns": table.column_names, "lacks": answer.told(), "rows": rows}
         return _answer(found, "rows", is_cut=is_cut)
@@ -257,7 +263,8 @@ def _answer(
 ) -> Answer:
     """An answer whose rows fit into it; `more` says whether some were left out."""
     while True:
-        text = json.dumps({**values, "more": is_cut}, ensure_ascii=False, default=str)
+        plain = without_nan({**values, "more": is_cut})
+        text = json.dumps(plain, ensure_ascii=False, allow_nan=False, default=str)
         if len(text.encode()) <= MAX_BYTES:
             return Answer(text, pictures)
         if len(values[rows]) < 2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import os
 import pty
 import secrets
@@ -58,6 +59,16 @@ def test_json_lines(root: Path) -> None:
     assert (first["day"], first["clock"], first["nothing"]) == ("2020-01-02", "10:00:01", None)
     assert first["i"] == {"months": 0, "days": 3, "nanoseconds": 0}
     assert first["numbered"] == {"1": "a"}
+
+
+@pytest.mark.parametrize("odd", ["'infinity'::date", "'-infinity'::timestamp"])
+def test_a_time_that_python_lacks(root: Path, odd: str) -> None:
+    with pytest.raises(UsageError, match="::varchar"):
+        run(root, f"select {odd} as far", "-F", "jsonl")
+    assert "infinity" in run(root, f"select ({odd})::varchar as far", "-F", "jsonl").stdout
+    shown = run(root, f"select {odd} as far", "-F", "table").stdout.splitlines()
+    assert shown[0].strip() == "far"
+    assert re.match(r"-?\d+ (days|ns)", shown[1])
 
 
 def test_files(root: Path, tmp_path: Path) -> None:

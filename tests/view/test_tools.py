@@ -162,6 +162,14 @@ def test_large_answers_are_cut(ask: Ask) -> None:
     assert ask("sql", query="select msg from rosout").values["rows"]
 
 
+def test_values_that_json_lacks(ask: Ask) -> None:
+    odd = "select 'nan'::double, '-infinity'::float, {'x': 'infinity'::double}"
+    assert ask("sql", query=odd).values["rows"] == [["NaN", "-Infinity", {"x": "Infinity"}]]
+    for query in ("select 'infinity'::date", "select 'infinity'::timestamp"):
+        assert "::varchar" in ask("sql", query=query).error
+    assert ask("sql", query="select 'infinity'::date::varchar").values["rows"] == [["infinity"]]
+
+
 def content(path: Path) -> dict[str, tuple[str, int]]:
     return {
         str(one.relative_to(path)): (
