@@ -1503,6 +1503,8 @@ class Store:
                 "recordings go into a bucket as a whole."
             )
         target, report = RemoteDirectory.create_in(address), CopyReport()
+        if isinstance(self.directory, RemoteDirectory) and self.directory.source is target.source:
+            raise UsageError(f"{address} is this very store: there is nothing to copy.")
         tables = self.session.tables
         target.refresh()
         there = {one.id: target.label_of_id(one.id) for one in chosen}

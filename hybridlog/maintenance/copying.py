@@ -7,6 +7,7 @@ last.
 
 from __future__ import annotations
 
+import os
 import secrets
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,8 +26,8 @@ from hybridlog.maintenance.places import (
 )
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import HeldError, StoreError, unreadable
+from hybridlog_storage.disk.directory import REMOVED, StoreDirectory
+from hybridlog_storage.errors import HeldError, StoreError, UsageError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.stopping import pause
 
@@ -112,6 +113,7 @@ def run(
         proved: Called with the id of each recording that is there with its payloads.
 
     Raises:
+        UsageError: The place is this very store.
         StoreError: The place cannot be written or reached; what was copied stays there.
         DiskFullError: No room; the copy can be run again.
     """
@@ -140,6 +142,8 @@ class _Copying:
         self._due = 0.0  # time from which more may be sent
 
     def run(self, chosen: Sequence[RecordingEntry | RecordingSummary]) -> CopyReport:
+        if self._is_same():
+            raise UsageError(f"{self._place.name} is this very store: there is nothing to copy.")
         there: dict[str, Copied] = {}
         for begin in range(0, len(chosen), _ASKED_AT_ONCE):
             asked = chosen[begin : begin + _ASKED_AT_ONCE]
@@ -159,6 +163,32 @@ class _Copying:
             finally:
                 self._place.leave()
         return self._report
+
+    def _is_same(self) -> bool:
+        """True if the place is the source: it sees a file that was made here this moment.
+
+        Paths do not tell, nor does the id of a store, which its backups have, too.
+        """
+        if self._source.is_remote or not self._source.is_writable:
+            return False  # nothing of it can be deleted
+        while True:
+            # After a crash, the next opening of the store removes it.
+            mark = f"{REMOVED}{secrets.token_hex(8)}"
+            path = self._source.recording(mark)
+            try:
+                flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+                os.close(files.open_file(path, flags, depth=files.IN_FOLDER))
+                try:
+                    is_seen = self._place.sees(mark)
+                finally:
+                    is_removed = not self._source.has(mark)
+                    files.remove_tree(path, depth=files.IN_FOLDER)
+            except OSError as error:
+                if not self._options.then_expire:  # a full disk can be copied from
+                    return False
+                raise durability.explain(error, path, "copying from") from error
+            if is_seen or not is_removed:
+                return is_seen
 
     def _is_known(self, recording: str, there: Copied | None) -> bool:
         """True if the place has all that would be copied."""

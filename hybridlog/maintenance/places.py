@@ -22,7 +22,14 @@ from hybridlog.columns.payload_files import open_file
 from hybridlog.entries import take_inventory
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import IMPORTING, LOCK, LOCK_WAIT_S, PAYLOADS, payload_names
+from hybridlog_storage.disk.directory import (
+    IMPORTING,
+    LOCK,
+    LOCK_WAIT_S,
+    PAYLOADS,
+    REMOVED,
+    payload_names,
+)
 from hybridlog_storage.errors import StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.segments.segment_check import SegmentCheck
@@ -37,6 +44,7 @@ if TYPE_CHECKING:
 
 _SEGMENT: Final = re.compile(r"[0-9]{6,9}\.mcap")
 _ID: Final = re.compile(r"[0-9a-f]{32}")
+_MARK: Final = re.compile(rf"{re.escape(REMOVED)}[0-9a-f]{{16}}")
 _PIECE: Final = 1 << 20
 _FETCHED: Final = 8 << 20  # bytes that a bucket is asked for
 _EDITS: Final = frozenset(
@@ -151,6 +159,9 @@ class Place(Protocol):
     name: str
     """What people call it."""
 
+    def sees(self, mark: str) -> bool:
+        """True if a file that another store has made among its recordings is here, too."""
+
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """Those of some recordings that it has, by id."""
 
@@ -232,6 +243,12 @@ class DirectoryPlace:
         if not self._recording:
             raise StoreError("No copy of a recording was begun.")
         return self._directory.recording(f"{IMPORTING}{self._recording}")
+
+    def sees(self, mark: str) -> bool:
+        """As of `Place`."""
+        if not _MARK.fullmatch(mark):
+            raise StoreError(f"{mark[:40]!r} is no mark of a store.")
+        return self._directory.has(mark)
 
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """As of `Place`."""

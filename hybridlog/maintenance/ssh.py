@@ -112,6 +112,10 @@ class Server:
         if self._receive().get("hybridlog") != _PROTOCOL:
             raise StoreError(f"hybridlog of {self.name} is of another version.")
 
+    def sees(self, mark: str) -> bool:
+        """As of `Place`."""
+        return self._ask("sees", mark=mark) is not False
+
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """As of `Place`."""
         found = _mapping(self._ask("have", recordings=[*recordings]))
@@ -275,6 +279,7 @@ def _have(place: DirectoryPlace, request: Mapping[str, Any], _: bytes) -> Any:
 
 
 _ANSWERS: Final[Mapping[str, Callable[[DirectoryPlace, Mapping[str, Any], bytes], Any]]] = {
+    "sees": lambda place, request, _: place.sees(str(request["mark"])),
     "have": _have,
     "begin": _begin,
     "digest": lambda place, request, _: place.digest(

@@ -60,7 +60,7 @@ def test_all_places_answer_like_the_robot(robots: Path, tmp_path: Path) -> None:
             counted = Disturbed(place)
             again = copied(here, counted)
         assert (again.copied, sorted(again.known)) == ([], sorted(STATES))
-        assert counted.asked == ["have"]  # of all that are there already
+        assert counted.asked == ["sees", "have"]  # of all that are there already
         here = tmp_path / name
     for label in STATES:
         right = answers(robots, label)
@@ -109,6 +109,39 @@ def test_a_connection_is_cut_at_any_byte(robots: Path, tmp_path: Path) -> None:
     with server_at(tmp_path / "lab") as place:
         assert copied(robots, place, "noted").copied == ["noted"]
     assert answers(tmp_path / "lab", "noted") == answers(robots, "noted")
+
+
+@pytest.mark.parametrize("expires", [False, True])
+def test_a_store_is_no_copy_of_itself(
+    robots: Path, tmp_path: Path, place_at: PlaceAt, expires: bool
+) -> None:
+    store = tmp_path / "store"
+    shutil.copytree(robots, store)
+    (tmp_path / "link").symlink_to(store)
+    before = {path: path.read_bytes() for path in (store / "recordings").rglob("*.mcap")}
+    for spelled in (store, tmp_path / "link", tmp_path / "link" / ".." / "store"):
+        with place_at(spelled) as place, pytest.raises(UsageError, match="this very store"):
+            copied(store, place, then_expire=expires)
+    assert {path: path.read_bytes() for path in (store / "recordings").rglob("*.mcap")} == before
+    assert sorted(path.name for path in (store / "recordings").iterdir()) == sorted(STATES)
+    # A backup has the same id, and is another store.
+    with place_at(robots) as place:
+        assert sorted(copied(store, place, then_expire=expires).known) == sorted(STATES)
+
+
+def test_a_mark_that_another_process_removes_is_made_again(robots: Path, tmp_path: Path) -> None:
+    class Swept(Disturbed):
+        def sees(self, mark: str) -> bool:
+            if not self.asked:
+                (robots / "recordings" / mark).unlink()
+            return bool(self.__getattr__("sees")(mark))
+
+    for spelled, is_same in ((robots, True), (tmp_path / "lab", False)):
+        with directory_at(spelled) as place, suppress(UsageError):
+            swept = Swept(place)
+            copied(robots, swept, "noted")
+            assert not is_same
+        assert swept.asked[:2] == ["sees", "sees"]
 
 
 def test_what_is_there_is_proved_before_it_is_believed(

@@ -38,6 +38,8 @@ def test_a_bucket_answers_like_the_robot(
         assert len(proxy.requests) - before <= 3
         with pytest.raises(UsageError, match="as a whole"):
             store.copy(address, options=CopyOptions(only_fields=True))
+    with hl.open(address) as store, pytest.raises(UsageError, match="this very store"):
+        store.copy(f"{address}/")
     files.mounted.clear()
     for label in STATES:
         right = answers(robots, label)
