@@ -10,6 +10,7 @@ import click
 
 from hybridlog import __version__
 from hybridlog.cli.completion import install_completion, show_completion
+from hybridlog.cli.hints import Context, check_moved
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
 DIFFERENT: Final = 12
@@ -39,11 +40,6 @@ EXIT_CODES: Final = {
 def of_os_error(error: OSError) -> int:
     """The code for an operating system error that the library has not mapped."""
     return DiskFullError.exit_code if error.errno in NO_SPACE else HybridlogError.exit_code
-
-
-def as_text() -> str:
-    """The table for help texts, one code a line."""
-    return "\n".join(f"  {code:>3}  {meaning}" for code, meaning in EXIT_CODES.items())
 
 
 GROUPS: Final = {
@@ -84,34 +80,17 @@ GROUPS: Final = {
 COMMANDS: Final = {name: module for group in GROUPS.values() for name, module in group.items()}
 """Names of all commands, and their modules."""
 
-MOVED: Final = {
-    "attachments": "info RECORDING --attachments",
-    "changes": "intervals TOPIC --changes FIELDS",
-    "du": "info --sizes recording",
-    "gaps": "intervals TOPIC --gaps",
-    "losses": "info --losses",
-    "note": "edit RECORDING --note TEXT",
-    "rate": "stats --rate",
-    "reindex": "index rebuild",
-    "rename": "edit RECORDING --name NAME",
-    "resample": "align TOPIC --step DURATION",
-    "schema": "info --topic TOPIC",
-    "serve": "open websocket",
-    "trust": "index trust",
-    "untag": "tag RECORDING --remove KEY",
-}
-"""Other names that people try, and the commands that do this."""
-
 
 class _LazyGroup(click.Group):
     """A group whose command `name` is the function `name_command` in the module of its name."""
+
+    context_class = Context
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name in MOVED:
-            raise click.UsageError(f"There is no {cmd_name!r}: use `hybridlog {MOVED[cmd_name]}`.")
+        check_moved(cmd_name)
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
@@ -127,6 +106,11 @@ class _LazyGroup(click.Group):
                     [(name, one.get_short_help_str(width)) for name, one in found if one],
                     col_max=12,
                 )
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_epilog(ctx, formatter)
+        with formatter.section("Exit codes"):
+            formatter.write_dl([(f"{code:>3}", meaning) for code, meaning in EXIT_CODES.items()])
 
 
 def _note_all(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
@@ -164,10 +148,7 @@ def _install_script(context: click.Context, _: click.Parameter, wanted: bool) ->
     # Names only: an unknown command is compared with them, and `get_command` loads one.
     commands=dict.fromkeys(COMMANDS, click.Command(None)),
     context_settings={"show_default": True},
-    epilog=(
-        "The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.\n\n"
-        f"\b\nExit codes:\n{as_text()}"
-    ),
+    epilog="The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.",
 )
 @click.option(
     "--version",

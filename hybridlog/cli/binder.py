@@ -15,6 +15,8 @@ from typing import Any, Final, TypeVar
 
 import click
 
+from hybridlog.cli.hints import Command, Pair
+
 _MAKE: Final = "hybridlog.parameter"
 _Kind = TypeVar("_Kind")
 PATH: Final = click.Path(readable=False, path_type=Path)
@@ -50,8 +52,9 @@ def option(
             settings["multiple"], words = True, f"{help} Repeatable."
         elif (of := annotation.removesuffix(" | None")) in _TYPES:
             settings.setdefault("type", _TYPES[of])
+        made = Pair if settings.get("nargs") == 2 else kind
         spelled = [field, name or f"--{field.replace('_', '-')}", *([short] if short else [])]
-        return kind(spelled, help=words, metavar=metavar, **settings)
+        return made(spelled, help=words, metavar=metavar, **settings)
 
     return field(metadata={_MAKE: make})
 
@@ -113,7 +116,7 @@ def command(
 
         known = getattr(function, "__click_params__", [])
         call.__click_params__ = [*known, *reversed(parameters)]  # type: ignore[attr-defined]
-        make: Any = click.command(name, **settings)
+        make: Any = click.command(name, **{"cls": Command, **settings})
         made: click.Command = make(call)
         if to is not None:
             to.add_command(made)

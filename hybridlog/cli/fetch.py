@@ -61,8 +61,14 @@ class _Choices(Asking, Tabular, Slices):
         "'/odom: twist.twist.linear.x > 0.5'.",
         "DURATION",
     )
-    before: str | None = option("Instead: start this long before each of these: 5min.", "DURATION")
-    after: str | None = option("Instead: end this long after each of these.", "DURATION")
+    before: str | None = option(
+        "With such a --where, in place of --within: from this long before each match on, "
+        "such as 5min.",
+        "DURATION",
+    )
+    after: str | None = option(
+        "With such a --where, in place of --within: until this long after each match.", "DURATION"
+    )
     count: bool = option("Only print how many.")
     form: str | None = option(
         "Without: by the suffix of -o, else a table on a terminal, else jsonl.",
@@ -119,6 +125,10 @@ def fetch_command(choices: _Choices) -> None:
             cost = query.counters.copy()
             cost.add(query.spent)
             print_cost(cost, time.monotonic() - started, count=choices.count)
+            given = cost.messages or cost.latched or cost.frames
+            if count is None and to.path is not None and not given:
+                what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
+                output.note(f"Nothing matched {what}, so {to.path} is empty.")
             print_remarks(query, choices.topics)
             if count is not None:
                 print_lost(query, count)

@@ -39,7 +39,7 @@ def _run() -> int:
     try:
         return _run_command()
     except HybridlogError as error:
-        _complain(str(error))
+        _complain("\n".join([str(error), *getattr(error, "__notes__", ())]))
         return error.exit_code
     except BrokenPipeError:
         _discard(sys.stdout)
@@ -72,8 +72,14 @@ def _run_command() -> int:
             code = app.invoke(context)
     except click.exceptions.Exit as leaving:
         return leaving.exit_code
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
+        return error.exit_code
+    except click.ClickException as error:
+        lines = [error.format_message()]
+        if isinstance(error, click.UsageError) and error.ctx is not None:
+            lines.append(f"`{error.ctx.command_path} --help` shows what there is.")
+        _complain("\n".join(lines))
         return error.exit_code
     except click.Abort:
         _complain("aborted.")

@@ -9,10 +9,11 @@ import click
 from click.core import ParameterSource
 
 from hybridlog.cli.binder import command
+from hybridlog.cli.hints import Command
 from hybridlog.cli.record_choices import LiveOption, RecordChoices, check_choices
 
 
-class _RecordCommand(click.Command):
+class _RecordCommand(Command):
     """`record`, with two spellings of options that click does not know."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

@@ -464,7 +464,11 @@ def test_remarks_follow_the_closing_line(store: Path) -> None:
     events = ("--where", "/long: data > 9", "--before", "1s")
     done = run("fetch", "-t", "/json", *events, "--count", store=store)
     assert "messages could not be tested" in done.err
-    assert "No time is asked for: there are no events" in done.err
+    assert "Nothing matched the condition that gives the times" in done.err
+    made = run("fetch", "-t", "/json", *events, "-o", store.parent / "near.jsonl", store=store)
+    assert f"Nothing matched '/long: data > 9', so {store.parent / 'near.jsonl'} is empty.\n" in (
+        made.err
+    )
     done = run("fetch", "-t", "odom", "-r", "odd", "--count", store=store, code=2)
     assert "there is no topic 'odom'" in done.err
     assert "in the store, robot has such a topic" in done.err

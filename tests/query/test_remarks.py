@@ -134,7 +134,7 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
     assert remarks(relative) == remarks(late)[:1]
     never = store.topic("/n").where("n > 99").windows("1s")
     assert remarks(store.topic("/j").during(never)) == [
-        "No time is asked for: there are no events, or no intervals."
+        "Nothing matched the condition that gives the times: no time is left to look at."
     ]
     day = BEGIN + 86_400 * SECOND
     with pytest.raises(TimeError, match=r"monday spans .* Other recordings span .*: tuesday\."):

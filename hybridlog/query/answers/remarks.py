@@ -155,7 +155,7 @@ def _names_in(kind: Any, above: str) -> Iterator[str]:
 def _causes(session: Session, question: Question) -> Iterator[str]:
     """Likely causes of an empty answer."""
     if question.during is not None and not len(question.during):
-        yield "No time is asked for: there are no events, or no intervals."
+        yield "Nothing matched the condition that gives the times: no time is left to look at."
         return
     if question.bounds is None or not question.is_by_log_time:
         return

@@ -1,0 +1,144 @@
+"""A command of click with help that wraps between words, and errors that say what was meant."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable
+from typing import Any, Final
+
+import click
+
+from hybridlog_storage.errors import TopicError
+
+_FIRST: Final = ("topic", "between", "where", "fields", "output", "form", "recording")
+_LAST: Final = ("store", "mongo", "verbose", "quiet", "help")
+_NAMED: Final = {"recording": "-r", "topic": "-t", "fields": "--fields"}
+"""Options whose values people type as arguments, and how they are written."""
+
+
+MOVED: Final = {
+    "attachments": "info RECORDING --attachments",
+    "changes": "intervals TOPIC --changes FIELDS",
+    "du": "info --sizes recording",
+    "help": "--help",
+    "gaps": "intervals TOPIC --gaps",
+    "losses": "info --losses",
+    "note": "edit RECORDING --note TEXT",
+    "rate": "stats --rate",
+    "reindex": "index rebuild",
+    "rename": "edit RECORDING --name NAME",
+    "resample": "align TOPIC --step DURATION",
+    "schema": "info --topic TOPIC",
+    "serve": "open websocket",
+    "trigger --rehearse": "intervals --rehearse EXPRESSION",
+    "trust": "index trust",
+    "untag": "tag RECORDING --remove KEY",
+}
+"""Other names and options that people try, and the commands that do this."""
+
+
+def check_moved(words: str) -> None:
+    """Say which command does what another name or option was tried for.
+
+    Raises:
+        click.UsageError: One does.
+    """
+    if words in MOVED:
+        raise click.UsageError(f"There is no `{words}`: use `hybridlog {MOVED[words]}`.")
+
+
+class _Formatter(click.HelpFormatter):
+    """Breaks the long terms of a list of options at blanks and behind `|`."""
+
+    def write_dl(
+        self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2
+    ) -> None:
+        room = self.width - self.current_indent
+        shown = [(term if len(term) <= room else _folded(term, room), text) for term, text in rows]
+        super().write_dl(shown, col_max, col_spacing)
+
+
+def _folded(term: str, room: int) -> str:
+    lines = textwrap.wrap(
+        term.replace("|", "| "),
+        room,
+        subsequent_indent=" " * 8,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join(line.replace("| ", "|") for line in lines)
+
+
+class Context(click.Context):
+    """A context whose help is wrapped between words."""
+
+    formatter_class = _Formatter
+
+
+class Command(click.Command):
+    """A command that says which option a word was meant for."""
+
+    context_class = Context
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """The parameters: those that most people need first, those of all commands last."""
+        order = {name: n - len(_FIRST) for n, name in enumerate(_FIRST)}
+        order |= {name: n for n, name in enumerate(_LAST, 1)}
+        return sorted(super().get_params(ctx), key=lambda one: order.get(one.name or "", 0))
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the words; one too many may be the value of an option."""
+        ctx.allow_extra_args = True
+        try:
+            extra = super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            check_moved(f"{self.name} {error.option_name}")
+            raise
+        if extra and not ctx.resilient_parsing:
+            word = extra[0]
+            raise click.UsageError(f"There is no place for {word!r} here.{self._meant(word)}", ctx)
+        return extra
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run; a word that is no topic or recording may be the value of an option."""
+        try:
+            return super().invoke(ctx)
+        except TopicError as error:
+            for argument in self.params:
+                given = ctx.params.get(argument.name or "")
+                if not isinstance(argument, click.Argument) or "did you mean" in str(error):
+                    continue
+                for word in [given] if isinstance(given, str) else given or ():
+                    hint = self._meant(word, argument)
+                    if hint and f"'{word}'" in str(error):
+                        error.add_note(hint.strip())
+            raise
+
+    def _meant(self, word: str, argument: click.Argument | None = None) -> str:
+        """The options that a word may belong to, as a question.
+
+        Args:
+            word: As typed.
+            argument: What it was taken for.
+        """
+        taken = (argument.metavar or "").casefold() if argument is not None else ""
+        options = {one.name for one in self.params if isinstance(one, click.Option)}
+        found = [
+            f"{short} {word}"
+            for name, short in _NAMED.items()
+            if name in options and name not in taken
+        ]
+        return f" Did you mean {' or '.join(found)}?" if found else ""
+
+
+class Pair(click.Option):
+    """An option with two values, neither of which is the next option."""
+
+    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
+        """Refuse an option as a value."""
+        for place, one in enumerate(value or ()):
+            if isinstance(one, str) and one[:1] == "-" and not one[1:2].isdigit():
+                first = value[0] if place else "start"
+                name = self.opts[0]
+                raise click.UsageError(f"{name} takes two times: {name} {first} end", ctx)
+        return super().type_cast_value(ctx, value)
