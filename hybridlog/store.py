@@ -1445,6 +1445,7 @@ class Store:
         recordings: Choice | Names | None = None,
         options: CopyOptions | None = None,
         progress: Progress | None = None,
+        report: CopyReport | None = None,
     ) -> CopyReport:
         """Copy recordings to another store; what is there already is not copied again.
 
@@ -1457,6 +1458,7 @@ class Store:
             recordings: The recordings, or what they must satisfy; None for all.
             options: What is copied of them, and how.
             progress: Called with the bytes copied of all that are to be copied.
+            report: Takes the result as it grows, so that it is known after an error, too.
 
         Returns:
             What was copied; recordings that are damaged or have not ended are refused.
@@ -1465,25 +1467,33 @@ class Store:
             StoreError: The place is not reached, or cannot be written.
             DiskFullError: It has no room; what arrived stays.
         """
-        from hybridlog.maintenance.copying import CopyOptions, run
+        from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
 
-        wanted = options or CopyOptions()
+        wanted, found = options or CopyOptions(), report or CopyReport()
         if wanted.only_fields and wanted.then_expire:
             raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
         if wanted.then_expire:
             self.directory.check_writable()
         self.session.catch_up()
-        chosen, proved = self._chosen(recordings), list[str]()
+        chosen = self._chosen(recordings)
         address = address_of(to)
         if address is not None:
-            return self._publish(address, chosen, wanted, progress)
+            return self._publish(address, chosen, wanted, progress, found)
         with _place(to, wanted) as place:
-            report = run(
-                self.directory, place, chosen, wanted, progress=progress, proved=proved.append
+
+            def expire(recording: str, digests: Mapping[int, str]) -> None:
+                self._expire(recording, digests, place.name, found, progress)
+
+            run(
+                self.directory,
+                place,
+                chosen,
+                wanted,
+                progress=progress,
+                proved=expire,
+                report=found,
             )
-            for recording in proved:
-                self._expire(recording, place.name, report, progress)
-        return report
+        return found
 
     def _publish(
         self,
@@ -1491,9 +1501,9 @@ class Store:
         chosen: Sequence[RecordingSummary],
         options: CopyOptions,
         progress: Progress | None,
+        report: CopyReport,
     ) -> CopyReport:
         """Copy recordings into a bucket."""
-        from hybridlog.maintenance.copying import CopyReport
         from hybridlog.maintenance.publish import publish
         from hybridlog_storage.remote.store import RemoteDirectory
 
@@ -1502,7 +1512,7 @@ class Store:
                 "--only-fields, --then-expire and --limit-rate are for directories and servers: "
                 "recordings go into a bucket as a whole."
             )
-        target, report = RemoteDirectory.create_in(address), CopyReport()
+        target = RemoteDirectory.create_in(address)
         if isinstance(self.directory, RemoteDirectory) and self.directory.source is target.source:
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
         tables = self.session.tables
@@ -1522,7 +1532,12 @@ class Store:
         return report
 
     def _expire(
-        self, recording: str, where: str, report: CopyReport, progress: Progress | None
+        self,
+        recording: str,
+        digests: Mapping[int, str],
+        where: str,
+        report: CopyReport,
+        progress: Progress | None,
     ) -> None:
         """Let the payloads of a recording go that were proved elsewhere."""
         from hybridlog.maintenance.keep import Keeper
@@ -1531,7 +1546,11 @@ class Store:
         rules = Rules.of(self.directory.settings.retention)
         keeper = Keeper(self.directory, self.remove)
         try:
-            kept = keeper.expire_all(recording, rules, f"it was copied to {where}", progress)
+            reason = f"it was copied to {where}"
+            kept = keeper.expire_all(recording, digests, rules, reason, progress)
+        except HeldError as error:
+            report.problems.append(f"Payloads stay: {error}")
+            return
         finally:
             self.session.catch_up(recording)
         report.freed_bytes += kept.freed_bytes

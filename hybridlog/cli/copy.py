@@ -15,11 +15,12 @@ from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
 from hybridlog.cli.progress import LateBar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import parse_size
-from hybridlog_storage.errors import BucketError, ResourceError, StoreError, UsageError
+from hybridlog_storage.errors import BucketError, ResourceError, StoreError, TopicError, UsageError
 from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
+    from hybridlog.query.choice import Choice
     from hybridlog.store import Store
 
 _WATCH_S = 2.0  # between two looks at a store that is followed
@@ -67,14 +68,35 @@ def copy_command(given: _Copy) -> None:
     ):
         if given.watch:
             _watch(store, given, how)
-        with _bar("copy", given) as bar:
-            report = store.copy(given.to, given.choice, how, bar)
-    _print(report, given)
+        report = _copied(store, given, given.choice, how)
     _check(report)
 
 
 def _bar(what: str, given: _Copy | _Import) -> closing[LateBar]:
     return closing(LateBar(what, quiet=given.quiet or given.as_json))
+
+
+def _copied(
+    store: Store,
+    given: _Copy,
+    chosen: Choice | list[str],
+    how: CopyOptions,
+    *,
+    is_short: bool = False,
+) -> CopyReport:
+    """Copy recordings and print what was copied, also if an error ends it."""
+    from hybridlog.maintenance.copying import CopyReport
+
+    report = CopyReport()
+    try:
+        with _bar("copy", given) as bar:
+            store.copy(given.to, chosen, how, bar, report)
+    except BaseException:
+        if report != CopyReport():
+            _print(report, given, is_short=is_short)
+        raise
+    _print(report, given, is_short=is_short)
+    return report
 
 
 def _watch(store: Store, given: _Copy, how: CopyOptions) -> NoReturn:
@@ -88,14 +110,16 @@ def _watch(store: Store, given: _Copy, how: CopyOptions) -> NoReturn:
         ]
         new = [one for one in ended if one not in done] if now != seen else []
         try:
+            held: list[str] = []
             if new:
-                with _bar("copy", given) as bar:
-                    report = store.copy(given.to, new, how, bar)
-                _print(report, given, is_short=True)
+                report = _copied(store, given, new, how, is_short=True)
                 output.notes([*report.refused.values(), *report.problems])
-            done.update(new)
-            seen = now
-            pause(_WATCH_S)
+                held = report.held
+            done.update(one for one in new if one not in held)
+            seen = None if held else now
+            pause(_RETRY_S if held else _WATCH_S)
+        except TopicError:
+            pause(_WATCH_S)  # one was removed since it was chosen
         except (StoreError, BucketError, ResourceError) as error:
             output.note(f"{error} Trying again in {_RETRY_S:.0f} s.")
             pause(_RETRY_S)

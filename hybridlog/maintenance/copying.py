@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
@@ -19,15 +19,18 @@ from hybridlog.entries import take_inventory
 from hybridlog.maintenance.places import (
     Copied,
     CopiedFile,
+    RefusedError,
+    content_of,
     digest_of,
     expired_in,
     files_of,
     pieces_of,
 )
+from hybridlog.wording import counted
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import REMOVED, StoreDirectory
-from hybridlog_storage.errors import HeldError, StoreError, UsageError, unreadable
+from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.stopping import pause
 
@@ -75,6 +78,7 @@ class CopyReport:
         known: Labels of recordings that were there already.
         lacking: Those of them whose payloads were deleted there, and are here.
         refused: Why recordings were not copied, by their labels here.
+        held: Ids of those of them that another process held: they can be copied when it is done.
         bytes_copied: Bytes copied now, without those that were there after an interruption.
         freed_bytes: Bytes that became free here, because payloads were proved there.
         problems: Why payloads did not expire here, in sentences.
@@ -84,13 +88,10 @@ class CopyReport:
     known: list[str] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
+    held: list[str] = field(default_factory=list)
     bytes_copied: int = 0
     freed_bytes: int = 0
     problems: list[str] = field(default_factory=list)
-
-
-class _RefusedError(StoreError):
-    """A recording that is not copied; others are."""
 
 
 def run(
@@ -100,7 +101,8 @@ def run(
     options: CopyOptions | None = None,
     *,
     progress: Progress | None = None,
-    proved: Callable[[str], None] = lambda _: None,
+    proved: Callable[[str, Mapping[int, str]], None] = lambda *_: None,
+    report: CopyReport | None = None,
 ) -> CopyReport:
     """Copy recordings of a store to a place.
 
@@ -110,15 +112,17 @@ def run(
         chosen: Recordings of `source`.
         options: How they are copied.
         progress: Called with the bytes copied and checked, of all that are to be copied.
-        proved: Called with the id of each recording that is there with its payloads.
+        proved: Called with the id of each recording that is there with its payloads, and the
+            digests of these segments by number; nothing is deleted there meanwhile.
+        report: Takes the result, as it grows.
 
     Raises:
         UsageError: The place is this very store.
         StoreError: The place cannot be written or reached; what was copied stays there.
         DiskFullError: No room; the copy can be run again.
     """
-    work = _Copying(source, place, options or CopyOptions(), progress, proved)
-    return work.run([*chosen])
+    work = _Copying(source, place, options or CopyOptions(), progress, report or CopyReport())
+    return work.run([*chosen], proved)
 
 
 class _Copying:
@@ -130,18 +134,22 @@ class _Copying:
         place: Place,
         options: CopyOptions,
         progress: Progress | None,
-        proved: Callable[[str], None],
+        report: CopyReport,
     ) -> None:
         self._source = source
         self._place = place
         self._options = options
         self._progress = progress
-        self._proved = proved
-        self._report = CopyReport()
+        self._report = report
+        self._proven: dict[str, JournalState] = {}  # as it was sent, by the recording's id
         self._done = self._total = 0
         self._due = 0.0  # time from which more may be sent
 
-    def run(self, chosen: Sequence[RecordingEntry | RecordingSummary]) -> CopyReport:
+    def run(
+        self,
+        chosen: Sequence[RecordingEntry | RecordingSummary],
+        proved: Callable[[str, Mapping[int, str]], None],
+    ) -> CopyReport:
         if self._is_same():
             raise UsageError(f"{self._place.name} is this very store: there is nothing to copy.")
         there: dict[str, Copied] = {}
@@ -153,16 +161,48 @@ class _Copying:
         missing = {one.id for one in wanted}
         for one in chosen:
             if one.id not in missing:
-                self._note_known(one.id, there[one.id])
+                self._note_known(one, there[one.id])
         for one in wanted:
             try:
                 self._copy(one)
-            except (_RefusedError, HeldError) as error:
+            except RefusedError as error:
                 self._report.refused[one.label] = str(error)
+                self._total -= one.stored_bytes
+            except HeldError as error:
+                self._report.refused[one.label] = f"Recording {one.label!r} is not copied: {error}"
+                self._report.held.append(one.id)
+            except TopicError as error:  # it was removed here meanwhile
+                self._place.drop()
+                self._report.refused[one.label] = str(error)
+                self._total -= one.stored_bytes
                 self._total -= one.stored_bytes
             finally:
                 self._place.leave()
+        if self._proven:
+            try:
+                self._let_go(proved)
+            finally:
+                self._place.leave()
         return self._report
+
+    def _let_go(self, proved: Callable[[str, Mapping[int, str]], None]) -> None:
+        """Tell which segments have a proven copy, while nothing can be deleted there."""
+        name, problems = self._place.name, self._report.problems
+        if not self._place.hold():
+            problems.append(f"Payloads stay: another process makes room in {name}. Run it again.")
+            return
+        there: dict[str, Copied] = {}
+        ids = [*self._proven]
+        for begin in range(0, len(ids), _ASKED_AT_ONCE):
+            there |= self._place.have(ids[begin : begin + _ASKED_AT_ONCE])
+        for recording, sent in self._proven.items():
+            now = there.get(recording)
+            if now is None or now.lacks_payloads or now.expired > expired_in(sent):
+                problems.append(f"Payloads of {sent.name} stay: its copy in {name} has lost some.")
+                continue
+            digests = self._place.segments(recording)
+            found = {number: one.digest for number, one in sent.sealed.items()}
+            proved(recording, {n: one for n, one in found.items() if digests.get(n) == one})
 
     def _is_same(self) -> bool:
         """True if the place is the source: it sees a file that was made here this moment.
@@ -203,13 +243,22 @@ class _Copying:
                 return journal.read(self._source.recording(label)) or JournalState()
         return JournalState()
 
-    def _note_known(self, recording: str, known: Copied) -> None:
+    def _note_known(self, one: RecordingEntry | RecordingSummary, known: Copied) -> None:
+        state = JournalState() if self._source.is_remote else self._state(one.id)
+        missing = self._missing(one.id, state, known)
+        if missing:
+            self._report.refused[one.label] = (
+                f"{known.label} in {self._place.name} lacks {counted(missing, 'segment')} of "
+                f"recording {one.label!r}: it may have been copied by hand before its end. Remove "
+                f"it there (`hybridlog rm {known.label}`), and copy again."
+            )
+            return
         self._report.known.append(known.label)
         may_lack = known.expired and not known.lacks_payloads
-        if may_lack and known.expired > expired_in(self._state(recording)):
+        if may_lack and known.expired > expired_in(state):
             self._report.lacking.append(known.label)
         if self._options.then_expire:
-            problems = self._place.problems(recording)
+            problems = self._place.problems(one.id)
             if known.lacks_payloads or known.expired:
                 problems.append("payloads of it have expired there")
             if problems:
@@ -218,52 +267,62 @@ class _Copying:
                     f"whole: {'; '.join(problems[:3])}."
                 )
             else:
-                self._proved(recording)
+                self._proven[one.id] = replace(state, expired={})
+
+    def _missing(self, recording: str, state: JournalState, known: Copied) -> int:
+        """Number of segments that its copy does not have, but for marks: they do not follow."""
+        if self._source.is_remote or content_of(state) == known.content:
+            return 0
+        there, marks = self._place.segments(recording), {mark["segment"] for mark in state.marks}
+        return sum(
+            there.get(number) != one.digest
+            for number, one in state.sealed.items()
+            if number not in marks
+        )
 
     def _copy(self, one: RecordingEntry | RecordingSummary) -> None:
         """Copy a recording, whatever label it has now.
 
         Raises:
-            _RefusedError: It has not ended, or is damaged.
+            RefusedError: It has not ended, or is damaged.
         """
         name = f"Recording {one.label!r} of {self._source.path}"
         if one.status == "open":
-            raise _RefusedError(f"{name} is being written. Copy it when it has ended.")
+            raise RefusedError(f"{name} is being written. Copy it when it has ended.")
         if one.status == "unfinished":
-            raise _RefusedError(
+            raise RefusedError(
                 f"{name} was cut short by a crash. Open that store once with write permission, "
                 "which recovers it, then copy it."
             )
-        only_fields = self._options.only_fields
-        begun = self._place.begin(one.id, wants_payloads=not only_fields)
-        if begun.known is not None:  # another process has copied it meanwhile
-            self._note_known(one.id, begun.known)
-            return
-        left, sizes = _TRIES, begun.sizes
+        only_fields, left = self._options.only_fields, _TRIES
         while True:
             label, sent = self._source.label_now(one.label, one.id), None
             try:
                 with self._sent(label, one.id) as sent:
+                    # Fields may take a while to prepare, and a server waits only so long.
+                    begun = self._place.begin(one.id, wants_payloads=not only_fields)
+                    if begun.known is not None:  # another process has copied it meanwhile
+                        self._note_known(one, begun.known)
+                        return
                     self._total += sent.bytes - one.stored_bytes
                     for file in sent.files:
-                        self._bring(sent, file, sizes.get(file.file, 0))
+                        self._bring(sent, file, begun.sizes.get(file.file, 0))
                 break
             except StoreError:
                 left -= 1
                 has_changed = left > 0 and sent is not None and sent.has_changed()
                 if self._source.has_label(label, one.id) and not has_changed:
                     raise
-                sizes = {}
         there = self._place.publish(one.label, sent.lines, lacks_payloads=sent.lacks_payloads)
         self._report.copied.append(there)
         if self._options.then_expire and not only_fields:
-            self._proved(one.id)
+            self._proven[one.id] = sent.state
 
     def _bring(self, sent: _Sent, file: CopiedFile, there: int) -> None:
         """Send what a place lacks of a file.
 
         Raises:
-            _RefusedError: It is damaged here.
+            RefusedError: It is damaged here.
         """
         place, path = self._place, file.below(sent.path)
         if there == file.bytes and place.prove(file):
@@ -282,7 +341,7 @@ class _Copying:
             at += len(data)
             self._count(sent.label, len(data))
         if not place.prove(file):
-            raise _RefusedError(
+            raise RefusedError(
                 f"{path} is damaged: what was copied does not match its checksums. "
                 "`hybridlog verify` shows where."
             )
@@ -321,9 +380,10 @@ class _Sent:
 
     Attributes:
         lacks_payloads: Whether payloads are left for later.
+        state: Its journal.
 
     Raises:
-        _RefusedError: It is incomplete.
+        RefusedError: It is incomplete.
     """
 
     def __init__(self, directory: StoreDirectory, label: str, recording: str) -> None:
@@ -332,23 +392,23 @@ class _Sent:
         self.path = directory.recording(label)
         inventory = take_inventory(directory, label)
         if inventory.id != recording or inventory.misfits or not inventory.is_proven:
-            raise _RefusedError(
+            raise RefusedError(
                 f"Recording {label!r} of {directory.path} is incomplete: `hybridlog verify "
                 f"--store {directory.path} {label}` shows what is missing. It was not copied."
             )
         assert inventory.state is not None  # it is proven
-        self._state: JournalState = inventory.state
+        self.state: JournalState = inventory.state
         self.files = files_of(inventory)
         self.segments = [*inventory.summaries]
         self.bytes = sum(file.bytes for file in self.files)
         self.lines = self._read()
-        if replace(journal.parse(self.lines), torn=self._state.torn) != self._state:
+        if replace(journal.parse(self.lines), torn=self.state.torn) != self.state:
             raise StoreError(f"{self.path} has changed meanwhile. Run it again.")
 
     def _read(self) -> bytes:
         path = self.path / JOURNAL
         try:
-            return files.read_file(path, journal.MAX_JOURNAL)[: self._state.length]
+            return files.read_file(path, journal.MAX_JOURNAL)[: self.state.length]
         except OSError as error:
             raise unreadable(error, path) from error
 
@@ -356,20 +416,20 @@ class _Sent:
         """The bytes of a file, a piece at a time.
 
         Raises:
-            _RefusedError: It cannot be read.
+            RefusedError: It cannot be read.
         """
         try:
             yield from pieces_of(file.below(self.path), at, end, piece, depth=file.depth)
         except StoreError as error:
-            raise _RefusedError(str(error)) from error
+            raise RefusedError(str(error)) from error
 
     def has_changed(self) -> bool:
         """True if files of it were replaced since: the journal says so."""
         state = journal.read(self.path)
         return state is not None and (state.thinned, state.payloads, state.sealed) != (
-            self._state.thinned,
-            self._state.payloads,
-            self._state.sealed,
+            self.state.thinned,
+            self.state.payloads,
+            self.state.sealed,
         )
 
 

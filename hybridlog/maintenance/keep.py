@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
@@ -130,12 +130,18 @@ class Keeper:
         return found
 
     def expire_all(
-        self, recording: str, rules: Rules, reason: str, progress: Progress | None = None
+        self,
+        recording: str,
+        digests: Mapping[int, str],
+        rules: Rules,
+        reason: str,
+        progress: Progress | None = None,
     ) -> Kept:
-        """Let the payloads of a recording go, but for what pins and rules keep.
+        """Let payloads of a recording go, but for what pins and rules keep.
 
         Args:
             recording: Its id.
+            digests: The segments that have a copy elsewhere: digests as sealed, by number.
             rules: Rules whose `never_tag` holds.
             reason: Why they go.
             progress: Called while payloads are replaced.
@@ -147,10 +153,11 @@ class Keeper:
             found, now = Kept(self.plan(Rules())), time.time_ns()
             for held in self._held(now):
                 if held.id == recording and not rules.is_never(held.tags):
-                    numbers = tuple(one.number for one in held.segments if not one.pinned)
-                    size = sum(one.size for one in held.segments if not one.pinned)
+                    going = [s for s in held.segments if s.number in digests and not s.pinned]
+                    numbers = tuple(one.number for one in going)
+                    size = sum(one.size for one in going)
                     if numbers:
-                        step = Step(held.label, held.id, numbers, (), size, reason, now)
+                        step = Step(held.label, held.id, numbers, (), size, reason, now, digests)
                         found.plan.steps.append(step)
                         self._do(step, found, progress)
         return found
@@ -227,6 +234,9 @@ class Keeper:
     def _expire(self, step: Step, label: str, progress: Progress | None) -> int:
         def check(state: JournalState) -> None:
             for number in step.segments:
+                digest = state.sealed[number].digest
+                if step.digests.get(number, digest) != digest:
+                    raise StoreError(f"{label}: segment {number} was replaced meanwhile.")
                 pinned = pinned_topics(state.sealed[number], state)
                 if pinned & {*step.topics} if step.topics else pinned:
                     raise StoreError(f"{label}: a pin was set meanwhile.")

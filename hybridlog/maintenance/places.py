@@ -30,7 +30,7 @@ from hybridlog_storage.disk.directory import (
     REMOVED,
     payload_names,
 )
-from hybridlog_storage.errors import StoreError, TopicError, unreadable
+from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_file import sealed_name
@@ -60,6 +60,10 @@ _EDITS: Final = frozenset(
     }
 )
 """Events that users add to a recording that has ended; `sealed` is of the segment of a mark."""
+
+
+class RefusedError(StoreError):
+    """A recording that is not copied; others are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,11 +137,13 @@ class Copied:
         label: Its label there.
         lacks_payloads: Whether only its fields were copied.
         expired: Number of expired topics there, summed over its segments.
+        content: As of `content_of`.
     """
 
     label: str
     lacks_payloads: bool = False
     expired: int = 0
+    content: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +170,9 @@ class Place(Protocol):
 
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """Those of some recordings that it has, by id."""
+
+    def segments(self, recording: str) -> dict[int, str]:
+        """Digests of the segments of a recording as they were sealed, by number."""
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """Begin or go on with a recording; nobody else copies it here until `leave`.
@@ -199,6 +208,12 @@ class Place(Protocol):
         Returns:
             The label it has.
         """
+
+    def hold(self) -> bool:
+        """Keep payloads from being deleted until `leave`; False if somebody deletes some now."""
+
+    def drop(self) -> None:
+        """Delete what has arrived of the recording that was begun, if one was."""
 
     def leave(self) -> None:
         """End the copy of a recording; what has arrived stays for the next one."""
@@ -266,7 +281,13 @@ class DirectoryPlace:
 
     def _copied(self, label: str) -> Copied:
         state = journal.read(self._directory.recording(label)) or JournalState()
-        return Copied(label, state.lacks_payloads, expired_in(state))
+        return Copied(label, state.lacks_payloads, expired_in(state), content_of(state))
+
+    def segments(self, recording: str) -> dict[int, str]:
+        """As of `Place`."""
+        label = self._labels().get(recording)
+        state = None if label is None else journal.read(self._directory.recording(label))
+        return {} if state is None else {n: one.digest for n, one in state.sealed.items()}
 
     def begin(self, recording: str, *, wants_payloads: bool, wait_s: float = LOCK_WAIT_S) -> Begun:
         """As of `Place`.
@@ -290,9 +311,16 @@ class DirectoryPlace:
                 pass  # a copy was interrupted, or another process copies it
             except OSError as error:
                 raise durability.explain(error, self._path, "copying into") from error
-            with suppress(TopicError):  # another process has given it its label
+            try:
                 self._held.enter_context(self._directory.writing(hidden, wait_s=wait_s))
                 break
+            except TopicError:
+                pass  # another process has given it its label
+            except HeldError as error:
+                raise HeldError(
+                    f"another process copies it into {self.name} at this moment.",
+                    is_recording=False,
+                ) from error
         known = self.have([recording]).get(recording)
         if known is not None and not (known.lacks_payloads and wants_payloads):
             self._directory.sweep(hidden)
@@ -450,10 +478,16 @@ class DirectoryPlace:
                 found.append(line)
         now = journal.parse(data)
         marked = {line["segment"] for line in found if line["event"] == journal.SEALED}
-        for number in marked - now.unmarked:
+        gone = marked & now.unmarked  # set and removed there: the number may be another mark's here
+        found = [line for line in found if line.get("segment") not in gone]
+        for number in marked - gone:
             name = sealed_name(number)
             if number in state.sealed or number not in now.sealed:
-                raise StoreError(f"Recording {label!r} was marked here and there: copy it by hand.")
+                raise RefusedError(
+                    f"Recording {label!r} was marked here and in {self.name}, where it lacks "
+                    "payloads: note the mark there, `hybridlog mark --remove` it, copy again, and "
+                    "set it again."
+                )
             with suppress(FileExistsError):
                 files.link(old / name, self._path / name, new_depth=files.IN_RECORDING)
         files.sync_folder(self._path)
@@ -473,6 +507,16 @@ class DirectoryPlace:
         self._directory.sweep(hidden)
         return label
 
+    def hold(self) -> bool:
+        """As of `Place`."""
+        return self._held.enter_context(self._directory.retaining())
+
+    def drop(self) -> None:
+        """As of `Place`."""
+        if self.is_begun:
+            self._close()
+            self._directory.sweep(self._path.name)
+
     def leave(self) -> None:
         """As of `Place`."""
         self._close()
@@ -491,6 +535,12 @@ class DirectoryPlace:
             found.append("it is incomplete")
         path = self._directory.recording(label)
         return found + [f"{f.file} is damaged" for f in files_of(inventory) if not f.is_whole(path)]
+
+
+def content_of(state: JournalState) -> str:
+    """A value that is the same for two copies of a recording with the same segments."""
+    sealed = sorted((number, one.digest) for number, one in state.sealed.items())
+    return hashlib.sha256(str(sealed).encode()).hexdigest()[:32]
 
 
 def expired_in(state: JournalState) -> int:

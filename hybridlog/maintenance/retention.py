@@ -299,6 +299,7 @@ class Step:
         bytes: About the bytes that become free.
         reason: Why it goes.
         before: The time before which it was written, ns.
+        digests: Digests that segments must have had when they were sealed, by number.
     """
 
     recording: str
@@ -308,6 +309,7 @@ class Step:
     bytes: int
     reason: str
     before: int
+    digests: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(slots=True)

@@ -19,7 +19,7 @@ from dataclasses import asdict
 from typing import IO, TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
-from hybridlog.maintenance.places import Begun, Copied, CopiedFile
+from hybridlog.maintenance.places import Begun, Copied, CopiedFile, RefusedError
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -42,6 +42,8 @@ _MAX_AHEAD: Final = 16  # pieces of files without an answer
 _MAX_TEXT: Final = 2000  # characters of a message of the other side
 _IDLE_S: Final = 60.0
 """Seconds of silence after which a copy that was begun is given up: the connection is cut."""
+_ERRORS: Final = {"full": DiskFullError, "refused": RefusedError}
+"""Errors that the other side is told by a word."""
 _NOT_FOUND: Final = 127  # exit code of a shell
 
 
@@ -121,6 +123,11 @@ class Server:
         found = _mapping(self._ask("have", recordings=[*recordings]))
         return {one: _copied(value) for one, value in found.items() if one in recordings}
 
+    def segments(self, recording: str) -> dict[int, str]:
+        """As of `Place`."""
+        found = _mapping(self._ask("segments", recording=recording))
+        return {int(number): str(digest) for number, digest in found.items() if number.isdigit()}
+
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """As of `Place`."""
         found = _mapping(self._ask("begin", recording=recording, wants_payloads=wants_payloads))
@@ -146,6 +153,14 @@ class Server:
         """As of `Place`."""
         said = {"label": label, "lacks_payloads": lacks_payloads}
         return str(self._ask("publish", lines, **said))
+
+    def hold(self) -> bool:
+        """As of `Place`."""
+        return self._ask("hold") is True
+
+    def drop(self) -> None:
+        """As of `Place`."""
+        self._ask("drop")
 
     def leave(self) -> None:
         """As of `Place`."""
@@ -180,7 +195,7 @@ class Server:
             text = f"{self.name}: {_shown(answer['error'])}"
             if answer.get("kind") == "held":
                 raise HeldError(text, is_recording=False)
-            raise (DiskFullError if answer.get("kind") == "full" else StoreError)(text)
+            raise _ERRORS.get(str(answer.get("kind")), StoreError)(text)
         return answer.get("value")
 
     def _receive(self) -> dict[str, Any]:
@@ -261,7 +276,7 @@ def _next(place: DirectoryPlace, requests: IO[bytes]) -> tuple[dict[str, Any], b
 def _kind(error: HybridlogError) -> str:
     if isinstance(error, HeldError):
         return "held"
-    return "full" if isinstance(error, DiskFullError) else ""
+    return next((kind for kind, one in _ERRORS.items() if isinstance(error, one)), "")
 
 
 def _begin(place: DirectoryPlace, request: Mapping[str, Any], _: bytes) -> Any:
@@ -281,6 +296,9 @@ def _have(place: DirectoryPlace, request: Mapping[str, Any], _: bytes) -> Any:
 _ANSWERS: Final[Mapping[str, Callable[[DirectoryPlace, Mapping[str, Any], bytes], Any]]] = {
     "sees": lambda place, request, _: place.sees(str(request["mark"])),
     "have": _have,
+    "segments": lambda place, request, _: place.segments(str(request["recording"])),
+    "hold": lambda place, *_: place.hold(),
+    "drop": lambda place, *_: place.drop(),
     "begin": _begin,
     "digest": lambda place, request, _: place.digest(
         CopiedFile.of(request["file"]), int(request["length"])
@@ -351,6 +369,7 @@ def _copied(value: object) -> Copied:
         _shown(found.get("label")),
         found.get("lacks_payloads") is True,
         expired if isinstance(expired, int) else 0,
+        _shown(found.get("content")),
     )
 
 

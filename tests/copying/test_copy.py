@@ -18,13 +18,15 @@ import hybridlog as hl
 from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
 from hybridlog.maintenance.places import CopiedFile, Place
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
+from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.errors import DiskFullError, HeldError, StoreError, UsageError
 from tests.copying.conftest import (
     STATES,
     Disturbed,
     PlaceAt,
     answers,
     directory_at,
+    expire,
     files_in,
     server_at,
 )
@@ -280,6 +282,110 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
         assert found == {key: value for key, value in right[label].items() if key in found}
         if label != "compacted":
             assert answers(lab, label) == right[label]
+
+
+def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
+    robot, lab, told = tmp_path / "robot", tmp_path / "lab", dict[str, Any]()
+    shutil.copytree(robots, robot)
+    with hl.open(robot, mongo="none") as store:
+        store.copy(lab, ["recorded", "noted"])
+        store.mark("recorded", "end", "later")
+        marked = store.entry("recorded")
+        sealed = {label: {*store.directory.listing(label).sealed} for label in STATES}
+    # One of the copies was made by hand before the end of the recording.
+    cut = tmp_path / "cut"
+    shutil.copytree(lab, cut)
+    lines = (cut / "recordings/noted/journal").read_bytes().splitlines(keepends=True)
+    number = next(n for n, line in enumerate(lines) if b'"segment":1' in line)
+    (cut / "recordings/noted/journal").write_bytes(b"".join(lines[:number] + lines[number + 1 :]))
+    (cut / "recordings/noted/000001.mcap").unlink()
+
+    def run_to(path: Path, change: Any = None) -> CopyReport:
+        class Changed(Disturbed):
+            def hold(self) -> bool:
+                if change is not None:
+                    change()
+                return bool(self.__getattr__("hold")())
+
+        told.clear()
+        with hl.open(robot, mongo="none") as store, place_at(path) as place:
+            chosen = [one for one in store.summaries() if one.label in {"recorded", "noted"}]
+            options = CopyOptions(then_expire=True)
+            return run(store.directory, Changed(place), chosen, options, proved=told.__setitem__)
+
+    assert not run_to(lab).problems
+    assert {*told[marked.id]} == sealed["recorded"] - {marked.marks[0]["segment"]}
+    report = run_to(cut)
+    assert "lacks 1 segment" in report.refused["noted"]
+    assert [*told] == [marked.id]
+    # It is not deleted there at the same time.
+    with StoreDirectory(lab).retaining():
+        report = run_to(lab)
+    assert "another process makes room" in report.problems[0]
+    assert not told
+    report = run_to(lab, lambda: expire_in(lab, "recorded"))
+    assert ["recorded stay" in one for one in report.problems] == [True]
+    assert len(told) == 1
+
+
+def expire_in(path: Path, label: str) -> None:
+    with hl.open(path, mongo="none") as store:
+        expire(store, label)
+
+
+def test_marks_of_both_sides(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
+    """What the lab removed again goes; one that both have set keeps no other recording waiting."""
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    names = ["recorded", "noted", "dropped"]
+    with place_at(lab) as place:
+        assert len(copied(robot, place, *names, only_fields=True).copied) == 3
+    with hl.open(lab, mongo="none") as store:
+        for name in names[:2]:
+            store.mark(name, "end", "there")
+        store.unmark("recorded", "there")
+    with hl.open(robot, mongo="none") as store:
+        for name in names[:2]:
+            store.mark(name, "end", "robot's")
+    with place_at(lab) as place:
+        report = copied(robot, place, *names)
+    assert sorted(report.copied) == ["dropped", "recorded"]
+    assert "was marked here and in" in report.refused["noted"]
+    assert answers(lab, "recorded") == answers(robot, "recorded")
+    with hl.open(lab, mongo="none") as store:
+        assert [mark["text"] for mark in store.entry("recorded").marks] == ["robot's"]
+        assert not store.verify(["recorded"]).findings
+
+
+def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
+    robots: Path, tmp_path: Path, place_at: PlaceAt
+) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    with hl.open(robot, mongo="none") as store:
+        held, gone = store.entry("noted").id, store.entry("dropped").id
+
+    class Busy(Disturbed):
+        def begin(self, recording: str, **options: Any) -> Any:
+            if recording == held:
+                raise HeldError("another process copies it", is_recording=False)
+            # Fields are ready: a server does not wait for them.
+            assert any(path.name.startswith(".copying-") for path in robot.iterdir())
+            begun = self.__getattr__("begin")(recording, **options)
+            if recording == gone:
+                shutil.rmtree(robot / "recordings" / "dropped")
+                raise StoreError("a file is gone")
+            return begun
+
+    with place_at(lab) as place:
+        report = copied(robot, Busy(place), "noted", "dropped", "recorded", only_fields=True)
+    assert report.copied == ["recorded"]
+    assert report.held == [held]
+    assert report.refused == {
+        "noted": "Recording 'noted' is not copied: another process copies it",
+        "dropped": "Recording 'dropped' is no longer in the store.",
+    }
+    assert [path.name for path in (lab / "recordings").iterdir()] == ["recorded"]
 
 
 def test_a_full_disk_there_keeps_what_arrived(
