@@ -1389,7 +1389,8 @@ class Store:
             until: Log time of its end, for what lasted; None for a moment.
 
         Raises:
-            TimeError: `moment` or `until` is invalid, or `until` is before `moment`.
+            TimeError: `moment` or `until` is invalid or outside the recording, or `until` is
+                before `moment`.
             StoreError: The recording is being written; use `hybridlog mark` without `--at`.
         """
         self._check_on_disk()
@@ -1397,9 +1398,8 @@ class Store:
 
         self.session.catch_up()
         (entry,) = self.select([recording])
-        start, end = extent_of(entry)
-        time = parse_time(moment, start=start, end=end)
-        last = None if until is None else parse_time(until, start=start, end=end)
+        time = edit.time_of_mark(entry, moment)
+        last = None if until is None else edit.time_of_mark(entry, until)
         try:
             edit.mark(
                 self.directory,

@@ -479,7 +479,7 @@ CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
     "untag": lambda store, one: store.untag(one, "a"),
     "note": lambda store, one: store.note(one, "seen"),
     "rename": lambda store, one: store.rename(one, "new"),
-    "mark": lambda store, one: store.mark(one, "+1s", "seen"),
+    "mark": lambda store, one: store.mark(one, "start", "seen"),
     "compact": lambda store, one: store.compact([one], ["/scan"], drop_mcap=True),
     "repair": lambda store, one: store.repair([one]),
 }

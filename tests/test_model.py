@@ -585,6 +585,12 @@ class Machine(RuleBasedStateMachine):
         recording = self.chosen(which)
         known = self.model[recording]
         moment = BEGIN + time * STEP
+        begin, end = self.store.recordings(recording).summaries[0].extent
+        has_messages = any(said.topic != MARKS for said in known.messages)
+        if has_messages and not begin <= moment <= end:
+            with pytest.raises(TimeError, match=r"begins at|ends at"):
+                self.store.mark(recording, moment, text, {"k": text})
+            return
         self.store.mark(recording, moment, text, {"k": text})
         known.marks.append((moment, text))
         known.mark_segments += 1

@@ -153,34 +153,12 @@ def mark_command(given: _Mark) -> None:
     elif len(given.recording) == 1:
         (recording,) = given.recording
         with given.opened() as store:
-            _check_begun(store, recording, at)
             labels = iter([store.mark(recording, at, given.text, tags, until=given.until).label])
     else:
         raise UsageError("A mark at a time needs one recording: name it with --recording.")
     for label in labels:
         if not given.quiet:
             output.note(f"Marked in {label}.")
-
-
-def _check_begun(store: Store, recording: str, at: str) -> None:
-    """Refuse a mark before its recording, of which it would become the beginning.
-
-    Relative times count from there, and `--at 10` is a second of 1970.
-
-    Raises:
-        UsageError: The recording has not begun at this time.
-    """
-    from hybridlog.query.times import format_time, parse_time
-    from hybridlog.record.losses import extent_of
-
-    (entry,) = store.select([recording])
-    start, end = extent_of(entry)
-    time = parse_time(at, start=start, end=end)
-    if start < end and time < start:
-        raise UsageError(
-            f"{at} is {format_time(time)}, and {entry.label} begins at {format_time(start)}: "
-            "ten seconds from its beginning are +10s, ten before its end -10s."
-        )
 
 
 def _mark_running(
@@ -198,7 +176,7 @@ _MAX_ROWS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Remove(Named, InStore):
+class _Remove(Named, InStore, Quiet):
     yes: bool = option("Do not ask.", short="-y")
 
 
@@ -226,7 +204,8 @@ def rm_command(given: _Remove) -> None:
                 "store removes the rest of it."
             ):
                 store.remove(recording)
-            output.say(f"deleted {label}")
+            if not given.quiet:
+                output.say(f"deleted {label}")
 
 
 def _confirm(copies: Sequence[str], chosen: Sequence[RecordingSummary]) -> None:

@@ -15,6 +15,7 @@ from hybridlog.query.periods import GAP_PERIODS
 from hybridlog.query.predicate.across import names_topics
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.times import format_duration, parse_duration
+from hybridlog.record.marks import MARKS
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, UsageError
 
@@ -271,7 +272,7 @@ def contract_of(topics: Sequence[TopicCheck]) -> str:
     """A contract in YAML that a good recording keeps, with room for the next one.
 
     Topics whose messages come now and then, latched ones and those of few messages get no
-    times.
+    times. Marks are no part of it: another recording need not have any.
 
     Args:
         topics: The topics of the recording.
@@ -279,7 +280,7 @@ def contract_of(topics: Sequence[TopicCheck]) -> str:
     recording = topics[0].recording if topics else "no topic"
     lines = [f"# Made by `hybridlog check --make` from {json.dumps(recording)}.", "topics:"]
     for one in sorted(topics, key=lambda one: one.topic):
-        if one.messages:
+        if one.messages and one.topic != MARKS:
             lines.append(f"  {json.dumps(one.topic, ensure_ascii=False)}:")
             lines += [f"    {key}: {value}" for key, value in _made(one)]
     return "\n".join(lines) + "\n"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.contract.judge import broken, judge
 from hybridlog.query.times import format_duration
+from hybridlog.record.marks import MARKS
 from hybridlog.wording import counted
 
 if TYPE_CHECKING:
@@ -92,7 +93,8 @@ def diff(
     """
     sides = _Side(a), _Side(b)
     found: list[Difference] = []
-    for topic in sorted({*sides[0].topics, *sides[1].topics}):
+    # Marks are about a recording, and not of it.
+    for topic in sorted({*sides[0].topics, *sides[1].topics} - {MARKS}):
         if not all(topic in side.topics for side in sides):
             words = [
                 ""

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.socket_directory import is_our_socket, new_socket
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.settings import NAME
 from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
@@ -257,7 +258,10 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
     if named:
         return list(dict.fromkeys(_resolve(name, names) for name in named))
     if not names:
-        raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
+        where = f"{store} is no store: no recorder runs there"
+        if (store / NAME).is_file():
+            where = "No recorder runs on this store"
+        raise UsageError(f"{where}; start one with `hybridlog record`.")
     if len(names) > 1:
         raise UsageError(f"Several recorders run; name one of {', '.join(names)}.")
     return names

@@ -400,7 +400,9 @@ class Recorder:
         lost: dict[str, int] = {}
         ring = self._target if isinstance(self._target, Snapshots) else None
         if ring is not None:
-            ring.look()
+            with self._lock:
+                names = [*self._topics]
+            ring.look(names)
         with self._lock:
             totals = dict(self._lost)
         for (topic, cause), count in totals.items():
@@ -538,8 +540,6 @@ class Recorder:
 
     def expect(self, channel: Channel) -> None:
         """See `Sink.expect`."""
-        if isinstance(self._target, Snapshots):
-            return  # messages in the ring are not indexed before a trigger
         with self._lock:
             self._expected += 1
             too_many = self._expected > _MAX_EXPECTED

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 _MAX_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into
 _MAX_WATCHED = 1000  # messages whose field `numbers` reads
+_MAX_TOLD = 100  # lines about triggers
 _RING_SHARE = 0.5  # of a recording's budget; the rest is for messages that come meanwhile
 
 
@@ -131,6 +132,8 @@ class Snapshots:
         again: Called with the reason of a trigger that fires during a snapshot.
         say: Shows a line to the user.
         clock: The clock of log times.
+        settle_s: Seconds after the first topic in which others may come, before a trigger is
+            told that none matches.
 
     Attributes:
         cut_off: Messages of snapshots that a full disk cost, by topic.
@@ -145,12 +148,16 @@ class Snapshots:
         say: Callable[[str], None],
         *,
         clock: MachineClock,
+        settle_s: float = 3.0,
     ) -> None:
         self.cut_off: Counter[str] = Counter()
         self._options = options
         self._again = again
         self._reasons: set[str] = set()
         self._unmet = dict.fromkeys(trigger.text for trigger in options.triggers)
+        self._settle_s = settle_s
+        self._settled_at: float | None = None
+        self._told: set[str] = set()
         self._ring = Ring(round(options.ring_s * 1e9), budget_bytes)
         self._start = start
         self._say = say
@@ -188,7 +195,7 @@ class Snapshots:
         )
         watches = self._watched.get(channel)
         if watches is None:
-            watches = self._watched[channel] = tuple(self._watches(channel))
+            watches = self.expect(channel)
         with self._lock:
             self._ring.add(message)
             active = self._active
@@ -209,6 +216,11 @@ class Snapshots:
         for reason in _happened(watches, message):
             self.fire(reason, log_time)
         return taken
+
+    def expect(self, channel: Channel) -> tuple[_Watch, ...]:
+        """Compile the triggers for a channel; tells those that can never fire on it."""
+        watches = self._watched[channel] = tuple(self._watches(channel))
+        return watches
 
     def fire(self, reason: str, at: int | None = None) -> None:
         """Start a snapshot, or extend the one that is being written.
@@ -233,8 +245,13 @@ class Snapshots:
         if goes_on and is_new:
             self._again(reason)
 
-    def look(self) -> None:
-        """End a snapshot whose time is over, even without further messages."""
+    def look(self, topics: Collection[str] = ()) -> None:
+        """End a snapshot whose time is over, even without further messages.
+
+        Args:
+            topics: Full names of the topics so far; triggers that match none are told.
+        """
+        self._tell_unmet(topics)
         with self._lock:
             now = self._clock.steady(self._clock.now())
             if self._active is not None and now >= self._until:
@@ -261,7 +278,7 @@ class Snapshots:
                 self._end(self._active)
         self._worker.shutdown(wait=True)
         for text in self._unmet:
-            self._say(f"no topic matches the trigger {text!r}")
+            self._say(f"no topic matched the trigger {text!r}")
         if self._failure is not None:
             raise self._failure
         return self._reports
@@ -341,7 +358,7 @@ class Snapshots:
         return [number for message in fields for number in numbers_at(message, path)]
 
     def _watches(self, channel: Channel) -> Iterator[_Watch]:
-        """The triggers for a channel; reports those that can never fire on it."""
+        """The triggers for a channel that may fire on it."""
         for trigger in self._options.triggers:
             if not trigger.fits(channel.topic):
                 continue
@@ -353,10 +370,27 @@ class Snapshots:
             try:
                 check(trigger.predicate, types)
             except WhereError as error:
-                self._say(f"trigger {trigger.text!r} can never fire on {channel.topic}: {error}")
+                self._tell_once(
+                    f"trigger {trigger.text!r} can never fire on {channel.topic}: {error}"
+                )
             else:
                 names = frozenset(path.split(".", 1)[0] for path in trigger.predicate.fields())
                 yield _Watch(trigger.text, to_bool(trigger.predicate, types), names)
+
+    def _tell_unmet(self, topics: Collection[str]) -> None:
+        for trigger in self._options.triggers:
+            if any(map(trigger.fits, topics)):
+                self._unmet.pop(trigger.text, None)
+        if topics and self._settled_at is None:
+            self._settled_at = time.monotonic() + self._settle_s
+        if self._settled_at is not None and time.monotonic() >= self._settled_at:
+            for text in [*self._unmet]:
+                self._tell_once(f"no topic matches the trigger {text!r} so far")
+
+    def _tell_once(self, text: str) -> None:
+        if text not in self._told and len(self._told) < _MAX_TOLD:
+            self._told.add(text)
+            self._say(text)
 
     def _write_out(self, reason: str, at: int) -> None:
         """Start a recording with the content of the ring; runs on the worker."""

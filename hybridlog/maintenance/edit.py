@@ -15,6 +15,8 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import finish_renaming, put_entry, remove_marks
+from hybridlog.query.times import TimeLike, format_time, parse_time
+from hybridlog.record.losses import extent_of
 from hybridlog.record.marks import mark_channel, mark_payload
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
@@ -60,6 +62,28 @@ def _with_labels(directory: StoreDirectory, label: str, line: journal.Event) -> 
         return line
     new = directory.free_label(str(line["name"]), but=label)
     return line if new == label else {**line, "from": label, "to": new}
+
+
+def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
+    """Log time of a mark's beginning or end, ns.
+
+    Outside of a recording that has ended, a mark would become its beginning or end, from which
+    relative times count.
+
+    Raises:
+        TimeError: It is invalid, or outside the recording.
+    """
+    start, end = extent_of(entry)
+    time = parse_time(moment, start=start, end=end)
+    has_messages = entry.messages > len(entry.marks)
+    if has_messages and entry.status != "open" and not start <= time <= end:
+        ends = f"begins at {format_time(start)}" if time < start else f"ends at {format_time(end)}"
+        is_ = f"{moment} is {format_time(time)}, and " if isinstance(moment, str) else ""
+        raise TimeError(
+            f"{is_ or f'A mark cannot be at {format_time(time)}: '}{entry.label} {ends}; ten "
+            "seconds from its beginning are +10s, ten before its end -10s."
+        )
+    return time
 
 
 def mark(
@@ -154,8 +178,8 @@ def unmark(
         if not gone:
             when = "" if moment is None else " at this time"
             raise UsageError(
-                f"{label} has no mark {text!r}{when}. Those that were set while it was recorded "
-                "are messages, and stay."
+                f"{label} has no mark {text!r}{when} that was set after it was recorded: those of "
+                "a recorder are messages, and stay."
             )
         lines = [journal.event(journal.UNMARKED, segment=mark["segment"]) for mark in gone]
         Journal(path).append(*lines)

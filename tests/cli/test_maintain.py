@@ -61,7 +61,7 @@ def test_rm(logs: Path, fresh: Path) -> None:
     assert recordings(fresh) == ["small"]
     assert "all is well" in run("verify", store=fresh).out
     assert "/json" in run("fetch", "-t", "/json", store=fresh, code=2).err
-    run("rm", "small", "-y", store=fresh)
+    assert run("rm", "small", "-yq", store=fresh).out == ""
     assert "is empty" in run("ls", store=fresh).err
     run("record", logs / "odd.mcap", "--quiet", store=fresh)
 

@@ -102,11 +102,22 @@ def test_nothing_leaves_no_file(store: Path, tmp_path: Path) -> None:
     assert "name them with -o" in run(*fetch[:3], "--split-by", "mark", store=store, code=2).err
 
 
-@pytest.mark.parametrize("time", ["3", "-10s", "2025-06-03"])
-def test_no_mark_before_the_recording(store: Path, time: str) -> None:
-    done = run("mark", "x", "-r", "one", "--at", time, store=store, code=2)
+@pytest.mark.parametrize(
+    ("time", "options", "ends"),
+    [
+        *((time, ("--at", time), "begins at 2025-06-03T08:00:0") for time in ("3", "-10s")),
+        *((time, ("--at", time), "ends at 2025-06-03T08:00:0") for time in ("+900d", "2026-06-03")),
+        ("+100s", ("--at", "+1s", "--until", "+100s"), "ends at 2025-06-03T08:00:0"),
+    ],
+)
+def test_no_mark_outside_the_recording(
+    store: Path, time: str, options: tuple[str, ...], ends: str
+) -> None:
+    before = run("ls", "--json", store=store).out
+    done = run("mark", "x", "-r", "one", *options, store=store, code=2)
     assert f"{time} is " in done.err
-    assert "one begins at 2025-06-03T08:00:00" in done.err
+    assert f"one {ends}" in done.err
+    assert run("ls", "--json", store=store).out == before
 
 
 def test_a_first_question_about_a_mark_tells_no_damage(store: Path) -> None:

@@ -302,6 +302,8 @@ def test_a_good_real_log_keeps_its_own_contract(name: str, tmp_path: Path) -> No
         path = tmp_path / "made.yaml"
         assert run("check", "-r", label, "--make", path, store=tmp_path / "s").code == 0
         assert Contract.read(path) == contract
+        store.mark(label, "start", "here")
+        assert contract_of(store.check()) == contract_of(checked)
         gone = next(one.topic for one in checked if one.messages)
         kept = matcher(["**"], [gone])
         store.record(DATA / "real" / name, name="other", matcher=kept, again=True)

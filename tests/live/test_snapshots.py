@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.live.control_server import request
+from hybridlog.live.machine_clock import MachineClock
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.ring import BufferedMessage, Ring
-from hybridlog.live.snapshots import SnapshotOptions, Trigger, _happened, _Watch
+from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger, _happened, _Watch
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.record.losses import Cause
@@ -222,8 +223,36 @@ def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
     assert "'/scan: nope == 1' can never fire on /scan: " in said
     assert "there is no field nope" in said
     assert """'/scan: near == "x"' can never fire on /scan: """ in said
-    assert "no topic matches the trigger '/nowhere: a == 1'" in said
+    assert "no topic matched the trigger '/nowhere: a == 1'" in said
     assert said.count("near > 1") == 1  # the snapshot itself
+    assert said.count("can never fire") == 2
+
+
+def test_a_trigger_that_can_never_fire_is_told_before_the_first_message(store: hl.Store) -> None:
+    wrong, nowhere = "/scan: nope == 1", "/nowhere: a == 1"
+    robot = Robot(store, SnapshotOptions(60, triggers=(Trigger.of(wrong),)))
+    robot.recorder.expect(scan_channel())
+    (line,) = robot.said
+    robot.recorder.stop()
+    assert "can never fire on /scan" in line
+    said: list[str] = []
+    snapshots = Snapshots(
+        SnapshotOptions(60, triggers=(Trigger.of(nowhere), Trigger.of("/scan"))),
+        1 << 20,
+        lambda _: pytest.fail("nothing fires"),
+        lambda _: None,
+        said.append,
+        clock=MachineClock(),
+        settle_s=0,
+    )
+    snapshots.look([])
+    assert not said
+    for _ in range(2):
+        snapshots.look(["/scan", "/odom"])
+    assert said == [f"no topic matches the trigger {nowhere!r} so far"]
+    snapshots.look(["/nowhere"])
+    assert snapshots.close() == []
+    assert len(said) == 1
 
 
 PARTS = Schema("test_msgs/Parts", "ros1msg", PARTS_TEXT)

@@ -415,7 +415,7 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
 def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) -> None:
     place = tmp_path / "it's [1]*?"
     copytree(many.directory.path, place)
-    (item,) = json.loads(answer("tables", "-t", "/small", "--json", store=place).out)
+    (item,) = json.loads(answer("tables", "/small", "--json", store=place).out)
     assert len(duckdb.sql(item["statement"])) == 160
 
 
@@ -473,7 +473,7 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
     assert listed(place) == listed_by_command(place)
     assert listed(place).keys() == {"first", "live"}
     for work in (
-        lambda: answer("tables", "-t", "/a", store=place),
+        lambda: answer("tables", "/a", store=place),
         lambda: answer("sql", "select count(*) from a", store=place),
     ):
         path.unlink()
