@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import secrets
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -90,6 +91,8 @@ _CLIENTS_WAIT_S = 600.0
 """Seconds for which a published MongoDB waits for clients."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by label, name or id, or their entries."""
+_ELSEWHERE: Final = re.compile(r"(?P<host>[^/:]+):(?P<path>.*)")
+"""A URL, or a place on a server as scp has it."""
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -169,18 +172,42 @@ def open_store(
 
 
 @contextmanager
-def _place(to: str | Path, options: CopyOptions) -> Iterator[Place]:
-    """The place that recordings are copied to."""
+def _place(to: str | Path, options: CopyOptions, source: StoreDirectory) -> Iterator[Place]:
+    """The place that recordings of a store are copied to."""
     from hybridlog.maintenance.ssh import is_ssh, ssh_place
 
     if is_ssh(str(to)):
         with ssh_place(str(to), options.ssh, options.program) as server:
             yield server
-    elif "://" in str(to):
-        raise UsageError(f"{to} is no place to copy to: give a directory, or ssh://user@host/path.")
-    else:
-        with open_store(to, create=True) as store, store.receiving() as place:
-            yield place
+        return
+    path = _local(to)
+    if not source.is_remote and source.path.resolve() in path.resolve().parents:
+        raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
+    with open_store(path, create=True) as store, store.receiving() as place:
+        yield place
+
+
+def _local(to: str | Path) -> Path:
+    """The directory to copy to.
+
+    Raises:
+        UsageError: It is written like a place elsewhere.
+    """
+    found = _ELSEWHERE.fullmatch(str(to))
+    if found is not None and (found["path"].startswith("/") or not os.path.lexists(to)):
+        host, path = found["host"], found["path"]
+        if host == "ssh":
+            cure = f"Write ssh://{path.lstrip('/')}"
+        elif path.startswith("//") or (path.startswith("/") and host == "file"):
+            cure = "Give a directory, ssh://user@host/path, s3://, gs:// or az://"
+        else:
+            rest = path if path.startswith("/") else f"/~/{path.removeprefix('~/')}"
+            cure = f"Write ssh://{host}{rest} for a server, or ./{to} for a directory"
+        raise UsageError(f"{to} is no place to copy to. {cure}.")
+    try:
+        return Path(to).expanduser()
+    except RuntimeError as error:
+        raise UsageError(f"{to}: there is no such home directory.") from error
 
 
 def _again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -1479,7 +1506,7 @@ class Store:
         address = address_of(to)
         if address is not None:
             return self._publish(address, chosen, wanted, progress, found)
-        with _place(to, wanted) as place:
+        with _place(to, wanted, self.directory) as place:
 
             def expire(recording: str, digests: Mapping[int, str]) -> None:
                 self._expire(recording, digests, place.name, found, progress)

@@ -45,6 +45,7 @@ _IDLE_S: Final = 60.0
 _ERRORS: Final = {"full": DiskFullError, "refused": RefusedError}
 """Errors that the other side is told by a word."""
 _NOT_FOUND: Final = 127  # exit code of a shell
+_NOT_REACHED: Final = 255  # exit code of ssh
 
 
 def is_ssh(to: str) -> bool:
@@ -75,12 +76,18 @@ def ssh_place(url: str, ssh: str | None, program: str) -> Iterator[Server]:
     requests, answers = process.stdin, process.stdout
     assert requests is not None
     assert answers is not None
+    server = None
     try:
-        yield Server(url, requests, answers)
+        server = Server(url, requests, answers)
+        yield server
     except StoreError as error:
+        code = None
         with suppress(subprocess.TimeoutExpired):
-            if process.wait(2) == _NOT_FOUND:
-                raise StoreError(f"{error} Name hybridlog on the server: --program.") from error
+            code = process.wait(2)
+        if code == _NOT_FOUND:
+            raise StoreError(f"{error} Name hybridlog on the server: --program.") from error
+        if code == _NOT_REACHED and server is None:
+            raise StoreError(f"{url} could not be reached.") from error
         raise
     finally:
         for stream in (requests, answers):
@@ -110,9 +117,10 @@ class Server:
         self._requests = requests
         self._answers = answers
         self._ahead = 0  # requests without an answer
-        self._is_cut = False
+        self._is_cut = self._is_met = False
         if self._receive().get("hybridlog") != _PROTOCOL:
             raise StoreError(f"hybridlog of {self.name} is of another version.")
+        self._is_met = True
 
     def sees(self, mark: str) -> bool:
         """As of `Place`."""
@@ -215,6 +223,8 @@ class Server:
 
     def _cut(self) -> StoreError:
         self._is_cut = True
+        if not self._is_met:
+            return StoreError(f"hybridlog of {self.name} has not answered.")
         return StoreError(
             f"The connection to {self.name} has ended. What arrived stays there: run the command "
             "again."

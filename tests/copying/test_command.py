@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import hybridlog as hl
 from tests.cli.running import run, started, wait_for
 from tests.copying.conftest import answers
 from tests.json_schemas import misfit, schema_of
@@ -47,7 +48,9 @@ def ssh(tmp_path: Path) -> Path:
     return path
 
 
-def test_copies_to_a_directory(robots: Path, tmp_path: Path) -> None:
+def test_copies_to_a_directory(
+    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done = run("copy", "noted", "-r", "exp*", tmp_path / "lab", "--store", robots)
     assert sorted(done.lines) == ["copied expired", "copied noted"]
     again = run("copy", tmp_path / "lab", "--store", robots, "--tag", "place", "--json")
@@ -55,8 +58,27 @@ def test_copies_to_a_directory(robots: Path, tmp_path: Path) -> None:
     assert not misfit(again.json, schema_of(["copy"]))
     assert again.json["bytes_copied"] == 0
     assert answers(tmp_path / "lab", "noted") == answers(robots, "noted")
-    for wrong in ("ftp://x/y", "ssh://", "ssh://-oProxyCommand=x/y", "ssh://a:b@c/d"):
-        assert run("copy", wrong, "--store", robots, code=2).err
+    for wrong, cure in {
+        "ssh://": "Write ssh://user@host/path",
+        "ssh://-oProxyCommand=x/y": "Write ssh://user@host/path",
+        "ssh://a:b@c/d": "has no password",
+        "ssh:/lab/data": "Write ssh://lab/data.",
+        "me@lab:/data": "Write ssh://me@lab/data for a server",
+        "lab:data": "Write ssh://lab/~/data for a server, or ./lab:data for a directory",
+        "ftp://x/y": "Give a directory, ssh://user@host/path, s3://, gs:// or az://.",
+        "file:///data": "Give a directory, ssh://user@host/path, s3://, gs:// or az://.",
+        "~nosuchuser/x": "no such home directory",
+        str(robots / "inside"): "lies inside the store",
+    }.items():
+        assert cure in run("copy", wrong, "--store", robots, code=2).err
+    run("copy", "noted", "~/home", "--store", robots, HOME=str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lab:data").mkdir()
+    with hl.open(robots, mongo="none") as store:
+        for there in ("./lab:here", "lab:data"):
+            store.copy(there, ["noted"])
+    for there in ("home", "lab:here", "lab:data"):
+        assert (tmp_path / there / "recordings" / "noted").is_dir()
     assert run("copy", tmp_path / "x", "--store", robots, "--limit-rate", "0", code=2).err
     assert run("copy", "nosuch", tmp_path / "x", "--store", robots, code=2).err
 
@@ -72,6 +94,9 @@ def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:
     assert run(*words, "--program", HYBRIDLOG).lines == ["dropped is there already"]
     there = tmp_path / "lab store"
     assert answers(there, "dropped") == answers(robots, "dropped")
+    away = run(*words[:-1], "sh -c 'echo no route to lab >&2; exit 255'", code=5)
+    assert "no route to lab" in away.err
+    assert f"{url} could not be reached." in away.err
     garbage = run("copy", "ssh://me@lab/x", "--store", robots, "--ssh", str(ssh), "--program",
                   "echo welcome to the lab;", code=5)  # fmt: skip
     assert "does not answer as hybridlog does" in garbage.err
