@@ -1531,6 +1531,7 @@ class Store:
         report: CopyReport,
     ) -> CopyReport:
         """Copy recordings into a bucket."""
+        from hybridlog.maintenance.opening import open_catalog
         from hybridlog.maintenance.publish import publish
         from hybridlog_storage.remote.store import RemoteDirectory
 
@@ -1542,14 +1543,11 @@ class Store:
         target = RemoteDirectory.create_in(address)
         if isinstance(self.directory, RemoteDirectory) and self.directory.source is target.source:
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
-        tables = self.session.tables
-        target.refresh()
-        there = {one.id: target.label_of_id(one.id) for one in chosen}
-        report.known += filter(None, there.values())
-        for entry in self.session.entries([one for one in chosen if not there[one.id]]):
+        own, tables = open_catalog(target), self.session.tables
+        for entry in self.session.entries(chosen):
             try:
                 label, is_new = publish(
-                    self.directory, self.catalog, entry, target, progress, tables=tables
+                    self.directory, self.catalog, entry, target, progress, tables=tables, own=own
                 )
             except StoreError as error:
                 report.refused[entry.label] = str(error)

@@ -286,7 +286,7 @@ class _Copying:
         Raises:
             RefusedError: It has not ended, or is damaged.
         """
-        name = f"Recording {one.label!r} of {self._source.path}"
+        name = f"Recording {one.label!r} of {self._source.place}"
         if one.status == "open":
             raise RefusedError(f"{name} is being written. Copy it when it has ended.")
         if one.status == "unfinished":
@@ -393,8 +393,8 @@ class _Sent:
         inventory = take_inventory(directory, label)
         if inventory.id != recording or inventory.misfits or not inventory.is_proven:
             raise RefusedError(
-                f"Recording {label!r} of {directory.path} is incomplete: `hybridlog verify "
-                f"--store {directory.path} {label}` shows what is missing. It was not copied."
+                f"Recording {label!r} of {directory.place} is incomplete: `hybridlog verify "
+                f"--store {directory.place} {label}` shows what is missing. It was not copied."
             )
         assert inventory.state is not None  # it is proven
         self.state: JournalState = inventory.state

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +28,7 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import ObjectExistsError, StoreError, unreadable
 from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.lists import RECORDINGS, TABLES, ListedRecording
 from hybridlog_storage.segments.segment_check import SegmentCheck
@@ -47,8 +50,9 @@ def publish(
     progress: Progress | None = None,
     *,
     tables: Tables | None = None,
+    own: Catalog | None = None,
 ) -> tuple[str, bool]:
-    """Put an ended recording into a store in a bucket.
+    """Put an ended recording into a store in a bucket, or what it lacks there.
 
     Args:
         source: The store that has it.
@@ -57,25 +61,30 @@ def publish(
         target: The store in a bucket.
         progress: Called with the bytes that have arrived.
         tables: The fields in the source, if they are known.
+        own: The catalog of `target`, if it is open.
 
     Returns:
-        Its label there, and whether it was put there now.
+        Its label there, and whether anything of it was put there now.
 
     Raises:
-        StoreError: It has not ended, or is damaged.
+        StoreError: It has not ended, is damaged, or has other content there.
         BucketError: The server does not answer, or refuses.
     """
     if entry.status in {"open", "unfinished"}:
         raise StoreError(f"Recording {entry.label!r} has not ended. Copy it when it has.")
-    target.refresh()
-    if label := target.label_of_id(entry.id):
-        return label, False
-    listed = _bring(source, entry, target, progress)
+    if own is None:
+        target.refresh()
+        own = open_catalog(target)
+    known = _there(entry, target, own)
+    if known is not None and known.is_whole:
+        return known.label, False
+    listed = _bring(source, entry, target, progress, known or _There())
     fields = _bring_fields(tables or Tables(source.path), entry, target)
     for _ in range(TRIES):
         with suppress(ObjectExistsError), target.changing():
             label, found = target.label_of_id(entry.id), listed.files
-            if label:  # another process was faster
+            if label and (known is None or target.files_of(label) != known.files):
+                # Another process was faster.
                 there = target.files_of(label)
                 # Of large files the last one to come replaced what the other one had sent.
                 newer = {
@@ -86,7 +95,6 @@ def publish(
                 found = {**there, **newer}
             label = label or target.free_label(entry.label)
             target.add_recording(label, ListedRecording(entry.id, found), fields)
-            own = open_catalog(target)
             _bring_results(catalog, entry, own)
             described = describe_now(target, own, label)
             if described.entry.status != entry.status or described.entry.id != entry.id:
@@ -99,6 +107,73 @@ def publish(
     raise StoreError(f"{target.source.bucket.address} changes all the time. Copy again.")
 
 
+@dataclass(frozen=True)
+class _There:
+    """A recording that the other store has.
+
+    Attributes:
+        label: Its label there.
+        files: The objects of its files, without those that are lost.
+        digests: Digest of each of its files, by path, as it was listed.
+        is_whole: Whether this store has nothing that it lacks.
+    """
+
+    label: str = ""
+    files: Mapping[str, Object] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
+    is_whole: bool = False
+
+    def notes(self) -> dict[str, Object]:
+        """The lines that were added to its journal there."""
+        return {path: o for path, o in self.files.items() if path.startswith(f"{JOURNAL}.")}
+
+    def has(self, path: str, digest: str, size: int) -> bool:
+        """True if a file is there already."""
+        found = self.files.get(path)
+        return found is not None and (self.digests.get(path), found.size) == (digest, size)
+
+
+def _there(entry: RecordingEntry, target: RemoteDirectory, own: Catalog) -> _There | None:
+    """What the other store has of a recording, by its catalog; None for nothing.
+
+    Raises:
+        StoreError: It has other content there.
+    """
+    label = target.label_of_id(entry.id)
+    row = own.recording(entry.id) if label else None
+    if row is None:
+        return None
+    there = row[1]
+    listed = target.listing(label)  # compares it with its objects
+    gone = _expired(there) - _expired(entry)
+    missing = there.digests.items() - entry.digests.items()
+    lacking = entry.digests.items() - there.digests.items()
+    is_damaged = target.is_damaged(label)
+    digests = {**there.digests, **there.stored}
+    known = _There(
+        label,
+        target.files_of(label),
+        {listed.sealed.get(int(number), ""): digest for number, digest in digests.items()}
+        | {f"{PAYLOADS}/{file['file']}": file["digest"] for file in there.payloads},
+        is_whole=not (lacking or gone or is_damaged),
+    )
+    if not known.is_whole and (missing or _expired(entry) - _expired(there)):
+        raise StoreError(
+            f"Recording {entry.label!r} has other content in {target.place}: each of the two "
+            "lacks what the other one has. Remove one of them, or keep both stores."
+        )
+    return known
+
+
+def _expired(entry: RecordingEntry) -> Counter[str]:
+    """Number of messages without payload, by topic."""
+    found: Counter[str] = Counter()
+    for channel in entry.channels:
+        if channel.id >= EXPIRED_IDS:
+            found[channel.topic] += channel.stats.messages
+    return found
+
+
 def _replaces(one: Object, other: Object | None) -> bool:
     return other is not None and other.name == one.name and other.version != one.version
 
@@ -108,19 +183,31 @@ def _bring(
     entry: RecordingEntry,
     target: RemoteDirectory,
     progress: Progress | None,
+    known: _There,
 ) -> ListedRecording:
-    """Create the objects of a recording, each after every byte of its file was checked."""
+    """Create the objects of a recording, each after every byte of its file was checked.
+
+    Those that are there already stay, and what was noted there.
+    """
     label = source.label_now(entry.label, entry.id)
     inventory = take_inventory(source, label)
     if inventory.id != entry.id or inventory.misfits or not inventory.is_proven:
         raise StoreError(
-            f"Recording {label!r} of {source.path} is incomplete: `hybridlog verify --store "
-            f"{source.path} {label}` shows what is missing. It was not copied."
+            f"Recording {label!r} of {source.place} is incomplete: `hybridlog verify --store "
+            f"{source.place} {label}` shows what is missing. It was not copied."
         )
-    path, found = source.recording(label), {}
+    path, found = source.recording(label), known.notes()
     sizes = [size for _, size in map(inventory.stored_file, inventory.summaries)]
     total = sum(sizes) + sum(file.bytes for file in inventory.payloads.values())
     done = 0
+
+    def is_there(name: str, digest: str, size: int) -> bool:
+        nonlocal total
+        if not known.has(name, digest, size):
+            return False
+        found[name] = known.files[name]
+        total -= size
+        return True
 
     def bring(name: str, size: int, depth: int) -> None:
         nonlocal done
@@ -132,6 +219,8 @@ def _bring(
     for number in inventory.summaries:
         name = inventory.listing.sealed[number]
         digest, size = inventory.stored_file(number)
+        if is_there(name, digest, size):
+            continue
         with SegmentCheck(path / name) as check:
             about = check.summary
             is_it = about is not None and (about.digest, about.size) == (digest, size)
@@ -139,8 +228,9 @@ def _bring(
                 raise StoreError(f"{path / name} is damaged: `hybridlog verify` shows where.")
         bring(name, size, files.IN_RECORDING)
     for file in inventory.payloads.values():
-        open_file(path / PAYLOADS, file).check()
-        bring(f"{PAYLOADS}/{file.file}", file.bytes, IN_PAYLOADS)
+        if not is_there(f"{PAYLOADS}/{file.file}", file.digest, file.bytes):
+            open_file(path / PAYLOADS, file).check()
+            bring(f"{PAYLOADS}/{file.file}", file.bytes, IN_PAYLOADS)
     lines = _journal(path, inventory) + journal.encode(
         journal.event(journal.ADOPTED, store=target.settings.store_id)
     )

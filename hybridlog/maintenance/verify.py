@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 _REPAIR = "run `hybridlog repair`"
 RESTORE = "restore the file from a copy"
+_COPY_AGAIN = "`hybridlog copy` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
 _NOTING_S = 2.0  # that a recorder may take to note a segment that it has sealed
 _KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})
@@ -107,6 +108,7 @@ def verify(
     labels = None if labels is None else [*labels]
     if not catalog.is_sound(labels):
         result.findings.append(Finding("", "catalog", "the file is damaged", _REPAIR))
+    directory.look_closely()
     index = None if database is None else _Index(database, count_all=labels is None)
     checker = tables.TableChecker(directory)
     for label in directory.labels() if labels is None else labels:
@@ -208,6 +210,8 @@ class _Check:
 
     def found(self, place: str, problem: str, cure: str) -> None:
         """Add a problem."""
+        if self._directory.is_remote:
+            cure = _COPY_AGAIN
         self._result.findings.append(Finding(self._label, place, problem, cure))
 
     def run(self, repairs: RepairReport, progress: Progress | None) -> None:
@@ -250,7 +254,8 @@ class _Check:
             time.sleep(_NOTING_S / 100)
             inventory = take_inventory(self._directory, self._label)
             entry = describe_inventory(self._catalog, inventory, is_open=True).entry
-        self._row(entry, is_open=is_open)
+        if inventory.is_proven or not self._directory.is_remote:  # where no row is noted
+            self._row(entry, is_open=is_open)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
             return

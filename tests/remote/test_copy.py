@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import hybridlog as hl
 from hybridlog.maintenance.copying import CopyOptions
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError
-from tests.copying.conftest import STATES, answers, robots  # noqa: F401 - a fixture
+from tests.copying.conftest import STATES, answers, expire, robots  # noqa: F401 - a fixture
 from tests.remote.server import Proxy
 
 
@@ -47,3 +48,70 @@ def test_a_bucket_answers_like_the_robot(
     with hl.open(tmp_path / "back", mongo="none", create=True) as store:
         assert sorted(store.import_from(address).copied) == sorted(STATES)
         assert not store.verify().findings
+
+
+def cut_short(store: Path, label: str) -> None:
+    """Leave what a recording had after two segments, as a copy of a running store has it."""
+    path = store / "recordings" / label
+    lines = (path / "journal").read_bytes().splitlines(keepends=True)
+    third = [number for number, line in enumerate(lines) if b'"sealed"' in line][2]
+    (path / "journal").write_bytes(b"".join(lines[:third]))
+    for segment in sorted(path.glob("*.mcap"))[2:]:
+        segment.unlink()
+
+
+def raw(path: str | Path, label: str) -> list[tuple[int, str, bytes]]:
+    with hl.open(path, mongo="none") as store:
+        query = store.topic(*store.topics()).in_recording(label)
+        return [
+            (one.log_time_ns, one.topic, b"" if one.is_reduced else bytes(one.raw)) for one in query
+        ]
+
+
+@pytest.mark.parametrize("lacks", ["payloads", "segments"])
+def test_less_in_a_bucket_is_completed(
+    robots: Path,  # noqa: F811
+    address: str,
+    tmp_path: Path,
+    lacks: str,
+) -> None:
+    less = tmp_path / "less"
+    whole = raw(robots, "recorded")
+    with hl.open(robots, mongo="none") as robot:
+        if lacks == "payloads":
+            robot.copy(less, ["recorded"], CopyOptions(only_fields=True))
+        else:
+            shutil.copytree(robots, less)
+            cut_short(less, "recorded")
+        with hl.open(less, mongo="none") as lab:
+            assert lab.copy(address, ["recorded"]).copied == ["recorded"]
+        assert raw(address, "recorded") != whole
+        with hl.open(address) as there:
+            there.tag("recorded", seen="yes")
+        assert robot.copy(address, ["recorded"]).copied == ["recorded"]
+        assert robot.copy(address, ["recorded"]).known == ["recorded"]
+        with hl.open(less, mongo="none") as lab:  # less takes nothing away
+            assert lab.copy(address, ["recorded"]).known == ["recorded"]
+    files.mounted.clear()
+    assert raw(address, "recorded") == whole
+    with hl.open(address) as there:
+        assert there.entry("recorded").tags["seen"] == "yes"
+        assert not there.verify().findings
+
+
+def test_other_content_of_the_same_recording_is_refused(
+    robots: Path,  # noqa: F811
+    address: str,
+    tmp_path: Path,
+) -> None:
+    less = tmp_path / "less"
+    shutil.copytree(robots, less)
+    cut_short(less, "recorded")
+    with hl.open(less, mongo="none") as lab:
+        expire(lab, "recorded")
+        assert lab.copy(address, ["recorded"]).copied == ["recorded"]
+        lab.mark("recorded", "start", "of the lab")
+        assert lab.copy(address, ["recorded"]).copied == ["recorded"]
+    with hl.open(robots, mongo="none") as robot:
+        report = robot.copy(address, ["recorded"])
+    assert "has other content" in report.refused["recorded"]

@@ -22,7 +22,6 @@ from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     BucketError,
-    HybridlogError,
     ObjectExistsError,
     ResourceError,
     StoreError,
@@ -292,19 +291,79 @@ def test_damaged_fields_are_left_out(
     assert shared
 
 
-def test_changed_objects_are_an_error(here: Path, address: str, proxy: Proxy) -> None:
-    publish_all(here, address, ("run",))
+def lose(address: str, ending: str, recording: str = "", *, changes: bool = False) -> str:
+    """Delete the last object whose name ends like this, or change it; its name."""
     bucket = Bucket(address)
+    *_, name = (
+        one.name
+        for one in bucket.objects()
+        if one.name.endswith(ending) and recording in one.name and "lists/" not in one.name
+    )
+    data = bucket.read_whole(name, 1 << 30)[1]
+    bucket.delete([name])
+    if changes:
+        bucket.create(name, data[:-1] + b"x")
+    return name
+
+
+@pytest.mark.parametrize("changes", [False, True])
+def test_lost_objects(here: Path, address: str, tmp_path: Path, changes: bool) -> None:
+    publish_all(here, address, ("run", "short-0"))
+    with hl.open(here, mongo="none") as source:
+        run = source.entry("run").id
+        whole = source.entry("run").messages // 2
     with hl.open(address) as store:
-        name = f"recordings/{store.entry('run').id}/000000.mcap"
-        about, data = bucket.read_whole(name, 1 << 30)
-        bucket.delete([name])
-        assert bucket.create(name, data[:-1] + b"x") != about.version
-        with pytest.raises(HybridlogError, match="changed"):
-            list(store.topic("/scan"))
-        bucket.delete([name])
-        with pytest.raises(HybridlogError, match="deleted meanwhile"):
-            list(store.topic("/scan"))
+        assert store.topic("/scan").count() == whole + 20
+        lose(address, "000001.mcap", run, changes=changes)
+        with pytest.raises(StoreError, match="missing or was changed"):
+            list(store.topic("/scan"))  # it has begun to answer
+    files.mounted.clear()
+    with hl.open(address) as store:
+        left = sum(1 for _ in store.topic("/scan")) - 20
+        assert 0 < left < whole
+        (row,) = store.sql("select count(x) as n from arm").to_arrow().to_pylist()
+        assert row["n"] == store.topic("/arm").count() < whole + 20
+        question = store.topic("/scan")
+        assert question.count() == left + 20
+        assert question.completeness().has_losses
+        found = store.verify()
+        assert [(one.recording, one.place) for one in found.findings] == [("run", "segment 1")]
+        assert "hybridlog copy" in found.findings[0].cure
+        assert found.recordings == 2
+    with hl.open(tmp_path / "back", mongo="none", create=True) as store:
+        report = store.import_from(address)
+        assert (report.copied, [*report.refused]) == (["short-0"], ["run"])
+        assert f"--store {address} run" in report.refused["run"]
+    with hl.open(here, mongo="none") as source:
+        assert source.copy(address, ["run", "short-0"]).copied == ["run"]
+        assert source.copy(address, ["run", "short-0"]).known == ["run", "short-0"]
+    files.mounted.clear()
+    with hl.open(address) as store:
+        assert store.topic("/scan").count() == whole + 20
+        assert not store.verify().findings
+
+
+def test_lost_fields_and_journals(here: Path, address: str, proxy: Proxy) -> None:
+    publish_all(here, address, ("run", "short-0"))
+    table = lose(address, ".parquet")
+    files.mounted.clear()
+    with hl.open(address) as store:
+        assert store.topic("/arm").where("n < 10").count() == 20
+        assert not store.verify().findings
+    lose(address, "/journal", table.split("/")[-1][:32])
+    files.mounted.clear()
+    with hl.open(address) as store:
+        (finding,) = store.verify().findings
+        assert finding.place == "journal"
+        label = finding.recording
+        assert store.topic("/arm").where("n < 10").count() == 20
+    with hl.open(here, mongo="none") as source:
+        proxy.requests.clear()
+        assert source.copy(address, ["run", "short-0"]).copied == [label]
+        assert not [one for one in proxy.requests if one[0] == "PUT" and ".mcap" in one[1]]
+    files.mounted.clear()
+    with hl.open(address) as store:
+        assert not store.verify().findings
 
 
 def test_hostile_lists(published: str, proxy: Proxy) -> None:

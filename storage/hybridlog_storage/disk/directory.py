@@ -327,6 +327,9 @@ class StoreDirectory:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
 
+    def look_closely(self) -> None:
+        """Find out which files are there that a list only says to be there; here none is."""
+
     def listing(self, label: str) -> Listing:
         """Read the content of a recording's directory.
 

@@ -9,6 +9,7 @@ the address, the name and the version of its object.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import struct
@@ -21,7 +22,7 @@ from weakref import WeakValueDictionary
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.user_directories import user_directory
-from hybridlog_storage.errors import BucketError, ResourceError
+from hybridlog_storage.errors import ObjectChangedError, ResourceError
 from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.remote.bucket import Bucket, Object, joined_ranges
 
@@ -102,7 +103,8 @@ class Blocks:
             ranges: Begin and end of each.
 
         Raises:
-            BucketError: The server does not answer, or has another version of the object.
+            OSError: The object is missing, or has another version, as a disk says of a bad sector.
+            BucketError: The server does not answer.
             ResourceError: The cache cannot be written.
         """
         size = self.about.size
@@ -119,25 +121,28 @@ class Blocks:
                 self._inode, self._proved = inode, set()
             wanted -= self._proved
             if wanted:
-                with self._cache.writing():
-                    self._fetch(fd, sorted(wanted))
+                self._fetch(fd, sorted(wanted))
 
     def _fetch(self, fd: int, wanted: list[int]) -> None:
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        sums = os.open(self._path.with_suffix(_SUMS), flags, 0o600)
+        with self._cache.writing():
+            sums = os.open(self._path.with_suffix(_SUMS), flags, 0o600)
         try:
-            missing = [number for number in wanted if not self._is_there(fd, sums, number)]
+            with self._cache.writing():
+                missing = [number for number in wanted if not self._is_there(fd, sums, number)]
             missing += self._ahead_of(missing)
             for piece in _pieces(joined_ranges([self._range(number) for number in missing])):
                 try:
                     found = self._bucket.read(self.about.name, piece, self.about.version)
-                except FileNotFoundError as error:
-                    raise BucketError(
-                        f"{self._bucket.address}/{self.about.name} was deleted meanwhile. Ask "
-                        "again."
+                except (FileNotFoundError, ObjectChangedError) as error:
+                    self._bucket.lost.add(self.about)
+                    place = f"{self._bucket.address}/{self.about.name}"
+                    raise OSError(
+                        errno.EIO, "its object in the bucket is missing or was changed", place
                     ) from error
-                for (begin, _), data in zip(piece, found, strict=True):
-                    self._keep(fd, sums, begin, data)
+                with self._cache.writing():
+                    for (begin, _), data in zip(piece, found, strict=True):
+                        self._keep(fd, sums, begin, data)
                 self._cache.added(sum(map(len, found)))
             self._proved.update(wanted)
         finally:

@@ -90,6 +90,9 @@ class Bucket:
     Args:
         address: Such as `s3://lab/store`.
 
+    Attributes:
+        lost: Objects that are missing here, or have another version by now.
+
     Raises:
         UsageError: It is not the address of a bucket.
         MissingDependencyError: obstore is not installed.
@@ -99,6 +102,7 @@ class Bucket:
         if not is_bucket(address) or not address.partition("://")[2].strip("/"):
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
         self.address = address.rstrip("/")
+        self.lost: set[Object] = set()
         self._has_conditions = False
         self._reading = _opened(self.address, _READ_S)
 

@@ -25,7 +25,7 @@ from hybridlog_storage import journal
 from hybridlog_storage.catalog_parts import MemoryFolder, Version
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.disk.directory import Listing, StoreDirectory
 from hybridlog_storage.errors import (
     BucketError,
     ObjectExistsError,
@@ -53,6 +53,7 @@ LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for a newer list, unless this process changes something."""
 _READ_NS: Final = 3600 * 10**9  # for so long a reader may need what a newer list has not
 _DAY_NS: Final = 86_400 * 10**9
+_ALONE: Final = 4  # recordings that are compared with the bucket one by one; then all at once
 _MAX_SETTINGS: Final = 1 << 20
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
@@ -81,7 +82,8 @@ class BucketFiles:
         self._cache = cache
         self._settings: bytes | None = None
         self._looked_at = 0.0
-        self._tables: tuple[Mapping[str, Object], _Node] = {}, {}  # of a list, and as folders
+        self._tables: tuple[Any, _Node] = None, {}  # of what list, and as folders
+        self._compared: set[str] = set()
         self.lock = taken_by_forks(threading.RLock())
         self.is_changing = False
 
@@ -109,6 +111,8 @@ class BucketFiles:
                 self.list = self.list if self.list.store == store else StoreList(store)
             else:
                 self.list = self.read_list(store, found)
+                self._compared.clear()
+                self.bucket.lost.clear()
             self._looked_at = time.monotonic()
 
     def read_list(self, store: str, about: Object) -> StoreList:
@@ -146,6 +150,36 @@ class BucketFiles:
                 raise
             self.list = after
             self._looked_at = time.monotonic()
+
+    def compare(self, recording: str = "") -> None:
+        """Leave out files whose objects are missing, or are not those that the list names.
+
+        Args:
+            recording: Id of the recording whose files are compared, once for each list; without
+                one all are, and those of fields.
+        """
+        with self.lock:
+            if recording in self._compared or (recording and "" in self._compared):
+                return
+            listed = self.list
+            everything = [one for r in listed.recordings.values() for one in r.files.values()]
+            place = f"{RECORDINGS}/{recording}" if recording else ""
+            if len(self._compared) >= _ALONE:  # 1,000 objects are listed at once
+                recording, place = "", RECORDINGS
+            elif not recording:
+                everything += listed.tables.values()
+            there = {one.name: (one.size, one.version) for one in self.bucket.objects(place)}
+            self.bucket.lost.update(
+                one
+                for one in everything
+                if one.name.startswith(place) and there.get(one.name) != (one.size, one.version)
+            )
+            self._compared.add(recording)
+
+    def files_of(self, label: str) -> dict[str, Object]:
+        """The object of each file of a recording, without those that are lost."""
+        lost = self.bucket.lost
+        return {p: o for p, o in self.list.recordings[label].files.items() if o not in lost}
 
     # Files.
 
@@ -210,7 +244,7 @@ class BucketFiles:
         if top == RECORDINGS and len(inner) == 1:
             recordings = {label: {} for label in listed.recordings}
         elif top == RECORDINGS and inner[1] in listed.recordings:
-            recordings = {inner[1]: _folder(listed.recordings[inner[1]].files)}
+            recordings = {inner[1]: _folder(self.files_of(inner[1]))}
         return {
             RECORDINGS: recordings,
             TABLES: self._tables_of(listed) if top == TABLES else {},
@@ -219,9 +253,10 @@ class BucketFiles:
 
     def _tables_of(self, listed: StoreList) -> _Node:
         known, folders = self._tables
-        if known is not listed.tables:
-            folders = _folder(listed.tables)
-            self._tables = listed.tables, folders
+        lost = self.bucket.lost
+        if known != (now := (id(listed.tables), len(lost))):
+            folders = _folder({path: o for path, o in listed.tables.items() if o not in lost})
+            self._tables = now, folders
         return folders
 
     def read_settings(self) -> bytes:
@@ -391,11 +426,19 @@ class RemoteDirectory(StoreDirectory):
     def looks(self, names: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by label: it changes whenever any file does."""
         listed = self._now.recordings
-        return {name: _look(listed[name]) for name in names if name in listed}
+        return {name: _look(self.files_of(name)) for name in names if name in listed}
 
     def _look_of(self, label: str) -> str:
-        found = self._now.recordings.get(label)
-        return "" if found is None else _look(found)
+        return self.looks([label]).get(label, "")
+
+    def look_closely(self) -> None:
+        """Compare all files with their objects."""
+        self.source.compare()
+
+    def listing(self, label: str) -> Listing:
+        """As of a directory; files count whose objects are there."""
+        self.source.compare(self.id_of(label))
+        return super().listing(label)
 
     def id_of(self, label: str) -> str:
         """The id of a recording; empty if there is none of this label."""
@@ -475,8 +518,12 @@ class RemoteDirectory(StoreDirectory):
         return next((name for name, one in self._now.recordings.items() if one.id == recording), "")
 
     def files_of(self, label: str) -> Mapping[str, Object]:
-        """The object of each file of a recording."""
-        return self._now.recordings[label].files
+        """The object of each file of a recording, without those that are lost."""
+        return self.source.files_of(label)
+
+    def is_damaged(self, label: str) -> bool:
+        """True if objects of a recording were lost, as far as it was compared with them."""
+        return len(self.files_of(label)) < len(self._now.recordings[label].files)
 
     def add_file(self, recording: str, path: str, content: bytes | BinaryIO) -> Object:
         """Create the object of a file, under another name if what a crash left has its own.
@@ -502,8 +549,9 @@ class RemoteDirectory(StoreDirectory):
         self, label: str, recording: ListedRecording, tables: Mapping[str, Object]
     ) -> None:
         """List a recording whose objects are there, within `changing`."""
+        self.source.bucket.lost.difference_update(recording.files.values(), tables.values())
         self._relist(label, recording)
-        self.source.list = replace(self._now, tables={**self._now.tables, **tables})
+        self._replace_tables(recording.id, tables)
 
     def move(self, old: str, new: str) -> None:
         """Give a recording another label, within `writing`."""
@@ -515,9 +563,8 @@ class RemoteDirectory(StoreDirectory):
         """List a recording no more, within `writing`; its objects stay."""
         others = dict(self._now.recordings)
         gone = others.pop(label)
-        mine = re.compile(rf"[^/]+/{gone.id}-\d+\.parquet")
-        tables = {path: o for path, o in self._now.tables.items() if not mine.fullmatch(path)}
-        self.source.list = replace(self._now, recordings=others, tables=tables)
+        self.source.list = replace(self._now, recordings=others)
+        self._replace_tables(gone.id, {})
 
     def unneeded(self, now: int | None = None) -> list[Object]:
         """Objects that may be deleted: what neither a list of the last hour nor a copy needs.
@@ -560,6 +607,11 @@ class RemoteDirectory(StoreDirectory):
     def _listed(self) -> str:
         return list_name(self._now.number)
 
+    def _replace_tables(self, recording: str, tables: Mapping[str, Object]) -> None:
+        mine = re.compile(rf"[^/]+/{recording}-\d+\.parquet")
+        others = {path: o for path, o in self._now.tables.items() if not mine.fullmatch(path)}
+        self.source.list = replace(self._now, tables={**others, **tables})
+
     def _relist(self, label: str, recording: ListedRecording) -> None:
         self.source.list = replace(self._now, recordings={**self._now.recordings, label: recording})
 
@@ -585,9 +637,9 @@ def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
     return found
 
 
-def _look(listed: ListedRecording) -> str:
+def _look(objects: Mapping[str, Object]) -> str:
     digest = hashlib.sha256()
-    for path, one in sorted(listed.files.items()):
+    for path, one in sorted(objects.items()):
         digest.update(f"{path}\n{one.name}\n{one.size}\n{one.version}\n".encode())
     return f"{digest.hexdigest()[:32]} 0 0"
 

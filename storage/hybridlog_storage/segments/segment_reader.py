@@ -606,7 +606,10 @@ class SegmentReader:
 
     def fetch(self, places: Iterable[ChunkPlace]) -> None:
         """Announce chunks that will be read, so that a bucket is asked once for all of them."""
-        files.fetch(self._fd, ((at.offset, at.offset + at.length + at.trailer) for at in places))
+        with suppress(OSError):  # what is missing is told when it is read
+            files.fetch(
+                self._fd, ((at.offset, at.offset + at.length + at.trailer) for at in places)
+            )
 
     def read(self, offset: int, length: int) -> memoryview:
         """Unchecked bytes of the file.
