@@ -9,6 +9,7 @@ from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog.cli import output
+from hybridlog.cli.signals import restore_echo, stop_echo
 from hybridlog.record.losses import Cause
 from hybridlog.wording import listed
 
@@ -48,6 +49,7 @@ class LiveTable:
 
     def __enter__(self) -> Self:
         """Begin to draw."""
+        stop_echo(self._live.console.file.fileno())
         self._live.start()
         return self
 
@@ -59,6 +61,7 @@ class LiveTable:
     ) -> None:
         """Remove the table."""
         self._live.stop()
+        restore_echo()
 
     def note(self, text: str) -> None:
         """Print a line above the table."""

@@ -20,7 +20,7 @@ from hybridlog.cli.live_table import LiveTable, in_short, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.record_choices import opened_to_record
 from hybridlog.cli.service import notify_service
-from hybridlog.cli.signals import SIGNALS, write_note
+from hybridlog.cli.signals import SIGNALS, restore_echo, write_note
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import Flag
 
@@ -143,6 +143,7 @@ def _stop_flag() -> Iterator[Flag]:
                 write_note(
                     "\nhybridlog: stopped. Flushed chunks stay; the next command seals them."
                 )
+                restore_echo()
                 os._exit(128 + number)
             stopped.set()
 

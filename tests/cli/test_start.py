@@ -111,6 +111,8 @@ def test_what_is_installed(tmp_path: Path) -> None:
     assert "pip install" not in shown
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {*NEEDED_FOR} == {*project["optional-dependencies"]} - {"all", "bench", "dev"}
+    (listed,) = re.findall(r"Extras: (.+), or `all`", (ROOT / "README.md").read_text())
+    assert {*re.findall(r"`(\w+)`", listed)} == {*NEEDED_FOR}
     (tmp_path / "sitecustomize.py").write_text(
         "import importlib.metadata as m\nfound = m.version\n"
         "def version(name):\n    if name == 'duckdb': raise m.PackageNotFoundError(name)\n"
