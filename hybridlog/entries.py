@@ -20,6 +20,7 @@ import numpy as np
 
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
+from hybridlog.schema.states import expired_messages
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
     ChannelStats,
@@ -344,6 +345,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         segments=entry.segments,
         has_losses=bool(losses),
         has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in losses),
+        expired=expired_messages(entry),
         look=look,
     )
 

@@ -210,6 +210,13 @@ def test_a_plan_promises_what_goes(store: Path) -> None:
     assert 0.85 < done["freed_bytes"] / step["bytes"] <= 1
     segments = sorted(journal.read(store / "recordings" / "run").sealed)  # type: ignore[union-attr]
     assert step["segments"] == segments[:-1]
+    gone = sum(raw is None for raw in payloads(store).values())
+    assert f"{gone} payloads deleted to make room" in answer("ls", store=store).out
+    assert answer("ls", "--json", store=store).json[0]["expired"] == gone
+    with hl.open(store, mongo="none") as opened:
+        told = str(opened.topic("camera").completeness())
+    words = f"{gone} messages have no payload, which was deleted to make room"
+    assert told == f"no message is lost; {words}"
 
 
 def test_an_import_says_where_payloads_are(store: Path, recorded: Path, tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def summary(number: int, span: tuple[int, int] | None, topics: list[str], **othe
         "segments": 1,
         "has_losses": False,
         "has_lost_segments": False,
+        "expired": 0,
         "look": "",
         **other,
     }

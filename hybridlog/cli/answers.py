@@ -574,6 +574,7 @@ def _write_pictures(
         DefinitionError: the same.
     """
     from hybridlog.arrays.message_arrays import IMAGES
+    from hybridlog.formats.raw import DirectoryWriter
     from hybridlog.query.answers.video import frames_in_front
     from hybridlog.schema.states import without_payload
 
@@ -605,7 +606,7 @@ def _write_pictures(
             progress()
         if refused is not None and not written:
             raise refused
-        if missing and not written and OUTPUTS[form].content == "video":
+        if missing and not written and not isinstance(images, DirectoryWriter):
             raise PayloadError(f"{missing}: there is no picture")
     query.counters.frames += len(before)
     if refused is not None:

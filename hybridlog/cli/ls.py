@@ -52,6 +52,8 @@ def _print(recordings: Sequence[RecordingSummary]) -> None:
 def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     span = entry.span
     notes = [] if entry.status == "complete" else [status_text(entry)]
+    if entry.expired:
+        notes.append(f"{output.counted(entry.expired, 'payload')} deleted to make room")
     if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
@@ -96,6 +98,7 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
         "last_ns": span[1] if span else None,
         "topics": recording.topic_count,
         "messages": recording.messages,
+        "expired": recording.expired,
         "stored_bytes": recording.stored_bytes,
         "segments": recording.segments,
         "source": recording.source,

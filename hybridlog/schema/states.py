@@ -14,7 +14,7 @@ from hybridlog.wording import counted, unfit
 from hybridlog_storage.messages import EXPIRED, EXPIRED_IDS, ORIGINAL_ENCODING, REDUCED
 
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import ChannelEntry
+    from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
 
 class State(StrEnum):
@@ -64,6 +64,12 @@ def told_channels(channels: Iterable[ChannelEntry]) -> list[ChannelEntry]:
         for number, channel in known.items()
         if channel.stats.messages or number + EXPIRED_IDS not in known
     ]
+
+
+def expired_messages(entry: RecordingEntry) -> int:
+    """Number of messages of a recording whose payloads were deleted."""
+    gone = (c for c in entry.channels if state_of(c.message_encoding) is State.EXPIRED)
+    return sum(channel.stats.messages for channel in gone)
 
 
 def without_payload(messages: int, state: State = State.REDUCED) -> str:

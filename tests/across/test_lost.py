@@ -92,7 +92,10 @@ def test_numbers_that_nobody_knows() -> None:
     assert str(Completeness(1, is_exact=True)) == "1 message is lost"
     assert str(Completeness(1, is_exact=False)) == "at least 1 messages are lost"
     assert str(unknown) == "an unknown number of messages are lost"
-    assert str(Completeness(0, is_exact=True, reduced=5)) == "no message is lost"
+    assert str(Completeness(4, is_exact=True, reduced=6, expired=1)) == (
+        "4 messages are lost; 5 messages have no payload, which was dropped under pressure; "
+        "1 message has no payload, which was deleted to make room"
+    )
 
 
 def seconds(found: Intervals) -> list[tuple[float, float, int]]:

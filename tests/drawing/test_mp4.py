@@ -23,6 +23,7 @@ from hybridlog.formats.writing import Sink
 from hybridlog.maintenance.expiry import expire
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
+from tests.cli.running import run
 from tests.cli.within import answer
 from tests.odd_messages import ros_channel
 from tests.ros_values import ROS1
@@ -263,6 +264,9 @@ def test_frames_whose_payloads_have_expired(tmp_path: Path) -> None:
     ):
         to_mp4(store.topic("/cam"), tmp_path / "out.mp4")
     assert not (tmp_path / "out.mp4").exists()
+    one = ("fetch", "cam", "--at", "+0s", "-o", tmp_path / "a.png")
+    told = run(*one, store=tmp_path / "store", code=PayloadError.exit_code).err
+    assert "1 message has no payload, which was deleted to make room" in told
     assert "known video" not in answer("info", "cam", store=tmp_path / "store").out
 
 

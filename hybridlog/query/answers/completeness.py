@@ -36,6 +36,7 @@ class Completeness:
             the range, all of it.
         is_exact: False if an unknown number is lost besides.
         reduced: Messages of which only the fields are stored.
+        expired: Those of them whose payloads were deleted to make room.
         rows: Rows of the loss ledger, with the label of their `recording`.
         unwritten: Messages that a running recorder has taken and not written yet, which are not
             lost; None for an unknown number.
@@ -50,6 +51,7 @@ class Completeness:
     messages: int
     is_exact: bool
     reduced: int = 0
+    expired: int = 0
     rows: tuple[Mapping[str, Any], ...] = ()
     unwritten: int | None = 0
     unindexed: int = 0
@@ -64,7 +66,15 @@ class Completeness:
         return bool(self.messages) or not self.is_exact
 
     def __str__(self) -> str:
-        """The losses in words: `4 messages are lost`."""
+        """What is missing in words: `4 messages are lost`, and payloads by cause."""
+        from hybridlog.schema.states import State, without_payload
+
+        gone = {State.REDUCED: self.reduced - self.expired, State.EXPIRED: self.expired}
+        return "; ".join(
+            [self._losses(), *(without_payload(count, why) for why, count in gone.items() if count)]
+        )
+
+    def _losses(self) -> str:
         if not self.has_losses:
             return "no message is lost"
         if not self.messages:
@@ -105,8 +115,8 @@ class Completeness:
         """
         if self.has_losses:
             raise IncompleteError(
-                f"{self} in this range; `hybridlog info --losses` says where. Without --strict the "
-                "rest is given."
+                f"{self._losses()} in this range; `hybridlog info --losses` says where. Without "
+                "--strict the rest is given."
             )
         if self.late:
             raise IncompleteError(" ".join(self.late))
@@ -227,14 +237,13 @@ def line_of(loss: Mapping[str, Any]) -> str:
 
 def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
     """The completeness of a recording in words: `complete`, or the number of missing messages."""
-    from hybridlog.schema.states import State, state_of, without_payload
+    from hybridlog.schema.states import State, expired_messages, without_payload
 
     found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
     for cause, what in NOT_LOST.items():
         messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
         found += f"; {counted(messages, 'message')} {what}" if messages else ""
-    gone = (c for c in entry.channels if state_of(c.message_encoding) is State.EXPIRED)
-    messages = sum(channel.stats.messages for channel in gone)
+    messages = expired_messages(entry)
     return found + (f"; {without_payload(messages, State.EXPIRED)}" if messages else "")
 
 

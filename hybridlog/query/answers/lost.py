@@ -79,12 +79,14 @@ def completeness_of(
     sentences += late
     for label, rows in by_recording.items():
         sentences += about_losses(label, rows)
+    expired = _expired(session, question)
     return Completeness(
         sum(row["count"] or 0 for row in lost),
         is_exact=not any(row["count"] is None for row in lost)
         and all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows),
         reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
-        + _expired(session, question),
+        + expired,
+        expired=expired,
         rows=tuple(lost),
         unwritten=unwritten,
         unindexed=unindexed,
