@@ -35,7 +35,7 @@ class Recordings(Sequence["RecordingEntry"]):
     ) -> None:
         self.summaries = tuple(summaries)
         self._session = session
-        self._problem = problem or "The store is empty: `hybridlog record FILE` fills it."
+        self._problem = problem or session.directory.when_empty
 
     def __len__(self) -> int:
         return len(self.summaries)

@@ -145,8 +145,13 @@ def open_store(
         directory = directory_of(where, read_only=read_only)
         if create or shared:
             directory.check_writable()
-        if require_database or mongo not in {None, NONE}:
+        if mongo not in {None, NONE}:
             raise UsageError("A store in a bucket is asked without MongoDB: leave out --mongo.")
+        if require_database:
+            raise StoreError(
+                f"{directory.place} is a store in a bucket, which has no index in MongoDB. Do this "
+                "in a store on a disk."
+            )
         return Store(directory, mongo=NONE, recover=False)
     if cache_mb is not None:
         checked_cache_mb(cache_mb, "The size of the cache")

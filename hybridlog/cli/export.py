@@ -81,7 +81,7 @@ def export_command(given: _Given, **training: Any) -> None:
     with given.opened() as store:
         query = given.query(store)
         if not query.topics:
-            raise UsageError("The store is empty: `hybridlog record FILE` fills it.")
+            raise UsageError(store.directory.when_empty)
         if given.tags is not None:
             query = query.tags(*parse_fields(given.tags, "--tags"))
         if form == LEROBOT:

@@ -199,7 +199,7 @@ def show_sizes(sizes: Sizes, by: str, *, as_json: bool) -> None:
     elif rows:
         _print_sizes(rows, sizes.total, recordings=by != "topic", topics=by != "recording")
     else:
-        output.note("The store is empty: `hybridlog record FILE` fills it.")
+        output.note("The store is empty.")
 
 
 _NO_TOPIC = "(no topic)"

@@ -31,7 +31,7 @@ def ls_command(given: _Given) -> None:
     elif recordings:
         _print(recordings)
     else:
-        output.note("The store is empty: `hybridlog record FILE` fills it.")
+        output.note(store.directory.when_empty)
 
 
 def _print(recordings: Sequence[RecordingSummary]) -> None:

@@ -68,7 +68,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
     choosing = _Choosing(session)
     try:
         if not len(choosing.places) and not choice.is_everything:
-            raise _NothingLeftError("The store is empty: `hybridlog record FILE` fills it.")
+            raise _NothingLeftError(session.directory.when_empty)
         if choice.name:
             choosing.by_name(choice.name)
         choosing.look()

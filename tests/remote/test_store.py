@@ -22,6 +22,7 @@ from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     BucketError,
+    HybridlogError,
     ObjectExistsError,
     ResourceError,
     StoreError,
@@ -364,6 +365,33 @@ def test_lost_fields_and_journals(here: Path, address: str, proxy: Proxy) -> Non
     files.mounted.clear()
     with hl.open(address) as store:
         assert not store.verify().findings
+
+
+def test_what_cannot_be_reached_is_told_in_words(
+    here: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(ask: Callable[[], Any]) -> str:
+        files.mounted.clear()
+        with pytest.raises(HybridlogError) as caught:
+            ask()
+        assert caught.value.exit_code == 5
+        return str(caught.value)
+
+    none = "s3://no-bucket/store"
+    with hl.open(here, mongo="none") as store:
+        assert "There is no bucket 'no-bucket'" in told(lambda: store.copy(none, ["short-0"]))
+    assert "There is no bucket 'no-bucket'" in told(lambda: hl.open(none))
+    publish_all(here, address, ("short-0",))
+    assert "a store in a bucket" in told(lambda: hl.open(address, require_database=True))
+    with hl.open(address) as store:
+        store.remove("short-0")
+    assert f"`hybridlog copy {address}` fills it" in answer("ls", store=Path(address)).err
+    roles = "Error performing PUT http://169.254.169.254/latest/api/token"
+    assert "Set AWS_ACCESS_KEY_ID" in Bucket(address)._problem("lists", roles)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    assert "http://127.0.0.1:9 does not answer" in told(lambda: hl.open(address))
+    monkeypatch.delenv("AWS_ALLOW_HTTP")
+    assert "Set AWS_ALLOW_HTTP=true" in told(lambda: hl.open(address))
 
 
 def test_hostile_lists(published: str, proxy: Proxy) -> None:

@@ -296,6 +296,11 @@ class StoreDirectory:
         """Where the store is, for people."""
         return str(self.path)
 
+    @property
+    def when_empty(self) -> str:
+        """What to say if it has no recordings."""
+        return "The store is empty: `hybridlog record FILE` fills it."
+
     def catalog_folder(self) -> MemoryFolder | None:
         """The files of the catalog; None for those in its folder here."""
         return None

@@ -54,6 +54,9 @@ _READ_S: Final = 60
 _WRITE_S: Final = 900
 _RETRY_S: Final = 60
 _CUT = re.compile(r"(?i)body|reset|closed|incomplete|timed? ?out|eof|sending request")
+_NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
+_ROLES = re.compile(r"169\.254\.|metadata\.google")  # asked if the environment has no key
+_HOST = re.compile(r"https?://[^/\s]+")
 _SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
 
 
@@ -382,6 +385,11 @@ class Bucket:
         try:
             yield
         except FileNotFoundError as error:
+            if _NO_BUCKET.search(str(error)):
+                bucket = self.address.split("/")[2]
+                raise BucketError(
+                    f"There is no bucket {bucket!r}: make it, or correct {self.address}."
+                ) from error
             raise FileNotFoundError(
                 errno.ENOENT, "there is no such object", self._place(name)
             ) from error
@@ -395,7 +403,24 @@ class Bucket:
         except (exceptions.AlreadyExistsError, exceptions.NotSupportedError):
             raise
         except (exceptions.BaseError, ValueError) as error:
-            raise BucketError(f"{self._place(name)}: {_reason(error)}") from error
+            raise BucketError(self._problem(name, _reason(error))) from error
+
+    def _problem(self, name: str, reason: str) -> str:
+        """An error of the library in words, with what cures it."""
+        host = _HOST.search(reason)
+        if _ROLES.search(reason):
+            return (
+                f"{self.address}: there are no credentials. Set AWS_ACCESS_KEY_ID and "
+                "AWS_SECRET_ACCESS_KEY, or what your provider has in their place."
+            )
+        if "builder error" in reason and not _allows_http():
+            return f"{self.address}: its server has no TLS. Set AWS_ALLOW_HTTP=true to allow that."
+        if host is not None and "error sending request" in reason:
+            return (
+                f"{self.address}: the server {host[0]} does not answer. Is it running, and is "
+                "AWS_ENDPOINT_URL its address?"
+            )
+        return f"{self._place(name)}: {reason}"
 
 
 def joined_ranges(

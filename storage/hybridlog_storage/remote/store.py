@@ -387,6 +387,11 @@ class RemoteDirectory(StoreDirectory):
         return self.source.bucket.address
 
     @property
+    def when_empty(self) -> str:
+        """What to say if it has no recordings."""
+        return f"The store is empty: `hybridlog copy {self.place}` fills it from one on a disk."
+
+    @property
     def is_writable(self) -> bool:
         """False: nothing is mended, or noted for others, without being asked to."""
         return False
