@@ -160,8 +160,10 @@ def _show(store: Store, given: _Given) -> None:
 
 def _extras(
     store: Store, entry: RecordingEntry
-) -> tuple[list[StoredAttachment], list[StoredMetadata]]:
-    """Attachments and metadata records of a recording; none of those that cannot be read."""
+) -> tuple[list[StoredAttachment], list[StoredMetadata], str]:
+    """Attachments and metadata records of a recording that can be read, and its completeness."""
+    from hybridlog.query.answers.lost import why_expired
+
     attachments: list[StoredAttachment] = []
     metadata: list[StoredMetadata] = []
     try:
@@ -169,7 +171,8 @@ def _extras(
         metadata = store.metadata(entry)
     except SegmentError as error:
         output.note(f"{entry.label}: {error}")
-    return attachments, metadata
+    expired = why_expired(store.directory, [entry.label])
+    return attachments, metadata, coverage(entry, losses_of(entry), expired)
 
 
 def _is_segment(what: str) -> bool:
@@ -200,6 +203,7 @@ def _as_dict(
     entry: RecordingEntry,
     attachments: list[StoredAttachment],
     metadata: list[StoredMetadata],
+    complete: str,
     videos: Mapping[str, VideoSummary],
 ) -> dict[str, Any]:
     from hybridlog.entries import summary_of
@@ -208,7 +212,7 @@ def _as_dict(
     return {
         **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
-        "coverage": coverage(entry, losses_of(entry)),
+        "coverage": complete,
         "losses": losses_of(entry),
         "notes": entry.notes,
         "marks": entry.marks,
@@ -262,6 +266,7 @@ def _print_recording(
     index: str | None,
     attachments: list[StoredAttachment],
     metadata: list[StoredMetadata],
+    complete: str,
     *,
     videos: Mapping[str, VideoSummary],
     drawn: Density | None,
@@ -290,7 +295,7 @@ def _print_recording(
         ("duration", format_duration(span[1] - span[0]) if span else "-"),
         ("messages", str(entry.messages)),
         ("stored", held),
-        *_coverage(entry, coverage(entry, losses)),
+        *_coverage(entry, complete),
         *(("", line_of(loss)) for loss in losses),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),

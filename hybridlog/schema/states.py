@@ -38,6 +38,8 @@ CAUSES: Final = {
     State.EXPIRED: "deleted to make room",
 }
 """Reasons why messages have no payload."""
+NOT_COPIED: Final = "not copied yet (`hybridlog copy` without --only-fields brings it)"
+"""Reason why messages of a copy have expired that were sent without their payloads."""
 _STATES: Final = {REDUCED: State.REDUCED, EXPIRED: State.EXPIRED}
 
 
@@ -72,16 +74,22 @@ def expired_messages(entry: RecordingEntry) -> int:
     return sum(channel.stats.messages for channel in gone)
 
 
-def without_payload(messages: int, state: State = State.REDUCED) -> str:
-    """A number of messages without payload: `1 message has no payload, which was dropped ...`."""
+def without_payload(messages: int, state: State = State.REDUCED, cause: str = "") -> str:
+    """A number of messages without payload: `1 message has no payload, which was dropped ...`.
+
+    Args:
+        messages: The number.
+        state: Their state.
+        cause: The reason; without, that of the state.
+    """
     has = "has" if messages == 1 else "have"
-    return f"{counted(messages, 'message')} {has} no payload, which was {CAUSES[state]}"
+    return f"{counted(messages, 'message')} {has} no payload, which was {cause or CAUSES[state]}"
 
 
-def without_fields(messages: int, state: State) -> str:
-    """A number of rows of a table without fields, in words."""
+def without_fields(messages: int, state: State, cause: str = "") -> str:
+    """A number of rows of a table without fields, in words; `cause` as of `without_payload`."""
     if state is State.UNREADABLE:
         return f"{unfit(messages)}; the fields are null, and error says why"
     have, its = ("has", "its payload was") if messages == 1 else ("have", "their payloads were")
     what = "fields" if state is State.REDUCED else "long arrays"
-    return f"{counted(messages, 'message')} {have} no {what}: {its} {CAUSES[state]}"
+    return f"{counted(messages, 'message')} {have} no {what}: {its} {cause or CAUSES[state]}"

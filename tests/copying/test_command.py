@@ -83,6 +83,17 @@ def test_copies_to_a_directory(
     assert run("copy", "nosuch", tmp_path / "x", "--store", robots, code=2).err
 
 
+def test_payloads_that_were_not_copied_yet_were_not_deleted(robots: Path, tmp_path: Path) -> None:
+    lab = tmp_path / "lab"
+    run("copy", "-r", "noted", "-r", "expired", lab, "--store", robots, "--only-fields")
+    for label, why in {"noted": "not copied yet (`hybridlog copy", "expired": "deleted"}.items():
+        told = f"no payload, which was {why}"
+        fetched = run("fetch", "cloud", "-r", label, "-o", tmp_path / f"{label}.mcap", store=lab)
+        assert told in fetched.err
+        assert told in " ".join(run("info", label, store=lab).out.split())
+        assert told in run("info", label, "--json", store=lab).json["coverage"]
+
+
 def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:
     url = "ssh://me@lab:22/~/lab%20store"
     words = ("copy", "dropped", url, "--store", robots, "--ssh", f"{ssh} -x y")

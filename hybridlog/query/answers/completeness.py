@@ -149,8 +149,14 @@ def not_indexed(messages: int) -> str:
     return f"{counted(messages, 'message')} {are} not indexed yet, nor in this answer of MongoDB."
 
 
-def left_out(question: Question, counters: Counters) -> Iterator[str]:
-    """Messages that an answer could not read or has no payload of."""
+def left_out(question: Question, counters: Counters, expired: str) -> Iterator[str]:
+    """Messages that an answer could not read or has no payload of.
+
+    Args:
+        question: The question.
+        counters: Of the answer.
+        expired: Why payloads have expired.
+    """
     from hybridlog.schema.states import State, without_fields, without_payload
 
     if counters.unreadable > counters.without_arrays:
@@ -158,8 +164,8 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     if counters.without_arrays:
         its = "its payload was" if counters.without_arrays == 1 else "their payloads were"
         yield (
-            f"{counted(counters.without_arrays, 'message')} could not be tested: {its} deleted to "
-            "make room; of long arrays only summaries are left."
+            f"{counted(counters.without_arrays, 'message')} could not be tested: {its} {expired}; "
+            "of long arrays only summaries are left."
         )
     gone = {
         State.REDUCED: counters.reduced - counters.expired,
@@ -168,11 +174,11 @@ def left_out(question: Question, counters: Counters) -> Iterator[str]:
     for state, number in gone.items():
         if number:
             yield (
-                f"{without_payload(number, state)}: not in this answer; --where and --fields "
-                "find the fields."
+                f"{without_payload(number, state, expired if state is State.EXPIRED else '')}: "
+                "not in this answer; --where and --fields find the fields."
             )
     if counters.lacking:
-        yield f"{without_fields(counters.lacking, State.EXPIRED)}; these are null."
+        yield f"{without_fields(counters.lacking, State.EXPIRED, expired)}; these are null."
     reasons: Counter[str] = Counter()
     for why, number in counters.no_transform:
         reasons[why] += number
@@ -235,8 +241,16 @@ def line_of(loss: Mapping[str, Any]) -> str:
     return f"{lost}{loss['cause']}{':' if said else ''}{said}"
 
 
-def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
-    """The completeness of a recording in words: `complete`, or the number of missing messages."""
+def coverage(
+    entry: RecordingEntry, losses: Collection[Mapping[str, Any]], expired: str = ""
+) -> str:
+    """The completeness of a recording in words: `complete`, or the number of missing messages.
+
+    Args:
+        entry: The recording.
+        losses: Rows of its ledger.
+        expired: Why payloads have expired, if that is known.
+    """
     from hybridlog.schema.states import State, expired_messages, without_payload
 
     found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
@@ -244,7 +258,7 @@ def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> st
         messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
         found += f"; {counted(messages, 'message')} {what}" if messages else ""
     messages = expired_messages(entry)
-    return found + (f"; {without_payload(messages, State.EXPIRED)}" if messages else "")
+    return found + (f"; {without_payload(messages, State.EXPIRED, expired)}" if messages else "")
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:

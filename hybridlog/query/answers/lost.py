@@ -23,7 +23,9 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
-from hybridlog_storage.errors import HybridlogError, TimeError
+from hybridlog.schema.states import CAUSES, NOT_COPIED, State
+from hybridlog_storage import journal
+from hybridlog_storage.errors import HybridlogError, StoreError, TimeError
 from hybridlog_storage.settings import EXPIRED
 from hybridlog_storage.times import BEGIN, END, span_of
 
@@ -33,8 +35,10 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
+_MOST_JOURNALS = 100  # that are read for a reason
 _INTERVAL_S = 1.0  # flush interval of recorders that do not say it
 _EVERYTHING = np.array([[BEGIN, END]], np.int64)
 
@@ -67,7 +71,8 @@ def completeness_of(
         lacks = _unindexed(session, one, cost)
         unindexed += lacks
         late += [not_indexed(lacks)] if lacks else []
-        sentences += () if cost is None else left_out(one, cost)
+        if cost is not None:
+            sentences += left_out(one, cost, _why_expired(session, one, cost))
     by_recording: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     known: set[tuple[Any, ...]] = set()
     for rows in ledgers:  # a loss of unknown topics is in several
@@ -95,6 +100,34 @@ def completeness_of(
         late=tuple(dict.fromkeys(late)),
         sentences=tuple(dict.fromkeys(sentences)),
     )
+
+
+def _why_expired(session: Session, question: Question, cost: Counters) -> str:
+    """Why payloads that an answer lacks have expired: a copy may be waiting for them."""
+    if not (cost.expired or cost.lacking or cost.without_arrays):
+        return CAUSES[State.EXPIRED]
+    summaries = session.snapshot().summaries
+    labels = [summaries[place].label for place in session.chosen(question).tolist()]
+    return why_expired(session.directory, labels)
+
+
+def why_expired(directory: StoreDirectory, labels: Sequence[str]) -> str:
+    """Why payloads of some recordings have expired."""
+    deleted = CAUSES[State.EXPIRED]
+    if directory.is_remote:
+        return deleted
+    either = f"{deleted}, or {NOT_COPIED}"
+    if len(labels) > _MOST_JOURNALS:
+        return either
+    waiting = set()
+    for label in labels:
+        with suppress(StoreError):
+            state = journal.read(directory.recording(label))
+            if state is not None and state.expired:
+                waiting.add(state.lacks_payloads)
+    if True not in waiting:
+        return deleted
+    return either if False in waiting else NOT_COPIED
 
 
 def _expired(session: Session, question: Question) -> int:
