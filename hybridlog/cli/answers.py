@@ -226,15 +226,6 @@ class Listing(Tabular, AsJson):
             raise UsageError("--json is a form of its own: leave out --format and --output.")
         return super().to
 
-    @property
-    def table(self) -> Destination:
-        """Format and place of an answer that is a table in any case.
-
-        Raises:
-            UsageError: As of `Tabular`.
-        """
-        return Tabular.to.fget(self)  # type: ignore[attr-defined,no-any-return]
-
     def answer(
         self,
         rows: Iterable[Mapping[str, Any]],
@@ -261,10 +252,8 @@ class Listing(Tabular, AsJson):
             output.print_json_list(map(without_nan, limited))
         elif titles or spare:
             shown = [cells(row) for row in limited]
-            if shown and titles:
-                output.print_rows(columns, shown, titles)
-            elif shown:
-                output.print_table(*output.fitted(columns, shown, spare))
+            if shown:
+                output.print_rows(*output.fitted(columns, shown, spare), titles)
         else:
             first = list(islice(limited, 1))
             if first:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import Listing, answer_tables, answering
+from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import Asking, parse_fields
 from hybridlog_storage.errors import UsageError
@@ -15,6 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
+_RATE_COLUMNS: Sequence[output.Column] = [
+    ("topic", "left"),
+    ("begin", "whole"),
+    ("end", "whole"),
+    ("recording", "left"),
+    ("messages", "right"),
+    ("Hz", "right"),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,18 +53,23 @@ def stats_command(given: _Given) -> None:
     with answering(given) as asked:
         if given.rate:
             asked.is_empty = False
-            completeness = asked.query.completeness if given.strict else None
             rates = asked.query.rate(given.window)
-            if not given.as_json:
-                answer_tables([rates], lambda: None, given.table, completeness)
-                return
-            if completeness is not None:
-                completeness().check()
+            if given.strict:
+                asked.query.completeness().check()
             times = [rates[name].cast("int64").to_pylist() for name in ("begin", "end")]
             rows = rates.drop_columns(["begin", "end"]).to_pylist()
-            output.print_json_list(
-                {"begin_ns": begin, "end_ns": end, **row}
-                for begin, end, row in zip(*times, rows, strict=True)
+            given.answer(
+                (
+                    {"begin_ns": begin, "end_ns": end, **row}
+                    for begin, end, row in zip(*times, rows, strict=True)
+                ),
+                _RATE_COLUMNS,
+                _cells_of_rate,
+                spare=[
+                    *(["recording"] if len({row["recording"] for row in rows}) == 1 else []),
+                    *(["end"] if given.window is not None else ["end", "begin"]),
+                ],
+                titles=2,
             )
             return
         found = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
@@ -72,7 +86,18 @@ def stats_command(given: _Given) -> None:
             own = [row["topic"]] if several else []
             return [*own, row["field"], *(_number(row[name]) for name in _NAMES)]
 
-        given.answer(map(asdict, found), columns, cells)
+        # How many are no numbers is left out only where there are none.
+        spare = [n for n in ("nan", "infinite") if not any(getattr(row, n) for row in found)]
+        titles = len(columns) - len(_NAMES)
+        given.answer(map(asdict, found), columns, cells, [*spare, "std"], titles)
+
+
+def _cells_of_rate(row: Mapping[str, Any]) -> list[str]:
+    from hybridlog.query.times import format_time
+
+    rate = "" if row["rate"] is None else f"{row['rate']:.2f}"
+    times = format_time(row["begin_ns"]), format_time(row["end_ns"])
+    return [row["topic"], times[0], times[1], row["recording"], str(row["messages"]), rate]
 
 
 def _number(value: float | None) -> str:

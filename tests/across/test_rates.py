@@ -331,7 +331,7 @@ def test_what_is_refused(logs: Logs) -> None:
 def test_the_commands(logs: Logs) -> None:
     store = logs.store.directory.path
     rates = run("stats", "--rate", "-t", "base", "--window", "500ms", "-F", "csv", store=store)
-    assert rates.lines[0] == '"begin","end","recording","topic","messages","rate"'
+    assert rates.lines[0] == '"begin_ns","end_ns","recording","topic","messages","rate"'
     assert "index document" not in rates.err
     assert run(
         "intervals", "--gaps", "-t", "right/pose", "-r", "b", "--count", "-q", store=store

@@ -64,10 +64,9 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
     assert pq.read_table(file).num_rows == len(rows)
     lines = answer(*words, "-F", "jsonl", "-n", "1", store=store, code=code).lines
     assert len(lines) == 1
-    if "--rate" not in words:  # its times have other names in JSON
-        assert _set(json.loads(lines[0])) == _set(rows[0])
-        assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
-        assert "--json is a form" in _error(*words, "--json", "-F", "csv", store=store)
+    assert _set(json.loads(lines[0])) == _set(rows[0])
+    assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
+    assert "--json is a form" in _error(*words, "--json", "-F", "csv", store=store)
 
 
 def _set(row: dict[str, object]) -> dict[str, object]:

@@ -144,6 +144,16 @@ def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
     assert {*labels} == {"robot", "odd", "torn"}
 
 
+def test_statistics_at_eighty_columns_break_no_name(store: Path) -> None:
+    for words in (("stats", "imu/data"), ("stats", "--rate")):
+        rows = run(*words, "-r", "robot", "--json", store=store).json
+        code, shown = on_terminal(*words, "-r", "robot", "--store", store, width=80)
+        assert code == 0
+        name = "topic" if "--rate" in words else "field"
+        lines = [line.split()[0] for line in plain(shown).splitlines()]
+        assert lines == [name, *(row[name] for row in rows)]
+
+
 def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None:
     code, shown = on_terminal("info", "robot", "--store", store, width=80)
     assert code == 0
