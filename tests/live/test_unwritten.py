@@ -83,13 +83,13 @@ def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
         for words in (
             ["fetch", "-t", "/a", "--count"],
             ["fetch", "-t", "/a", "--where", "data == '1'"],
-            ["rate", "-t", "/a"],
-            ["gaps", "-t", "/a"],
+            ["stats", "-t", "/a", "--rate"],
+            ["intervals", "-t", "/a", "--gaps"],
             ["intervals", "-t", "/a", "--where", "data == '1'"],
-            ["changes", "-t", "/a", "--fields", "data"],
+            ["intervals", "-t", "/a", "--changes", "data"],
             ["export", tmp_path / "a.mcap", "-t", "/a", "--force"],
             ["sql", "select count(*) from a"],
-            ["trigger", "--rehearse", "/a: data == '1'"],
+            ["intervals", "--rehearse", "/a: data == '1'"],
         ):
             done = run(*words, *mongo, store=path)
             assert told in done.err, (words, done.err)

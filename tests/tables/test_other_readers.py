@@ -393,7 +393,7 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
         return answer("tables", *arguments, store=many.directory.path).out
 
     for topic in ("/large", "/small", "/changed", "/two"):
-        items = json.loads(shown("-t", topic, "--json"))
+        items = json.loads(shown(topic, "--json"))
         assert len(items) == (2 if topic in {"/changed", "/two"} else 1)
         rows = 0
         for item in items:
@@ -401,15 +401,15 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
             assert len(found) == item["rows"]
             rows += len(found)
         assert rows == many.topic(topic).count()
-    lines = shown("-t", "small").splitlines()
+    lines = shown("small").splitlines()
     files = [line for line in lines if line.endswith(".parquet")]
     assert all(Path(file).is_file() for file in files)
     (statement,) = (line for line in lines if line.startswith("select"))
     assert len(duckdb.sql(statement)) == 160
-    one = json.loads(shown("-t", "/large", "-r", "1", "--json"))
+    one = json.loads(shown("/large", "-r", "1", "--json"))
     assert [item["rows"] for item in one] == [600]
     assert [len(duckdb.sql(item["statement"])) for item in one] == [600]
-    assert "recording" not in shown("-t", "/large")
+    assert "recording" not in shown("/large")
 
 
 def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) -> None:
