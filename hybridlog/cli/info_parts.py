@@ -1,4 +1,4 @@
-"""What options of `hybridlog info` show: definitions, losses, sizes, attachments."""
+"""Parts of `hybridlog info`, by option: definitions, losses, sizes, attachments."""
 
 from __future__ import annotations
 

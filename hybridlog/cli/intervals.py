@@ -60,7 +60,7 @@ class _Given(Asking, Listing):
 
     @property
     def needs_topic(self) -> bool:  # type: ignore[override]
-        """Whether a topic has to be named."""
+        """True if a topic has to be named."""
         return self.rehearse is None
 
 

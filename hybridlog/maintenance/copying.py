@@ -50,7 +50,7 @@ _SENDING: Final = ".copying-"  # prefix of the folder of a recording whose field
 
 @dataclass(frozen=True, slots=True)
 class CopyOptions:
-    """How recordings are copied.
+    """Options of a copy.
 
     Attributes:
         only_fields: Leave the payloads for later: the copy is like an expired recording.

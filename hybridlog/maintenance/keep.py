@@ -250,7 +250,7 @@ class Keeper:
 
 
 def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
-    """Whether a recording may have messages from a time to another; a running one, later ones."""
+    """True if a recording may have messages in a range of time; a running one, later ones."""
     start, stop = extent_of(entry)
     is_over = entry.status not in {"open", "unfinished"}
     return (end is None or end > start) and not (is_over and begin is not None and begin >= stop)

@@ -160,7 +160,7 @@ class Begun:
 
 
 class Place(Protocol):
-    """Where recordings are copied to. One recording at a time, by one thread."""
+    """A destination of copies. One recording at a time, by one thread."""
 
     name: str
     """What people call it."""
@@ -465,7 +465,7 @@ class DirectoryPlace:
             raise durability.explain(error, path, "copying into") from error
 
     def _edits(self, label: str, state: JournalState) -> list[journal.Event]:
-        """What users added to a copy that lacks payloads; segments of marks get a name here."""
+        """Lines that users added to a copy without payloads; segments of marks get a name here."""
         old = self._directory.recording(label)
         data = files.read_file(old / JOURNAL, journal.MAX_JOURNAL)
         lines = [line for _, line in journal.read_lines(data) if line is not None]

@@ -134,7 +134,7 @@ class _There:
 
 
 def _there(entry: RecordingEntry, target: RemoteDirectory, own: Catalog) -> _There | None:
-    """What the other store has of a recording, by its catalog; None for nothing.
+    """The recording in the other store, by its catalog; None for nothing.
 
     Raises:
         StoreError: It has other content there.

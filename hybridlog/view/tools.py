@@ -250,7 +250,7 @@ def plot(context: Context, asked: Asked, fields: list[str]) -> Answer:
 
 
 def _lacks(query: Query, name: str, count: int) -> dict[str, Any]:
-    """What the last answer of a query lacks, in words."""
+    """The gaps of a query's last answer, in words."""
     found = query.completeness()
     return {
         "lost": found.describe(count) if found.has_losses else None,

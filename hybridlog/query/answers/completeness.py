@@ -66,7 +66,7 @@ class Completeness:
         return bool(self.messages) or not self.is_exact
 
     def __str__(self) -> str:
-        """What is missing in words: `4 messages are lost`, and payloads by cause."""
+        """The missing messages in words: `4 messages are lost`, and payloads by cause."""
         from hybridlog.schema.states import State, without_payload
 
         gone = {State.REDUCED: self.reduced - self.expired, State.EXPIRED: self.expired}

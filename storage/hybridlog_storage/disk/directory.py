@@ -288,17 +288,17 @@ class StoreDirectory:
 
     @property
     def address(self) -> str:
-        """What another process opens it by."""
+        """The address by which another process opens it."""
         return str(self.path.absolute())
 
     @property
     def place(self) -> str:
-        """Where the store is, for people."""
+        """The store's place, for people."""
         return str(self.path)
 
     @property
     def when_empty(self) -> str:
-        """What to say if it has no recordings."""
+        """The sentence for a store without recordings."""
         return "The store is empty: `hybridlog record FILE` fills it."
 
     def catalog_folder(self) -> MemoryFolder | None:

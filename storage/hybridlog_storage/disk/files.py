@@ -66,7 +66,7 @@ class Fetched(Protocol):
         """Another handle of the same file."""
 
     def identity(self) -> tuple[int, ...]:
-        """What another file does not have, nor this one after a change."""
+        """A value that no other file has, nor this one after a change."""
 
 
 mounted: Final[dict[Path, Mounted]] = {}
@@ -316,7 +316,7 @@ def preadv(fd: int, buffers: Sequence[memoryview], offset: int) -> int:
 
 
 def identity(fd: int) -> tuple[int, ...]:
-    """What another file does not have, nor this one after a change."""
+    """A value that no other file has, nor this one after a change."""
     if is_fetched(fd):
         return cast("Fetched", fd).identity()
     about = os.fstat(fd)

@@ -49,7 +49,7 @@ class CachedFile(int):
         self.blocks.fetch(self, ranges)
 
     def identity(self) -> tuple[int, ...]:
-        """What another object does not have, nor this one after a change."""
+        """A value that no other object has, nor this one after a change."""
         return inode_of(self.blocks.about), self.blocks.about.size
 
     def again(self) -> CachedFile:

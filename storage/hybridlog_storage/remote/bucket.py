@@ -205,7 +205,7 @@ class Bucket:
         return self._again(name, read)
 
     def head(self, name: str) -> Object | None:
-        """What an object is; None if it does not exist.
+        """The size and version of an object; None if it does not exist.
 
         Raises:
             BucketError: The server does not answer, or refuses.
@@ -465,7 +465,7 @@ def _opened(address: str, timeout_s: int) -> ObjectStore:
 
 
 def _allows_http() -> bool:
-    """Whether the environment allows a server without TLS, under the name that obstore reads."""
+    """True if the environment allows a server without TLS, under the name that obstore reads."""
     names = ("AWS_ALLOW_HTTP", "GOOGLE_ALLOW_HTTP", "AZURE_ALLOW_HTTP", "ALLOW_HTTP")
     return any(os.environ.get(name, "").lower() in {"1", "true"} for name in names)
 
@@ -496,7 +496,7 @@ def _size_of(content: bytes | BinaryIO) -> int:
 
 
 def _reason(error: Exception) -> str:
-    """What an error of the library says, in one line and without what may be secret."""
+    """The message of an error of the library, in one line and without what may be secret."""
     lines = str(error).partition("Debug source")[0].split("\n")
     text = " ".join(" ".join(lines).split())
     printable = "".join(one for one in text if one.isprintable())

@@ -378,7 +378,7 @@ class RemoteDirectory(StoreDirectory):
 
     @property
     def address(self) -> str:
-        """What another process opens it by."""
+        """The address by which another process opens it."""
         return self.source.bucket.address
 
     @property
@@ -388,7 +388,7 @@ class RemoteDirectory(StoreDirectory):
 
     @property
     def when_empty(self) -> str:
-        """What to say if it has no recordings."""
+        """The sentence for a store without recordings."""
         return f"The store is empty: `hybridlog copy {self.place}` fills it from one on a disk."
 
     @property
