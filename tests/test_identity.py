@@ -580,7 +580,7 @@ def test_twenty_commands_at_once_wait_for_each_other(
     commands: list[Callable[[hl.Store], object]] = [
         *(partial(hl.Store.tag, recording=one, **{f"key{n}": str(n)}) for n in range(8)),
         *(partial(hl.Store.note, recording=one, note=f"note {n}") for n in range(4)),
-        *(partial(hl.Store.mark, recording=one, moment="+1s", note=f"mark {n}") for n in range(4)),
+        *(partial(hl.Store.mark, recording=one, moment="+0s", note=f"mark {n}") for n in range(4)),
         *(partial(hl.Store.rename, recording=one, name=f"name {n}") for n in range(3)),
         partial(hl.Store.compact, recordings=[one], topics=["/scan"]),
     ]
@@ -601,7 +601,7 @@ def test_twenty_commands_at_once_wait_for_each_other(
     with hl.open(path, mongo=NOWHERE) as store, ThreadPoolExecutor(len(commands)) as pool:
         with store.directory.writing("a", one):
             begun = [pool.submit(run, command) for command in commands]
-            while len(waiting) < len(commands):
+            while len(waiting) < len(commands) and not any(one.done() for one in begun):
                 time.sleep(0.01)
         for future in begun:
             future.result(250)

@@ -108,7 +108,7 @@ class Command(click.Command):
                 given = ctx.params.get(argument.name or "")
                 if not isinstance(argument, click.Argument) or "did you mean" in str(error):
                     continue
-                for word in [given] if isinstance(given, str) else given or ():
+                for word in given if isinstance(given, tuple) else [str(given or "")]:
                     hint = self._meant(word, argument)
                     if hint and f"'{word}'" in str(error):
                         error.add_note(hint.strip())

@@ -153,7 +153,7 @@ def test_recording_needs_no_server(store: Path, tmp_path: Path, kind: str) -> No
     for words in (
         ("fetch", "-t", "/base/scan", "--where", "ranges.min < 1", "--count"),
         ("stats", "-t", "/imu/data", "--fields", "orientation.x"),
-        ("mark", "-r", "robot", "--at", "+1s", "here"),
+        ("mark", "-r", "robot", "--at", "+0s", "here"),
         ("verify",),
         ("repair",),
     ):

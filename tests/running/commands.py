@@ -325,7 +325,7 @@ COMMANDS: dict[str, list[Asked]] = {
         ),
         asked(
             "stats said arm --rate -F jsonl",
-            lines("begin", "end", "topic", "messages", "rate"),
+            lines("begin_ns", "end_ns", "topic", "messages", "rate"),
             lambda k: [*reversed(rates(k, "/said", "/arm"))],
         ),
     ],

@@ -286,7 +286,7 @@ def test_episodes_are_marks_and_intervals(make: Make, tmp_path: Path) -> None:
 def test_a_task_may_be_said_by_a_topic(make: Make, tmp_path: Path) -> None:
     with make(Log()) as store:
         store.mark("run0", START + SECOND, "a", until=START + 2 * SECOND)
-        store.mark("run0", START + 3 * SECOND, "b", until=START + 4 * SECOND)
+        store.mark("run0", START + 3 * SECOND, "b", until=START + 3_900 * MS)
         export(store, tmp_path / "set", episodes_by="mark", task="", task_topic="say")
         assert [one["tasks"] for one in episodes_of(tmp_path / "set")] == [["first"], ["second"]]
         assert {row["task_index"] for row in rows_of(tmp_path / "set")} == {0, 1}
