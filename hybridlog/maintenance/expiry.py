@@ -116,9 +116,8 @@ def expire(
     path = directory.recording(label)
     work = _Expiry(path, sorted(segments), topics, log or Journal(path), min_bytes)
     done = work.run(directory, label, progress)
-    with suppress(
-        HybridlogError, OSError
-    ):  # they stay as they are, and the next expiry tries again
+    # Files that cannot be joined stay as they are, and the next expiry tries again.
+    with suppress(HybridlogError, OSError):
         done.freed += work.join(max_files)
     return done
 
