@@ -62,7 +62,7 @@ ALLOWED = {
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "obstore": ("hybridlog_storage.remote.bucket",),
     "pandas": ("hybridlog.frames",),
-    "polars": ("hybridlog.frames.polars",),
+    "polars": ("hybridlog.frames.frame",),
     "pyarrow": (
         "hybridlog.across",
         "hybridlog.cli",

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.bins import AGGREGATES, Aggregate, Bins
+from hybridlog.across.bins import AGGREGATES, Aggregate, Bins, RegularTimes
 from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import HOWS, UNKNOWN, How, match
-from hybridlog.across.regular_times import RegularTimes
 from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, together
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
@@ -235,7 +234,7 @@ class Aligned:
         Raises:
             MissingDependencyError: polars is not installed.
         """
-        from hybridlog.frames.polars import to_polars
+        from hybridlog.frames.frame import to_polars
 
         return to_polars(self.to_arrow())
 

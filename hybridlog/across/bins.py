@@ -1,4 +1,7 @@
-"""Aggregates of a topic's messages in bins of equal length: count, first, last, min, max, mean."""
+"""Aggregates of a topic's messages in bins of equal length: count, first, last, min, max, mean.
+
+The bins begin at regular times, which are rows of an alignment too.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.topic_reader import Stream, TopicReader, together
+from hybridlog.across.topic_reader import TIME, Stream, TopicReader, together
 from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.predicate.types import FieldTypes
+from hybridlog.query.ranges import RangeResolver
+from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import is_number, is_time
 from hybridlog.schema.summary import Totals
 from hybridlog_storage.errors import TimeError, UsageError
@@ -23,14 +28,19 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.across.regular_times import RegularTimes
+    from hybridlog.query.question import Question
     from hybridlog.session import Session
+
 
 Aggregate = Literal["count", "first", "last", "min", "max", "mean"]
 AGGREGATES: Final[tuple[Aggregate, ...]] = get_args(Aggregate)
 _OF_NUMBERS: Final = frozenset({"min", "max", "mean"})
 _COUNT = "count"
 _Block = tuple["NDArray[np.int64]", pa.Table]
+
+MAX_TIMES = 100_000_000
+"""Maximum number of rows of `resample`."""
+_GRID_ROWS = 65_536
 
 
 class Bins:
@@ -280,3 +290,51 @@ def _values_of(column: Any) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
         column = column.fill_null(0)
     values = column.to_numpy()
     return values, is_value & np.isfinite(values)
+
+
+class RegularTimes:
+    """Regular times as rows: from the beginning of each recording, or of the asked range.
+
+    Args:
+        session: The open store.
+        question: The question whose recordings and range count.
+        step: Time between two rows, ns.
+
+    Attributes:
+        step: The step.
+
+    Raises:
+        UsageError: the step is zero.
+    """
+
+    def __init__(self, session: Session, question: Question, step: int) -> None:
+        if step == 0:
+            raise UsageError("A step of 0 gives no times: name a duration, such as 100ms.")
+        self.question = question
+        self.step = step
+        spans: dict[str, list[tuple[int, int]]] = {}
+        for summary, span in RangeResolver(session, question).spans():
+            spans.setdefault(summary.id, []).append(span)
+        self._spans = spans
+        rows = sum((end - begin) // step for found in spans.values() for begin, end in found)
+        if rows > MAX_TIMES:
+            raise UsageError(f"There would be {rows} rows; use a longer step or a time range.")
+
+    def end(self, recording: str, time: int) -> int:
+        """End of the bin that begins at a time: the next time, or the end of the range."""
+        spans = self._spans[recording]
+        return min(time + self.step, next(end for begin, end in spans if begin <= time < end))
+
+    def empty(self) -> pa.Table:
+        """No rows."""
+        return pa.table({TIME: numbers(np.empty(0, np.int64), "time")})
+
+    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
+        """The times in a recording."""
+        for begin, end in self._spans.get(recording, []):
+            first = begin
+            while first < end:
+                last = min(end, first + _GRID_ROWS * self.step)
+                times = np.arange(first, last, self.step, dtype=np.int64)
+                yield times, pa.table({TIME: numbers(times, "time")})
+                first = last if last == end else first + len(times) * self.step

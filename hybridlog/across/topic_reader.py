@@ -1,12 +1,15 @@
-"""One topic of an alignment: its messages as tables, with their times on a clock."""
+"""One topic of an alignment: its messages as tables, with their times on a clock.
+
+Other processes can use a data set over an open store, see `OpensAgain`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Clock, Question
     from hybridlog.session import Session
+
 
 TIME: Final = "log_time"
 """Column of the time of a row."""
@@ -233,3 +237,40 @@ def together(tables: Sequence[pa.Table]) -> pa.Table:
         ]
         columns[name] = pa.chunked_array(parts, kind)
     return pa.table(columns)
+
+
+class OpenedStore(Protocol):
+    """A store that a process has opened for itself."""
+
+    @property
+    def session(self) -> Session:
+        """Its state."""
+
+
+class OpensAgain:
+    """A data set that can be pickled: each process opens the store for itself.
+
+    Args:
+        session: The open store.
+        open_again: Opens it in another process.
+
+    Attributes:
+        counters: What reading has cost in this process.
+    """
+
+    def __init__(self, session: Session, open_again: Callable[[], OpenedStore]) -> None:
+        self.counters = Counters()
+        self._open_again = open_again
+        self._session: Session | None = session
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the open store."""
+        state = vars(self).copy()
+        state.update(_session=None, counters=Counters())
+        return state
+
+    def _opened(self) -> Session:
+        """The store, opened by this process."""
+        if self._session is None:
+            self._session = self._open_again().session
+        return self._session

@@ -84,8 +84,7 @@ def check_command(given: _Check) -> None:
 
 
 def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> None:
-    from hybridlog.contract.judge import broken
-    from hybridlog.contract.junit import junit_of
+    from hybridlog.contract.judge import broken, junit_of
 
     if given.junit is not None:
         _write(given.junit, junit_of(results))

@@ -33,7 +33,7 @@ def sql_command(given: _Given) -> None:
     unambiguous. Tables: recordings, topics, losses, marks. Needs no MongoDB.
     """
     from hybridlog.query.times import parse_duration
-    from hybridlog.sql.memory_limit import limited_memory
+    from hybridlog.sql.duck import limited_memory
 
     to, query = given.to, given.query
     most = None if given.memory is None else parse_size(given.memory)

@@ -13,7 +13,7 @@ from hybridlog.cli.answers import Destination, answer_sql
 from hybridlog.cli.output import note, notes, say
 from hybridlog.index.consent import state_directory
 from hybridlog.sql.completion import DELIMITERS, candidates
-from hybridlog.sql.memory_limit import limited_memory
+from hybridlog.sql.duck import limited_memory
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import at_safe_points, postpone
 

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.columns.chunk_file import ChunkFile
+from hybridlog.columns.column_file import ChunkFile
 from hybridlog.columns.fields import FieldShape, without
 from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.columns.payload_rows import Piece, bytes_of
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.columns.chunk_file import Place
+    from hybridlog.columns.column_file import Place
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.columns.chunk_file import ChunkFile
 from hybridlog.columns.clouds import PointLayout
-from hybridlog.columns.column_file import FIRST, LAST, TablePart
+from hybridlog.columns.column_file import FIRST, LAST, ChunkFile, TablePart
 from hybridlog.columns.layout import TopicCounts
 from hybridlog.columns.parquet_file import leaves
 from hybridlog.columns.payload_rows import NEEDED, Rebuilder, rows_of

@@ -278,8 +278,6 @@ class TableWriter:
         self._held_rows = 0
         self._held_segment = -1
         self._channels: dict[int, Channel] = {}
-        self._met: Mapping[int, Channel] = {}  # the last mapping, and its size
-        self._met_count = 0
         self._has_grown = False  # rows were decoded since the last look at their size
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._of_channel: dict[int, tuple[_Topic, Codec, State]] = {}

@@ -1,4 +1,4 @@
-"""Arrow columns as a pandas frame with types that every library supports.
+"""Arrow columns as a pandas or polars frame, in pandas with types that every library supports.
 
 | column | in pandas |
 |---|---|
@@ -21,11 +21,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.schema.arrow_types import is_list, is_numeric, is_text, lengths_of, missing_of
+from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    import pyarrow as pa
     from numpy.typing import NDArray
+
 
 _types = pa.types
 _NAT = np.iinfo(np.int64).min
@@ -192,3 +195,18 @@ def _string_dtype() -> Any:
     if int(pd.__version__.split(".")[0]) >= 3:
         return pd.StringDtype(storage="pyarrow", na_value=np.nan)
     return pd.StringDtype("pyarrow_numpy")
+
+
+def to_polars(table: pa.Table) -> Any:
+    """A polars frame of a table.
+
+    Raises:
+        MissingDependencyError: polars is not installed.
+    """
+    try:
+        import polars as pl
+    except ImportError as error:
+        raise MissingDependencyError(
+            "A polars frame needs polars: pip install polars; to_arrow and to_pandas do not."
+        ) from error
+    return pl.from_arrow(table)

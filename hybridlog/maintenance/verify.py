@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from hybridlog.columns import chunk_file
+from hybridlog.columns import column_file
 from hybridlog.columns.payload_files import RecordingPayloads, walk
 from hybridlog.entries import take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
@@ -129,7 +129,7 @@ def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[str, str]]
         try:
             payloads.reader(file).check()
         except StoreError as error:
-            yield file.file, str(error).removesuffix(chunk_file.RESTORE)
+            yield file.file, str(error).removesuffix(column_file.RESTORE)
 
 
 class _Index:

@@ -1,18 +1,29 @@
-"""Latching channels: a subscriber that joins late receives their last messages."""
+"""Latching channels: a subscriber that joins late receives their last messages.
+
+So they stand in front of the messages of a range; the frames of a video from its key frame too.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Mapping
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from hybridlog.arrays import is_video_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog_storage.messages import Batch
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from hybridlog_storage.messages import Buffer, Channel
+
 
 KEEP_ALL: Final = 1 << 62
 """Depth of a publisher that keeps all of its messages."""
@@ -20,6 +31,11 @@ KEEP_ALL: Final = 1 << 62
 _TRANSIENT_LOCAL = re.compile(r"durability\W+(?:1|\w*transient_local)\b", re.IGNORECASE)
 _MAX_TEXT = 32 << 10  # characters; profiles of more than a hundred publishers are counted only
 _POLICIES = frozenset({"durability", "history", "depth"})
+
+MAX_HELD: Final = 256 << 20
+"""Payload bytes that are held; the last message of each publisher is held in any case."""
+
+_BATCH = 2 << 20  # payload bytes
 
 
 def depth_of(channel: Channel) -> int:
@@ -94,3 +110,167 @@ def _depth(profile: Mapping[object, object]) -> int:
 def _is(policy: object, number: int, name: str) -> bool:
     text = str(policy).lower()
     return text == str(number) or text.endswith(name)
+
+
+class _Held(NamedTuple):
+    """A message; the order is that of log time and arrival."""
+
+    log_time: int
+    number: int
+    channel: int
+    publish_time: int
+    sequence: int
+    payload: bytes
+
+
+class LatchedFront:
+    """Holds the last messages of each publisher from before a slice until the log has ended.
+
+    A log may be out of order, so only its end shows which messages are the last ones. Their
+    log time becomes that of the slice's beginning. Messages of their channels with that very
+    log time are held, too: of equal log times, the one that arrived last is current.
+
+    Of video, the frames from the last key frame before the slice on are held, to which its first
+    frames refer; none without such a key frame.
+
+    Args:
+        begin: Log time of the beginning, ns.
+        original_times: The messages keep their log time.
+
+    Attributes:
+        messages: Number of latched messages from before the slice.
+        left_out: Number of those that were in force and could not be held.
+    """
+
+    def __init__(self, begin: int, *, original_times: bool) -> None:
+        self._begin = begin
+        self._original_times = original_times
+        self._depths: list[int] = []
+        self._channels: list[Channel] = []
+        self._keys: dict[Hashable, _Held] = {}
+        self._publishers: list[Hashable] = []
+        self._has_publish_time: list[bool] = []
+        self._last: dict[Hashable, list[_Held]] = defaultdict(list)
+        self._at_begin: list[_Held] = []
+        self._size = 0
+        self._number = 0
+        self.messages = 0
+        self.left_out = 0
+
+    def split(
+        self, batch: Batch, inside: NDArray[np.bool_], channels: Sequence[Channel]
+    ) -> tuple[Batch, NDArray[np.bool_]]:
+        """Take the messages to hold from a batch.
+
+        Args:
+            batch: The next messages of the log, of the wanted topics.
+            inside: bool[n], True for messages of the slice.
+            channels: The log's channels.
+
+        Returns:
+            The batch and bool[n], True for messages to write at once. Among them are messages
+            from before the slice of publishers that keep all of theirs.
+        """
+        for channel in channels[len(self._depths) :]:
+            self._depths.append(KEEP_ALL - 1 if is_video(channel) else depth_of(channel))
+            self._channels.append(channel)
+            self._publishers.append(publisher_of(channel))
+            self._has_publish_time.append(channel.has_publish_time)
+        depth = np.array(self._depths, np.int64)[batch.channel]
+        before = batch.log_time < self._begin
+        always = before & (depth == KEEP_ALL)
+        hold = before & (depth > 0) & ~always
+        if not self._original_times:
+            hold |= (batch.log_time == self._begin) & (depth > 0) & (depth < KEEP_ALL) & inside
+        for row in np.flatnonzero(hold).tolist():
+            hold[row] = self._hold(batch, row)
+        if always.any():
+            self.messages += int(always.sum())
+            batch = self._moved(batch)
+        return batch, (inside | always) & ~hold
+
+    def _hold(self, batch: Batch, row: int) -> bool:
+        """Hold a message; False for one that is to be written at once."""
+        self._number += 1
+        channel = int(batch.channel[row])
+        held = _Held(
+            int(batch.log_time[row]),
+            self._number,
+            channel,
+            int(batch.publish_time[row]),
+            int(batch.sequence[row]),
+            bytes(batch.payload(row)),
+        )
+        if held.log_time == self._begin:
+            if self._size + len(held.payload) > MAX_HELD:
+                return False
+            self._size += len(held.payload)
+            self._at_begin.append(held)
+            return True
+        publisher = self._publishers[channel]
+        last = self._last[publisher]
+        heappush(last, held)
+        self._size += len(held.payload)
+        if is_video(self._channels[channel]):
+            self._cut_to_key(publisher, held)
+        if len(last) > self._depths[channel]:
+            self._size -= len(heappop(last).payload)
+        while self._size > MAX_HELD and len(last) > 1:
+            self._size -= len(heappop(last).payload)
+            self.left_out += 1
+            key = self._keys.get(publisher)
+            if key is not None and key < last[0]:
+                del self._keys[publisher]  # the rest refers to what is gone
+        return True
+
+    def _cut_to_key(self, publisher: Hashable, held: _Held) -> None:
+        """Drop the frames before the last key frame, if the frame just held is one or before it."""
+        key, last = self._keys.get(publisher), self._last[publisher]
+        if is_key_frame(self._channels[held.channel], held.payload):
+            key = self._keys[publisher] = max(key or held, held)
+        while key is not None and last[0] < key:
+            self._size -= len(heappop(last).payload)
+
+    def batches(self) -> Iterator[Batch]:
+        """The held messages, in order; `channel` indexes the log's channels."""
+        front = sorted(
+            held
+            for publisher, last in self._last.items()
+            for held in last
+            if publisher in self._keys or not is_video(self._channels[held.channel])
+        )
+        self.messages += len(front)
+        group: list[_Held] = []
+        size = 0
+        for held in [*front, *self._at_begin]:
+            group.append(held)
+            size += len(held.payload)
+            if size >= _BATCH:
+                yield self._moved(_batch_of(group))
+                group, size = [], 0
+        if group:
+            yield self._moved(_batch_of(group))
+
+    def _moved(self, batch: Batch) -> Batch:
+        """The messages with the log time of the beginning, where they are from before it."""
+        if self._original_times:
+            return batch
+        moved = batch.take(slice(None))
+        moved.log_time = np.maximum(batch.log_time, self._begin)
+        # Without publish times, they repeat the log times.
+        has_own = np.array(self._has_publish_time)[batch.channel]
+        moved.publish_time = np.where(has_own, batch.publish_time, moved.log_time)
+        return moved
+
+
+def _batch_of(group: Sequence[_Held]) -> Batch:
+    length = np.fromiter((len(held.payload) for held in group), np.int64, len(group))
+    return Batch(
+        buffer=b"".join(held.payload for held in group),
+        offset=np.cumsum(length) - length,
+        length=length,
+        channel=np.array([held.channel for held in group], np.int32),
+        log_time=np.array([held.log_time for held in group], np.int64),
+        publish_time=np.array([held.publish_time for held in group], np.int64),
+        sequence=np.array([held.sequence for held in group], np.uint32),
+    )

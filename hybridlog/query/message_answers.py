@@ -210,7 +210,7 @@ class MessageAnswers(Steps):
 
     def _scans(self) -> NDArray[Any] | None:
         """Laser scans of one length as an array, from columns; None for everything else."""
-        from hybridlog.frames.scans import FIELDS, are_scans, scans_in
+        from hybridlog.frames.answer import FIELDS, are_scans, scans_in
 
         if not are_scans(self.channels()):
             return None

@@ -18,9 +18,8 @@ import numpy as np
 from hybridlog.query.bounds import MIN_RECORDINGS, BoundsFinder, within_bounds
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
 from hybridlog.query.engines.base import Checking, Need, UndecidedError
-from hybridlog.query.engines.chunk_index import ChunkIndex
+from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.statistics import Statistics
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.column import STAMP

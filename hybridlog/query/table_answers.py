@@ -41,7 +41,7 @@ class TableAnswers(Steps):
         Raises:
             MissingDependencyError: polars is not installed.
         """
-        from hybridlog.frames.polars import to_polars
+        from hybridlog.frames.frame import to_polars
 
         return to_polars(self.to_arrow())
 

@@ -31,7 +31,6 @@ import calendar
 import math
 import re
 import time
-from collections.abc import Sequence
 from datetime import UTC, date, datetime, timedelta
 from decimal import ROUND_HALF_EVEN, Decimal
 from numbers import Integral, Real
@@ -164,34 +163,6 @@ def parse_range(
             "the end is not part of them)"
         )
     return low, high
-
-
-def parse_between(
-    between: str | Sequence[TimeLike], *, start: int | None, end: int | None
-) -> tuple[int, int]:
-    """A range written as `t0..t1` or given as two times.
-
-    Either side of `..` may be left out: `..+5s`, `-10s..`.
-
-    Args:
-        between: `"t0..t1"` or a sequence of two times.
-        start: First log time, for relative times.
-        end: One past the last log time, for relative times.
-
-    Raises:
-        TimeError: not two times, or an empty range.
-    """
-    parts: Sequence[TimeLike]
-    if isinstance(between, str):
-        parts = between.split("..")
-        if len(parts) != 2:
-            raise TimeError(f"{_shown(between)} is not a time range: write t0..t1; {ACCEPTED}")
-    else:
-        parts = between
-        if len(parts) != 2:
-            raise TimeError(f"a time range needs two times, got {len(parts)}")
-    low, high = (None if _is_blank(part) else part for part in parts)
-    return parse_range(low, high, start=start, end=end)
 
 
 def parse_duration(text: DurationLike) -> int:
@@ -436,10 +407,6 @@ def _checked(ns: int, source: object) -> int:
             "(-2**63 to 2**63 nanoseconds since 1970)"
         )
     return ns
-
-
-def _is_blank(part: object) -> bool:
-    return part is None or (isinstance(part, str) and not part.strip())
 
 
 def _spelled(source: object, default: str, ns: int) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.entries import text
-from hybridlog.query.latched_front import LatchedFront
+from hybridlog.query.latching import LatchedFront
 from hybridlog.record.capture import Capture
 from hybridlog.schema.completion import TRIED_MESSAGES, completed
 from hybridlog.wording import listed

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any, Final
+
+from hybridlog.sql.names import PLAIN, written
 
 if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlConnection
 
 DELIMITERS: Final = " \t\n,;()[]<>=!+-*/'"
 """Characters between words."""
-_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _WORDS: Final = (
     "as",
     "asof",
@@ -60,7 +60,7 @@ def candidates(connection: SqlConnection, line: str, text: str) -> list[str]:
         text: The word that is being typed, such as `pose.po`.
     """
     names = connection.names()
-    words = {word.casefold() for word in _PLAIN.findall(line)}
+    words = {word.casefold() for word in PLAIN.findall(line)}
     views = [name for name in names if name.casefold() in words and name != text]
     columns: dict[str, None] = {}
     for view in views:
@@ -71,7 +71,7 @@ def candidates(connection: SqlConnection, line: str, text: str) -> list[str]:
             alias, _, rest = above.partition(".")
             found = _below(schema, rest) if alias not in schema.names else []
             columns.update(dict.fromkeys(f"{alias}.{path}" for path in found))
-    known = [*columns] if "." in text else [*map(_spelled, names), *columns, *_WORDS]
+    known = [*columns] if "." in text else [*map(written, names), *columns, *_WORDS]
     return sorted({name for name in known if name.casefold().startswith(text.casefold())})
 
 
@@ -84,8 +84,3 @@ def _below(schema: Any, path: str) -> list[str]:
             return []
         fields = list(found[0].type)
     return [f"{path}.{field.name}" if path else field.name for field in fields]
-
-
-def _spelled(name: str) -> str:
-    """A name as SQL takes it."""
-    return name if _PLAIN.fullmatch(name) else '"' + name.replace('"', '""') + '"'

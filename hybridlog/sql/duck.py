@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from hybridlog_storage.errors import (
@@ -36,6 +39,13 @@ _SETTINGS: Final = {
 }
 _SHORTAGES: Final = ("Out of Memory", "Cannot allocate memory", "start new thread")
 _T = TypeVar("_T")
+
+OWN_MEMORY: Final = 512 << 20
+"""Bytes that hybridlog may take beside DuckDB, on top of what the process has at the start."""
+
+
+# What Arrow reserves would count as taken; it reads this when it is loaded.
+os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
 
 
 def duckdb() -> Any:
@@ -174,3 +184,32 @@ class Worker:
     def close(self) -> None:
         """End the thread."""
         self._pool.shutdown(cancel_futures=True)
+
+
+def private_bytes() -> int:
+    """Bytes of private memory of this process, reserved ones included; 0 where it is unknown."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
+
+
+@contextmanager
+def limited_memory(memory: int) -> Iterator[int]:
+    """Limit what this process takes from now on, where the system can.
+
+    Args:
+        memory: Limit of DuckDB's memory, bytes; `OWN_MEMORY` is on top of it.
+
+    Yields:
+        Bytes that it may have in all.
+    """
+    before, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    wanted = private_bytes() + memory + OWN_MEMORY
+    most = wanted if before == resource.RLIM_INFINITY else min(wanted, before)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
+    try:
+        yield most
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (before, hard))

@@ -394,7 +394,7 @@ class SqlAnswer:
             MissingDependencyError: polars is not installed.
             ResourceError: it needs more memory or time than it may.
         """
-        from hybridlog.frames.polars import to_polars
+        from hybridlog.frames.frame import to_polars
 
         return to_polars(self.to_arrow())
 

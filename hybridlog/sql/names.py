@@ -13,7 +13,7 @@ from hybridlog_storage.mongo.collection_names import collection_of
 TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""
 _WORD: Final = re.compile(r'"((?:[^"]|"")*)"|([^\W\d][\w$]*)')
-_PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _LISTING: Final = frozenset(
     {
         "database",
@@ -87,6 +87,11 @@ def quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
+def written(name: str) -> str:
+    """A name as people write it in SQL: in quotes only where it needs them."""
+    return name if PLAIN.fullmatch(name) else quoted(name)
+
+
 def _words(query: str) -> list[tuple[str, str]]:
     return _WORD.findall(query)
 
@@ -96,5 +101,5 @@ def _short_names(topic: str) -> Iterator[str]:
     parts = topic.strip("/").split("/")
     for start in range(1, len(parts)):
         name = "__".join(parts[start:])
-        if _PLAIN.fullmatch(name):
+        if PLAIN.fullmatch(name):
             yield name

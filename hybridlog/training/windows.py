@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.across.opens_again import OpensAgain
+from hybridlog.across.topic_reader import OpensAgain
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.pieces import pieces
@@ -24,7 +24,7 @@ from hybridlog_storage.times import BEGIN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.across.opens_again import OpenedStore
+    from hybridlog.across.topic_reader import OpenedStore
     from hybridlog.training.episodes import Episode, OnGap
     from hybridlog.training.feature_map import FeatureMap
 

@@ -21,7 +21,7 @@ from starlette.routing import Route
 from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.formats.slices import SliceCache
-from hybridlog.query.answers.next_time import next_time
+from hybridlog.query.answers.match_times import next_time
 from hybridlog.record.losses import extent_of
 from hybridlog.view.asked import RequestParams
 from hybridlog.view.sql_process import SqlProcess

@@ -82,7 +82,6 @@ ROUTES: Final = (
     "export",
     "messages",
     "recordings",
-    "series",
     "spatial",
     "timeline",
 )

@@ -10,8 +10,7 @@ from multiprocessing.reduction import recv_handle
 from typing import Any
 
 import hybridlog
-from hybridlog.sql.duck import shortage_of
-from hybridlog.sql.memory_limit import OWN_MEMORY, limited_memory, private_bytes
+from hybridlog.sql.duck import OWN_MEMORY, limited_memory, private_bytes, shortage_of
 from hybridlog.view.context import SQL_MEMORY, Context
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import GivenUpError, until_given_up

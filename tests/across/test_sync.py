@@ -18,8 +18,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.across.approximate_time import approximate_sets
-from hybridlog.across.sync import Synced
+from hybridlog.across.sync import Synced, approximate_sets
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 

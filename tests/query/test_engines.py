@@ -24,9 +24,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
 from hybridlog.query.engines.base import Engine
-from hybridlog.query.engines.chunk_index import ChunkIndex
+from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.statistics import Statistics
 from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.parser import parse

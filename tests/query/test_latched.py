@@ -16,9 +16,8 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats.slices import Front
-from hybridlog.query import latched_front
-from hybridlog.query.latched_front import LatchedFront
-from hybridlog.query.latching import KEEP_ALL, depth_of
+from hybridlog.query import latching
+from hybridlog.query.latching import KEEP_ALL, LatchedFront, depth_of
 from hybridlog.query.query import Query
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
@@ -316,7 +315,7 @@ def test_a_recorded_slice_without_latched_messages(store: hl.Store, log: Path) -
 def test_what_does_not_fit_in_memory_is_told(
     store: hl.Store, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(latched_front, "MAX_HELD", 1)
+    monkeypatch.setattr(latching, "MAX_HELD", 1)
     begin = BEGIN + 45 * SECOND
     report = store.record(log, name="tight", between=(begin, begin + SECOND), again=True)
     # The last message of each publisher, and all of those who keep all.

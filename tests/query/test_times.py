@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from hybridlog.query.times import (
     format_duration,
     format_time,
-    parse_between,
     parse_duration,
     parse_range,
     parse_time,
@@ -203,18 +202,6 @@ def test_ranges() -> None:
         between("+6s", "+6s")
     with pytest.raises(TimeError, match="the end"):
         between("2100-01-01", None)
-
-
-def test_between() -> None:
-    expected = (START + 10**9, START + 2 * 10**9)
-    assert parse_between("+1s..+2s", start=START, end=END) == expected
-    assert parse_between(["1s", "2s"], start=START, end=END) == expected
-    assert parse_between("..2s", start=START, end=END) == (START, expected[1])
-    assert parse_between("-1s..", start=START, end=END) == (END - 10**9, END)
-    assert parse_between("1.5..2.5", start=None, end=None) == (1_500_000_000, 2_500_000_000)
-    for wrong in ("+1s", "1s..2s..3s", ["1s"], "1s...2s"):
-        with pytest.raises(TimeError):
-            parse_between(wrong, start=START, end=END)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.sql.memory_limit import OWN_MEMORY, limited_memory, private_bytes
+from hybridlog.sql.duck import OWN_MEMORY, limited_memory, private_bytes
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.cli.running import COMMAND, environment
 

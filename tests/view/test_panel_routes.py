@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 import hybridlog as hl
 from hybridlog.drawing.series import series
 from hybridlog.drawing.tree import MAX_SHOWN, tree
-from hybridlog.query.answers.next_time import next_time
+from hybridlog.query.answers.match_times import next_time
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 import hybridlog as hl
-from hybridlog.sql.memory_limit import OWN_MEMORY
+from hybridlog.sql.duck import OWN_MEMORY
 from hybridlog.view.context import SQL_MEMORY
 from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import HybridlogError, ResourceError, StoreError

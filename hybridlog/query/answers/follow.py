@@ -24,8 +24,6 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun, ScanPlan
@@ -143,10 +141,6 @@ class Following(Planner, Iterator["Message"]):
             is_new = columns.number >= (read if segment == last else 0)
             yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
             self._read[entry.id] = segment, len(table.chunks)
-
-    def reads_tables(self, part: Part, fields: Collection[str] | None) -> bool:
-        """False: tables have whole topics."""
-        return False
 
     def _selecting(self, part: Part) -> Engine:
         return self._scan

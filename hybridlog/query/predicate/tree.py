@@ -91,15 +91,6 @@ class Field(_Node):
         return any(isinstance(part, Slice) for part in self.parts)
 
     @property
-    def is_of_slice(self) -> bool:
-        """True if the last name follows a slice, as in `ranges[0:9].min`."""
-        return len(self.parts) > 1 and isinstance(self.parts[-2], Slice)
-
-    def without_slices(self) -> Field:
-        """The path to all elements."""
-        return Field(tuple(part for part in self.parts if not isinstance(part, Slice)))
-
-    @property
     def names(self) -> str:
         """The path without array indexes, as in the types of fields."""
         return ".".join(part for part in self.parts if isinstance(part, str))

@@ -21,7 +21,7 @@ from hybridlog.query.predicate.tree import (
     Predicate,
     Value,
 )
-from hybridlog.schema.kinds import FLOATS, INTEGERS, NUMBERS, TIMES
+from hybridlog.schema.kinds import FLOATS, NUMBERS, TIMES
 from hybridlog.wording import listed
 from hybridlog_storage.errors import WhereError
 
@@ -121,10 +121,6 @@ class FieldTypes:
     def are_floats(self, path: str) -> bool:
         """True if a field, or the elements of an array, are floating-point numbers."""
         return self.base(path) in FLOATS
-
-    def are_int64(self, path: str) -> bool:
-        """True if a field, or the elements of an array, are integers that fit into int64."""
-        return self.base(path) in INTEGERS - {"uint64"}
 
 
 @lru_cache(maxsize=64)

@@ -156,7 +156,7 @@ def sql(context: Context, asked: RequestParams) -> dict[str, Any]:
 
 def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
     """The first rows of a query, worked out in the process for SQL."""
-    from hybridlog.sql.shown import shown
+    from hybridlog.frames.cells import shown
 
     connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
     try:
