@@ -552,7 +552,7 @@ class Session:
             return self._latest
         if self._has_names_changed() and time.monotonic() >= self._looks_at:
             self.catch_up()
-        elif snapshot.is_open.any():
+        elif snapshot.unfinished:
             self._latest = _Moment(snapshot)
         return self._latest
 
@@ -590,7 +590,7 @@ class Session:
         """
         moment = self._moment
         snapshot = self._snapshot_of(moment)
-        for place in np.flatnonzero(snapshot.is_open).tolist():
+        for place in snapshot.unfinished:
             recording = snapshot.summaries[place].id
             if recordings is None or recording in recordings:
                 self._follow(moment, recording)
@@ -697,7 +697,7 @@ class Session:
         place = snapshot.by_id.get(summary.id)
         if summary.id in moment.entries:
             return moment.entries[summary.id]
-        if place is not None and snapshot.is_open[place]:
+        if place is not None and snapshot.summaries[place].status in UNFINISHED:
             return self._follow(moment, summary.id)
         found = self._read_entry(summary)
         if found is not None:

@@ -26,24 +26,24 @@ if TYPE_CHECKING:
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
 _MAX_CACHED = 128  # sets of topics
-_LATEST = np.iinfo(np.int64).max
+_LATEST = (1 << 63) - 1
 
 
 def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str]:
     return one.span is None, one.span or (0, 0), one.label
 
 
-def _columns(
+def _columns_of(
     summaries: Sequence[RecordingSummary], topics: Iterable[str]
 ) -> dict[str, NDArray[Any]]:
-    """Columns of a snapshot, a row for each recording, by the name of the attribute."""
+    """Columns of a snapshot, a row for each recording, by name."""
     numbers = {digest: number for number, digest in enumerate(topics)}
     bounds = np.array([one.extent for one in summaries], np.int64).reshape(-1, 2)
     return {
         "begin": bounds[:, 0].copy(),
         "end": bounds[:, 1].copy(),
         "is_open": np.array([one.status in UNFINISHED for one in summaries], np.bool_),
-        "_set": np.array([numbers[one.topics] for one in summaries], np.intp),
+        "set": np.array([numbers[one.topics] for one in summaries], np.intp),
     }
 
 
@@ -56,9 +56,6 @@ class Snapshot:
 
     Attributes:
         summaries: Oldest log time first, empty recordings last.
-        begin: int64[n], first log time of each, ns.
-        end: int64[n], one past the last log time of each, ns; both count lost messages.
-        is_open: bool[n], whether each may have later messages by now.
     """
 
     def __init__(
@@ -68,16 +65,40 @@ class Snapshot:
     ) -> None:
         self.summaries = sorted(summaries, key=_order)
         self._topics = topics
-        self.begin: NDArray[np.int64]
-        self.end: NDArray[np.int64]
-        self.is_open: NDArray[np.bool_]
-        self._set: NDArray[np.intp]
-        for name, values in _columns(self.summaries, topics).items():
-            setattr(self, name, values)
         self._having: dict[frozenset[str], NDArray[np.intp]] = {}
 
     def __len__(self) -> int:
         return len(self.summaries)
+
+    @lazy
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        """The columns, which a list of recordings does without."""
+        return _columns_of(self.summaries, self._topics)
+
+    @property
+    def begin(self) -> NDArray[np.int64]:
+        """int64[n], first log time of each, ns."""
+        return self._columns["begin"]
+
+    @property
+    def end(self) -> NDArray[np.int64]:
+        """int64[n], one past the last log time of each, ns; both count lost messages."""
+        return self._columns["end"]
+
+    @property
+    def is_open(self) -> NDArray[np.bool_]:
+        """bool[n], whether each may have later messages by now."""
+        return self._columns["is_open"]
+
+    @property
+    def _set(self) -> NDArray[np.intp]:
+        """The number of the topics of each."""
+        return self._columns["set"]
+
+    @lazy
+    def unfinished(self) -> list[int]:
+        """Positions of those that may have later messages by now."""
+        return [n for n, one in enumerate(self.summaries) if one.status in UNFINISHED]
 
     def with_changes(
         self,
@@ -104,20 +125,20 @@ class Snapshot:
             found.summaries.insert(place, one)
         new = {digest: sorted(of) for digest, of in topics.items() if digest not in self._topics}
         known = {**self._topics, **new}
-        columns = _columns(changed, known)
+        columns = _columns_of(changed, known)
         for name, values in columns.items():
-            columns[name] = np.insert(np.delete(getattr(self, name), places), before, values)
-        used = np.unique(columns["_set"])
+            columns[name] = np.insert(np.delete(self._columns[name], places), before, values)
+        used = np.unique(columns["set"])
         if len(used) < len(known):
             held = [*known.items()]
             known = dict(held[number] for number in used.tolist())
-            columns["_set"] = np.searchsorted(used, columns["_set"])
-        vars(found).update(columns, _topics=known, _having={})
-        stale = {"tags", "by_id", "by_label"}
+            columns["set"] = np.searchsorted(used, columns["set"])
+        vars(found).update(_columns=columns, _topics=known, _having={})
+        stale = {"tags", "by_id", "by_label", "unfinished"}
         if before == places[::-1] and [one.label for one in changed] == [
             self.summaries[place].label for place in before
         ]:
-            stale = {"tags"}  # each is where it was
+            stale = {"tags", "unfinished"}  # each is where it was
         if known.keys() != self._topics.keys():
             stale |= {"topics", "schemas"}
         for name in stale:

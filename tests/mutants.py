@@ -900,8 +900,8 @@ SILENT = [
         ),
         (
             "a-recording-that-goes-on-has-two-places",
-            "np.insert(np.delete(getattr(self, name), places), before, values)",
-            "np.insert(getattr(self, name), before, values)",
+            "np.insert(np.delete(self._columns[name], places), before, values)",
+            "np.insert(self._columns[name], before, values)",
             CHANGED,
         ),
         (
@@ -912,8 +912,8 @@ SILENT = [
         ),
         (
             "new-tags-are-not-found",
-            '            stale = {"tags"}  # each',
-            "            stale = set()  # each",
+            '            stale = {"tags", "unfinished"}  # each',
+            '            stale = {"unfinished"}  # each',
             CHANGED,
         ),
         (
@@ -930,7 +930,7 @@ SILENT = [
         ),
         (
             "a-new-topic-is-that-of-another-recording",
-            '            columns["_set"] = np.searchsorted(used, columns["_set"])\n',
+            '            columns["set"] = np.searchsorted(used, columns["set"])\n',
             "",
             CHANGED,
         ),
@@ -1104,8 +1104,8 @@ SILENT = [
         ),
         (
             "times-are-lost-in-no-time",
-            "asked = _EVERYTHING if windows is None else windows",
-            "asked = _EVERYTHING",
+            "asked = np.array([[BEGIN, END]], np.int64) if windows is None else windows",
+            "asked = np.array([[BEGIN, END]], np.int64)",
             LOST,
         ),
     ),

@@ -115,6 +115,9 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
 
 
 def _store(context: click.Context) -> StoreDirectory:
+    from hybridlog_storage.lazy import import_numpy_late
+
+    import_numpy_late()
     from hybridlog.store import store_path
     from hybridlog_storage.remote import directory_of
 
@@ -142,13 +145,13 @@ def _snapshot(directory: StoreDirectory) -> Snapshot:
 
     from hybridlog.entries import summary_of
     from hybridlog.maintenance.opening import open_catalog, snapshot_of
-    from hybridlog.record.running import RunningRecording
-    from hybridlog.snapshot import UNFINISHED
 
     with closing(open_catalog(directory)) as catalog:
         found = snapshot_of(catalog, catalog.summaries())
-        for summary in found.summaries:
-            known = catalog.recording(summary.id) if summary.status in UNFINISHED else None
+        for summary in [found.summaries[place] for place in found.unfinished]:
+            from hybridlog.record.running import RunningRecording
+
+            known = catalog.recording(summary.id)
             if known is None:
                 continue
             running = RunningRecording(directory, summary.label, partial(itemgetter(1), known))

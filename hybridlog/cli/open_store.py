@@ -47,6 +47,9 @@ def opened_store(
         records: The command records, also while MongoDB is unavailable.
         recover: False to leave what a crash has cut to another opening, which reports it.
     """
+    from hybridlog_storage.lazy import import_numpy_late
+
+    import_numpy_late()
     from hybridlog.store import open_store
 
     bar = LateBar("indexing", quiet=quiet)

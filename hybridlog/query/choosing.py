@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -67,7 +67,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
     """
     choosing = _Choosing(session)
     try:
-        if not len(choosing.places) and not choice.is_everything:
+        if not choosing.left and not choice.is_everything:
             raise _NothingLeftError(session.directory.when_empty)
         if choice.name:
             choosing.by_name(choice.name)
@@ -119,26 +119,31 @@ class _Choosing:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._snapshot = session.snapshot()
-        self.places = np.arange(len(self._snapshot), dtype=np.intp)
+        self.left: list[int] = [*range(len(self._snapshot))]
         self.conditions: list[str] = []
 
     @property
     def summaries(self) -> list[RecordingSummary]:
         """Those that are left. Positions are of the snapshot at hand: a later one sorts anew."""
-        return [self._snapshot.summaries[place] for place in self.places.tolist()]
+        return [self._snapshot.summaries[place] for place in self.left]
+
+    @property
+    def _places(self) -> NDArray[np.intp]:
+        """Positions of those that are left."""
+        return np.array(self.left, np.intp)
 
     def look(self) -> None:
         """See what those that go on have flushed."""
-        ids = [self._snapshot.summaries[place].id for place in self.places.tolist()]
+        ids = [summary.id for summary in self.summaries]
         self._snapshot = self._session.look(ids)
-        self.places = np.sort(np.array([self._snapshot.by_id[one] for one in ids], np.intp))
+        self.left = sorted(self._snapshot.by_id[one] for one in ids)
 
-    def _keep(self, places: Collection[int] | NDArray[np.intp], condition: str) -> bool:
+    def _keep(self, places: Iterable[int], condition: str) -> bool:
         """Keep those at some positions; true if any is left."""
         self.conditions.append(condition)
-        kept = np.fromiter(places, np.intp, len(places))
-        self.places = np.intersect1d(self.places, kept)
-        return bool(len(self.places))
+        kept = {*places}
+        self.left = [place for place in self.left if place in kept]
+        return bool(self.left)
 
     def by_name(self, names: Sequence[str]) -> None:
         condition = f"named {' or '.join(map(repr, names))}"
@@ -166,13 +171,13 @@ class _Choosing:
 
     def by_topic(self, pattern: str) -> None:
         topics, hint = self._topics(pattern)
-        if not self._keep(self._snapshot.having(topics), f"with the topic {pattern!r}"):
+        if not self._keep(self._snapshot.having(topics).tolist(), f"with the topic {pattern!r}"):
             raise _NothingLeftError(hint)
 
     def _topics(self, pattern: str) -> tuple[list[str], str]:
         """The topics of the recordings that fit a pattern, and what to say if none does."""
         fits = matcher([pattern])
-        known = self._snapshot.topics_at(self.places)
+        known = self._snapshot.topics_at(self._places)
         found = [topic for topic in known if fits(topic)]
         if found:
             return found, ""
@@ -187,7 +192,7 @@ class _Choosing:
         names = self._session.type_names()
         schemas = {digest for digest, known in names.items() if _is_type(known, name)}
         found = self._snapshot.with_schemas(schemas)
-        if self._keep(found, f"with messages of the type {name!r}"):
+        if self._keep(found.tolist(), f"with messages of the type {name!r}"):
             return
         known = sorted(set(names.values()))
         near = difflib.get_close_matches(name, known, cutoff=0.6)
@@ -208,15 +213,14 @@ class _Choosing:
             start=0,
             end=TIME_LIMIT - 1,
         )
-        before = self.places
-        places = self._snapshot.during(before, low, high, time.time_ns())
+        before = self.summaries
+        places = self._snapshot.during(self._places, low, high, time.time_ns())
         sides = [] if _is_side(begin) else [f"from {format_time(low)} on"]
         if not _is_side(end):
             sides.append(f"before {format_time(high)}")
         condition = " ".join(["with messages", *sides])
-        if not self._keep(places, condition):
-            spans = [self._snapshot.summaries[place].span for place in before.tolist()]
-            known = [span for span in spans if span is not None]
+        if not self._keep(places.tolist(), condition):
+            known = [one.span for one in before if one.span is not None]
             hint = "`hybridlog ls` shows the times of all."
             if known:
                 first = format_time(min(span[0] for span in known))
@@ -225,11 +229,12 @@ class _Choosing:
             raise _NothingLeftError(hint)
 
     def by_age(self, age: DurationLike) -> None:
-        snapshot, latest = self._snapshot, time.time_ns() - parse_duration(age)
-        places = self.places
-        is_written = [snapshot.summaries[place].status == "open" for place in places.tolist()]
-        first, end = snapshot.begin[places], snapshot.end[places]
-        old = places[(first < end) & (end - 1 <= latest) & ~np.array(is_written, np.bool_)]
+        latest = time.time_ns() - parse_duration(age)
+        old = [
+            place
+            for place, one in zip(self.left, self.summaries, strict=True)
+            if one.status != "open" and one.extent[0] < one.extent[1] <= latest + 1
+        ]
         if not self._keep(old, f"whose last message is from {format_time(latest)} or before"):
             raise _NothingLeftError("`hybridlog ls` shows the times of all.")
 
@@ -240,7 +245,7 @@ class _Choosing:
                 f"Write TOPIC: PREDICATE, such as 'scan: ranges.min < 0.5', not {condition!r}."
             )
         topics, hint = self._topics(pattern)
-        there = np.intersect1d(self._snapshot.having(topics), self.places)
+        there = np.intersect1d(self._snapshot.having(topics), self._places)
         found: set[int] = set()
         if len(there):
             ids = tuple(self._snapshot.summaries[place].id for place in there.tolist())

@@ -90,7 +90,7 @@ class Records:
 
 Column: TypeAlias = Scalars | Strings | Arrays | Records
 AnyColumn = TypeVar("AnyColumn", bound=Column)
-_T = TypeVar("_T", bound=np.generic)
+_T = TypeVar("_T", bound="np.generic")
 
 LONG = 64
 """Mean number of elements from which rows are copied one by one."""

@@ -56,6 +56,7 @@ from hybridlog_storage.errors import (
     exhausted,
 )
 from hybridlog_storage.forks import taken_by_forks
+from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk_table import ChunkTable
@@ -90,17 +91,15 @@ _MAX_BOUNDED_PARTS: Final = 256  # parts that are replaced at the end for the sa
 _MAX_NOTED: Final = 1 << 17  # bounds that wait for the end
 Ends = tuple[float | None, float | None]
 """The least and the greatest of some numbers; None twice without any."""
-_STAMPS = np.dtype(
-    [
-        ("unreadable", "<u4"),
-        ("surplus", "<u4"),
-        ("stamped", "<u4"),
-        ("first_stamp", "<i8"),
-        ("last_stamp", "<i8"),
-        ("skew_sum", "<f8"),
-        ("skew_min", "<i8"),
-        ("skew_max", "<i8"),
-    ]
+_STAMPS = RowType(
+    ("unreadable", "<u4"),
+    ("surplus", "<u4"),
+    ("stamped", "<u4"),
+    ("first_stamp", "<i8"),
+    ("last_stamp", "<i8"),
+    ("skew_sum", "<f8"),
+    ("skew_min", "<i8"),
+    ("skew_max", "<i8"),
 )
 """Results of decoding; one row for each row of `ChunkTable.parts`."""
 

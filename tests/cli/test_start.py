@@ -28,28 +28,34 @@ HEAVY = {"numpy", "pandas", "pyarrow", "pymongo", "rosbags", "mcap", "zstandard"
 LISTED = """
 import atexit, os, sys
 os._exit = sys.exit  # a command leaves without the interpreter's own end
-atexit.register(lambda: print("", *sys.modules, sep="\\n", file=sys.stderr))
+
+@atexit.register
+def show():
+    is_late = "__file__" not in vars(sys.modules.get("numpy", os))  # and was not needed
+    shown = [name for name in sys.modules if name != "numpy" or not is_late]
+    print("", *shown, sep="\\n", file=sys.stderr)
+
 from hybridlog.cli import main
 main()
 """
 
 
-def modules_of(*arguments: object) -> set[str]:
+def modules_of(*arguments: object, **variables: str) -> set[str]:
     """Modules that a command imports."""
     ended = subprocess.run(
         [sys.executable, "-c", LISTED, *map(str, arguments)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment(),
+        env=environment(**variables),
         check=True,
     )
     return set(ended.stderr.splitlines())
 
 
-def packages_of(*arguments: object) -> set[str]:
+def packages_of(*arguments: object, **variables: str) -> set[str]:
     """Top packages that a command imports."""
-    return {name.split(".")[0] for name in modules_of(*arguments)}
+    return {name.split(".")[0] for name in modules_of(*arguments, **variables)}
 
 
 def test_help_imports_little() -> None:
@@ -60,10 +66,38 @@ def test_help_imports_little() -> None:
         assert len(loaded) < most, sorted(loaded)
 
 
-def test_looking_imports_no_table_libraries(store: Path) -> None:
-    for command in (("ls",), ("info", "robot")):
-        unneeded = {"pandas", "pyarrow", "pymongo", "rosbags"}
-        assert not packages_of(*command, "--store", store) & unneeded
+def test_looking_imports_neither_numbers_nor_tables(store: Path) -> None:
+    asked: list[tuple[tuple[object, ...], dict[str, str]]] = [
+        ((*words, "--store", store), {})
+        for words in (("ls",), ("ls", "--tag", "place"), ("info", "robot"), ("info", "--losses"))
+    ]
+    for line in (f"info --store {store} ro", f"fetch --store {store} sc"):
+        words = {"COMP_WORDS": f"hybridlog {line}", "COMP_CWORD": str(len(line.split()))}
+        asked.append(((), {"_HYBRIDLOG_COMPLETE": "bash_complete", **words}))
+    for arguments, variables in [*asked, (("--version",), {})]:
+        assert not packages_of(*arguments, **variables) & (HEAVY - {"mcap", "zstandard"})
+
+
+def test_threads_that_use_numpy_first_at_once_have_it() -> None:
+    """It is imported at its first use, which may be in many threads."""
+    program = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from hybridlog_storage.lazy import import_numpy_late
+import_numpy_late()
+import numpy as np
+assert "__file__" not in vars(np)
+ready = Barrier(8)
+def use(number):
+    ready.wait()
+    return int(np.arange(number).sum())
+with ThreadPoolExecutor(8) as threads:
+    assert [*threads.map(use, range(8))] == [0, 0, 1, 3, 6, 10, 15, 21]
+import numpy.linalg
+assert np.ndarray is sys.modules["numpy"].ndarray and np.linalg is numpy.linalg
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_help_names_commands_and_exit_codes() -> None:

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 _MOST_JOURNALS = 100  # that are read for a reason
 _INTERVAL_S = 1.0  # flush interval of recorders that do not say it
-_EVERYTHING = np.array([[BEGIN, END]], np.int64)
 
 
 def completeness_of(
@@ -184,7 +183,7 @@ def _losses_in(
 
 
 def _asked(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    asked = _EVERYTHING if windows is None else windows
+    asked = np.array([[BEGIN, END]], np.int64) if windows is None else windows
     if bounds is not None:
         asked = np.clip(asked, *bounds)
     return asked[asked[:, 1] > asked[:, 0]]

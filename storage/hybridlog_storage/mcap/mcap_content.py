@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch
 from hybridlog_storage.segments.compression import decompress_pieces, is_implausible
 
@@ -39,15 +40,13 @@ _NUMBER = struct.Struct("<H")
 _NUMBERS = struct.Struct("<HH")
 INDEX_PLACE = struct.Struct("<HQ")  # an entry of that map
 
-MESSAGE_HEAD = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
+MESSAGE_HEAD = RowType(
+    ("opcode", "u1"),
+    ("length", "<u8"),
+    ("channel", "<u2"),
+    ("sequence", "<u4"),
+    ("log_time", "<u8"),
+    ("publish_time", "<u8"),
 )
 """A message record up to its payload: 31 bytes."""
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from hybridlog_storage.checksum import crc32, crc32_combine
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.compression import decompress
@@ -26,35 +27,31 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Batch, Buffer
 
-CHUNK: Final = np.dtype(
-    [
-        ("offset", "<u8"),
-        ("length", "<u8"),
-        ("trailer", "<u8"),
-        ("crc", "<u4"),
-        ("trailer_crc", "<u4"),
-        ("first", "<i8"),
-        ("last", "<i8"),
-        ("parts", "<u4"),
-    ]
+CHUNK: Final = RowType(
+    ("offset", "<u8"),
+    ("length", "<u8"),
+    ("trailer", "<u8"),
+    ("crc", "<u4"),
+    ("trailer_crc", "<u4"),
+    ("first", "<i8"),
+    ("last", "<i8"),
+    ("parts", "<u4"),
 )
 """A chunk: offset and bytes of its record, bytes of the message indexes and arrival record
 behind it, CRC-32 of the record and of the part behind it, first and last log time in ns,
 and its number of rows in `parts`."""
-PART: Final = np.dtype(
-    [
-        ("channel", "<u4"),
-        ("messages", "<u4"),
-        ("payload_bytes", "<u8"),
-        ("first", "<i8"),
-        ("last", "<i8"),
-        ("first_publish", "<i8"),
-        ("last_publish", "<i8"),
-    ]
+PART: Final = RowType(
+    ("channel", "<u4"),
+    ("messages", "<u4"),
+    ("payload_bytes", "<u8"),
+    ("first", "<i8"),
+    ("last", "<i8"),
+    ("first_publish", "<i8"),
+    ("last_publish", "<i8"),
 )
 """The messages of one channel in one chunk: number, bytes of their payloads, first and
 last log time, first and last publish time, times in ns."""
-OTHER: Final = np.dtype([("offset", "<u8"), ("length", "<u8"), ("crc", "<u4")])
+OTHER: Final = RowType(("offset", "<u8"), ("length", "<u8"), ("crc", "<u4"))
 """A stretch of the file outside of chunks: its start, its bytes, its CRC-32."""
 
 _HEAD = struct.Struct("<III")  # rows of chunks, parts and others

@@ -27,6 +27,7 @@ from mcap.records import Schema as SchemaRecord
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.copying import windows
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.lazy import RowType
 from hybridlog_storage.mcap.mcap_content import (
     CHUNK_INDEX_HEAD,
     INDEX_PLACE,
@@ -81,7 +82,7 @@ INDEX_HEAD: Final = struct.Struct("<BQHI")
 PROOF: Final = struct.Struct("<QQIIIII")
 """Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
 
-_INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
 _MAX_ARRIVALS = 1 << 27
 _per_thread = threading.local()
 
