@@ -56,10 +56,10 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.forks import begins_anew
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader, place_of
+from hybridlog_storage.threads import begins_anew
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:

@@ -932,7 +932,7 @@ class Store:
             AlreadyRecordedError: Its content is in the store already.
         """
         from hybridlog.formats.detect import open_source
-        from hybridlog.formats.fingerprint import fingerprint
+        from hybridlog.formats.reading import fingerprint
         from hybridlog.record.recorder import RecordOptions, record
 
         with open_source(Path(log)) if isinstance(log, str | Path) else log as source:
@@ -1344,7 +1344,7 @@ class Store:
         Raises:
             StoreError: it is being written.
         """
-        from hybridlog.maintenance import removal
+        from hybridlog.maintenance import edit
 
         if recording not in self.repairs.copies:
             self.session.catch_up()
@@ -1352,10 +1352,10 @@ class Store:
         try:
             if recording in self.repairs.copies:
                 original = self.entry(self.repairs.copies[recording])
-                removal.remove_copy(self.directory, recording, original.id)
+                edit.remove_copy(self.directory, recording, original.id)
             else:
                 (entry,) = self.select([recording])
-                removal.remove(self.directory, self.catalog, self.session.writable_database, entry)
+                edit.remove(self.directory, self.catalog, self.session.writable_database, entry)
         except ConnectionLostError:
             self.refresh()
             self.connect()  # a new connection removes the rest

@@ -325,7 +325,7 @@ FORMAT_2 = [
         ),
     ),
     *_of(
-        "hybridlog/maintenance/removal.py",
+        "hybridlog/maintenance/edit.py",
         (
             "documents-of-a-removed-recording-stay",
             "    forget(database, entry.key, indexed)\n",
@@ -1002,11 +1002,13 @@ SILENT = [
         ),
     ),
     *_of(
-        "hybridlog/maintenance/removal.py",
+        "hybridlog/maintenance/edit.py",
         (
             "the-recording-that-has-the-label-is-removed",
-            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n",
-            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n"
+            "        if isinstance(directory, RemoteDirectory):\n",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n"
+            "        if isinstance(directory, RemoteDirectory):\n",
             f"{CHOSEN}[rm-3]",
         ),
         (

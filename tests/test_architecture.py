@@ -76,7 +76,7 @@ ALLOWED = {
         "hybridlog.schema.arrow_objects",
         "hybridlog.schema.arrow_protobuf",
         "hybridlog.schema.arrow_types",
-        "hybridlog.schema.stamps",
+        "hybridlog.schema.codec",
         "hybridlog.query",
         "hybridlog.sql",
         "hybridlog.tf",

@@ -23,8 +23,8 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
+from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
-from hybridlog.schema.stamps import stamp_array
 from hybridlog.wording import counted
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.times import span_of

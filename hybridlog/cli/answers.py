@@ -243,7 +243,7 @@ class Listing(Tabular, AsJson):
             spare: Columns that may be left out, see `output.fitted`.
             titles: Number of cells in the title of a block, see `output.print_rows`.
         """
-        from hybridlog.schema.plain import without_nan
+        from hybridlog.schema.text import without_nan
 
         to, limited = self.to, islice(rows, self.limit)
         if to is not None:

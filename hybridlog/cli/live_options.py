@@ -30,7 +30,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         TopicError: A pattern that is malformed.
     """
     from hybridlog.contract.contract import Contract
-    from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
+    from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.query.topics import matcher

@@ -154,7 +154,7 @@ class LogRecorder:
     def _pieces(self, store: Store, log: Log) -> Iterator[Log]:
         """The log; the missing parts of it if others were recorded on their own."""
         from hybridlog.formats.find import Log
-        from hybridlog.formats.fingerprint import fingerprint
+        from hybridlog.formats.reading import fingerprint
 
         if self._choices.again or len(log.files) == 1:
             yield log

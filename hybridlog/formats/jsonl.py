@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.formats.writing import FileWriter, Line, Sink, Target
-from hybridlog.schema.plain import without_nan
+from hybridlog.schema.text import without_nan
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

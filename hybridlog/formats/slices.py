@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hybridlog_storage.disk.user_directories import user_directory
+from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import SegmentError, UsageError
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from hybridlog.frames.names import is_summary, own_columns, summary_of, tag_colu
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
+from hybridlog.schema.codec import stamp_array
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.reduced_codec import ExpiredFields, without_lossy
-from hybridlog.schema.stamps import stamp_array
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.user_directories import user_directory
+from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import EMBEDDED, NONE, without_password
 

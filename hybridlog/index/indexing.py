@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import Codec
+from hybridlog.schema.codec import Codec, stamps_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.index_bodies import index_bodies
-from hybridlog.schema.stamps import stamps_of
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed

@@ -16,9 +16,9 @@ from dataclasses import asdict, dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.live.budget import default_budget, resident_bytes
+from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.control_server import ControlServer
-from hybridlog.live.machine_clock import MachineClock
+from hybridlog.live.memory import default_budget, resident_bytes
 from hybridlog.live.policy import (
     PAYLOAD_STRIDE,
     SMALL_BYTES,
@@ -35,12 +35,10 @@ from hybridlog.live.recording import (
     LiveRecording,
     indexed_within_s,
 )
-from hybridlog.live.retention import RetentionThread
 from hybridlog.live.silence import RULE, Commands, SilenceWatch
-from hybridlog.live.simulated_time import CLOCK, SimulatedTime
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
-from hybridlog.maintenance.keep import Own
+from hybridlog.maintenance.keep import Own, RetentionThread
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause
 from hybridlog.record.marks import CLOCK_SET, CONTRACT, mark_channel, mark_payload

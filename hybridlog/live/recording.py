@@ -17,15 +17,13 @@ from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
+from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
 from hybridlog.index.index_writer import INTERVAL_S
-from hybridlog.live.budget import MIN_USER_BUDGET, default_budget
-from hybridlog.live.fair_semaphore import FairSemaphore
-from hybridlog.live.frozen_objects import frozen_objects
-from hybridlog.live.memory_reservation import MemoryReservation
+from hybridlog.live.memory import MIN_USER_BUDGET, MemoryReservation, default_budget, frozen_objects
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Backpressure, Capture
 from hybridlog.record.losses import Cause, Ledger
@@ -45,6 +43,41 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
+
+
+class FairSemaphore:
+    """Admits a limited number of threads, in the order in which they arrive.
+
+    Python's own locks let later threads overtake a waiting one any number of times.
+
+    Args:
+        limit: Threads that are admitted at the same time.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._lock = Lock()
+        self._free = limit
+        self._waiting: deque[Lock] = deque()
+
+    def __enter__(self) -> None:
+        """Wait for admission."""
+        with self._lock:
+            if self._free:
+                self._free -= 1
+                return
+            admitted = Lock()
+            admitted.acquire()
+            self._waiting.append(admitted)
+        admitted.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        """Admit the thread that has waited longest."""
+        with self._lock:
+            if self._waiting:
+                self._waiting.popleft().release()
+            else:
+                self._free += 1
+
 
 _LARGE = 1 << 17  # bytes from which a payload is copied into its chunk at once
 _MAX_LAID = 8 << 20  # bytes of one batch: after it, writers that wait for room are notified

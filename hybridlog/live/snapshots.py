@@ -34,7 +34,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.times import BEGIN
 
 if TYPE_CHECKING:
-    from hybridlog.live.machine_clock import MachineClock
+    from hybridlog.live.clocks import MachineClock
     from hybridlog.live.recording import LiveRecording
     from hybridlog.query.predicate.tree import Predicate, Test
     from hybridlog.record.recorder import RecordReport

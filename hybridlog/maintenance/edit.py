@@ -1,4 +1,4 @@
-"""Edits recordings that have ended: name, tags, notes and marks."""
+"""Edits recordings that have ended: name, tags, notes and marks; and removes them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from hybridlog.entries import (
     sealed_event,
     take_inventory,
 )
-from hybridlog.maintenance.decoding import decode_again
-from hybridlog.maintenance.opening import finish_renaming, put_entry, remove_marks
+from hybridlog.maintenance import tables
+from hybridlog.maintenance.index import decode_again, forget
+from hybridlog.maintenance.opening import announce_removal, finish_renaming, put_entry, remove_marks
 from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog.record.marks import mark_channel, mark_payload
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import StoreError, TimeError, UsageError
+from hybridlog_storage.errors import StoreError, TimeError, TopicError, UsageError
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.messages import EXPIRED_IDS, Batch, Channel
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.chunk import pack
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.segments.chunk import PackedChunk
     from hybridlog_storage.segments.segment_file import Sealed
 
@@ -236,7 +240,7 @@ def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> in
             messages = np.add.reduceat(summary.table.parts["messages"], starts)
             for place, count in zip(summary.chunks, messages.tolist(), strict=True):
                 following = max(following, int(reader.read_arrivals(place, count).max()) + 1)
-        if following >= int(cast(int, summary.recording.get("next_seq", 0))):
+        if following >= int(cast("int", summary.recording.get("next_seq", 0))):
             break
     # Numbers of a lost segment are not reused: it may be restored from a copy.
     return following + sum(sealed.messages for sealed in inventory.lost)
@@ -257,3 +261,67 @@ def _chunk(channel_id: int, moment: int, payload: bytes, seq: int) -> PackedChun
     builder = ChunkBuilder(1 << 10)
     builder.append(batch, one * seq)
     return pack(Compressor("none"), *builder.take())
+
+
+def remove(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    database: Database | None,
+    entry: RecordingEntry,
+) -> None:
+    """Delete a recording.
+
+    The journal announces it first. Then the directory gets a hidden name, and the recording
+    is gone; the next opening removes remaining files. In a bucket it is listed no more, and its
+    objects stay for those who read them.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        database: The index; None if it is unavailable: the next connection clears it.
+        entry: The recording.
+
+    Raises:
+        StoreError: It is being written, or cannot be removed.
+        TopicError: It is gone.
+        DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
+    """
+    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+        if isinstance(directory, RemoteDirectory):
+            directory.drop(label)
+            catalog.remove(entry.id)
+            return
+        announce_removal(directory, label)
+        tables.announce_removal(directory, entry.id)
+        hidden = directory.hide(label)
+        try:
+            catalog.remove(entry.id)
+            with suppress(OSError):  # the next connection removes them
+                tables.remove(directory, entry.id, {c.type for c in entry.channels})
+            if database is not None:
+                _clear(database, entry)
+        finally:
+            # On a full disk, the space of these files is needed first.
+            directory.sweep(hidden)
+
+
+def _clear(database: Database, entry: RecordingEntry) -> None:
+    """Remove a recording from the index."""
+    state = IndexState(database)
+    indexed = state.one(entry.key)
+    if indexed is not None:
+        state.put(entry, "removing", turn=indexed.turn + 1)
+    forget(database, entry.key, indexed)
+
+
+def remove_copy(directory: StoreDirectory, label: str, recording: str) -> None:
+    """Delete a directory with a copy of a recording; the index stays.
+
+    Raises:
+        StoreError: It is being written, or cannot be removed.
+        TopicError: It is no copy of the recording any more.
+    """
+    with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
+        if now != label or directory.labels_of(recording) == [label]:
+            raise TopicError(f"{label!r} is no longer a copy of another recording.")
+        directory.sweep(directory.hide(label))

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import walk
 from hybridlog.columns.table_writer import TableWriter
+from hybridlog.entries import take_inventory
+from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.decoding import decode_again
 from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import Progress, RepairReport, reporter
-from hybridlog_storage.catalog import decoded_rows
+from hybridlog_storage.catalog import decoded_rows, stamps_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -28,12 +29,19 @@ from hybridlog_storage.mongo.index_state import NOTHING, Indexed, IndexState, Th
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from hybridlog.entries import Inventory
+    from hybridlog.maintenance.report import Progress
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
+
 
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
@@ -553,3 +561,53 @@ def mirror(catalog: Catalog, database: Database, recording: str) -> None:
     known = catalog.recording(recording)
     if known is not None:
         state.show(known[1])
+
+
+def decode_again(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    progress: Progress | None = None,
+) -> RecordingEntry:
+    """Decode all segments without decoding results in the catalog.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entry: The recording, locked by this process for writing.
+        progress: Called after each chunk.
+
+    Returns:
+        The recording's complete entry.
+
+    Raises:
+        SegmentError: A segment cannot be opened.
+    """
+    inventory = take_inventory(directory, entry.label)
+    found = _decoded(directory, catalog, entry, inventory, progress)
+    catalog.put_stamps(entry.id, found)
+    return put_entry(directory, catalog, entry.label)
+
+
+def _decoded(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    entry: RecordingEntry,
+    inventory: Inventory,
+    progress: Progress | None,
+) -> Iterator[tuple[int, str, NDArray[Any]]]:
+    indexer = ChunkIndexer(entry.id)
+    missing = {
+        number: summary
+        for number, summary in inventory.summaries.items()
+        if catalog.stamps(entry, number, summary.table) is None
+    }
+    report = reporter(progress, entry.label, sum(summary.size for summary in missing.values()))
+    for segment in walk(directory.recording(entry.label), missing, report=report, known=missing):
+        summary = segment.summary
+        stats: dict[int, Mapping[int, ChannelStats]] = {}
+        for place, chunk in segment.chunks():
+            if not isinstance(chunk, SegmentError):  # an unreadable chunk has no results
+                _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)
+                stats[place.number] = of_chunk.stats
+        yield segment.number, summary.digest, stamps_of(summary.table, stats)

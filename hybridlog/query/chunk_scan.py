@@ -358,7 +358,7 @@ class ChunkScan:
         elif self._plan.clock == "publish":
             times = batch.publish_time
         else:
-            from hybridlog.schema.stamps import stamps_of
+            from hybridlog.schema.codec import stamps_of
 
             times = np.zeros(len(batch), np.int64)
             has_stamp = np.zeros(len(batch), np.bool_)

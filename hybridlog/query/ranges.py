@@ -231,7 +231,7 @@ class RangeResolver:
             stats = self._session.chunk_stats(recording, chunk)[number]
             known = _known_ends(stats, is_publish=is_publish)
             if not known:
-                from hybridlog.schema.stamps import stamps_of
+                from hybridlog.schema.codec import stamps_of
 
                 reader = self._session.segment(recording.id, chunk.segment)
                 batch = reader.read_chunk(chunk.place).batch

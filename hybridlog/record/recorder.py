@@ -38,8 +38,7 @@ from hybridlog_storage.times import placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.formats.fingerprint import Fingerprint
-    from hybridlog.formats.reading import Damage, Source
+    from hybridlog.formats.reading import Damage, Fingerprint, Source
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.catalog import Catalog

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.schema.column import Column, Records, Scalars, Strings
-from hybridlog.schema.utf8 import repaired
+from hybridlog.schema.column import Column, Records, Scalars, Strings, repaired
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -14,8 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import DURATION, TIME, lists, structs
-from hybridlog.schema.plain import MAX_DEPTH, json_text
-from hybridlog.schema.utf8 import repaired_text
+from hybridlog.schema.text import MAX_DEPTH, json_text, repaired_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

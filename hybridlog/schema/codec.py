@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 import numpy as np
 
-from hybridlog.schema.column import Records, row_of, top_level_names
+from hybridlog.schema.column import STAMP, Records, row_of, top_level_names
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
     from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.objects import Objects
-    from hybridlog_storage.messages import Buffer
-
+    from hybridlog_storage.messages import Batch, Buffer
 
 NO_ROWS: NDArray[np.intp] = np.empty(0, np.intp)
 
@@ -238,3 +237,34 @@ def plain_message(
         PayloadError: The payload does not fit its definition.
     """
     return one_message(codec, payload).plain(names, whole=False)[0] if codec.indexed else {}
+
+
+def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Decode the header stamps of messages of one channel.
+
+    Args:
+        codec: The codec of the channel.
+        batch: The messages.
+
+    Returns:
+        Rows of the messages that have a stamp, and the stamps, ns.
+    """
+    decoded = codec.columns(batch.buffer, batch.offset, batch.length, {STAMP})
+    found = stamp_array(decoded.arrow())
+    if found is None:
+        return np.empty(0, np.intp), np.empty(0, np.int64)
+    there = found.is_valid().to_numpy(zero_copy_only=False)
+    stamps = found.drop_null().view("int64").to_numpy()
+    return decoded.rows[there], stamps
+
+
+def stamp_array(records: pa.StructArray) -> pa.Array[Any] | None:
+    """The header stamps of decoded messages, timestamp[ns]; None when they have none."""
+    import pyarrow as pa
+
+    found: pa.Array[Any] = records
+    for name in STAMP.split("."):
+        if not pa.types.is_struct(found.type) or found.type.get_field_index(name) < 0:
+            return None
+        found = found.flatten()[found.type.get_field_index(name)]
+    return found if pa.types.is_timestamp(found.type) else None

@@ -1,19 +1,30 @@
-"""Finds the codec of a channel."""
+"""Finds the codec of a channel; the codec of JSON, which has no definition."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, cast
 
-from hybridlog.schema.codec import Codec, OpaqueCodec
+from hybridlog.schema.codec import Codec, OpaqueCodec, decode_each
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.definition_text import canonical
+from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import State, encoding_of, state_of
-from hybridlog_storage.errors import DefinitionError
+from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Channel, Schema
+    from collections.abc import Collection
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hybridlog.schema.codec import Decoded
+    from hybridlog.schema.definition import FieldPath
+    from hybridlog.schema.objects import Plain
+    from hybridlog_storage.messages import Buffer, Channel, Schema
+
 
 _MAX_NAME = 1000  # bytes
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
@@ -49,8 +60,6 @@ def _codec(encoding: str, schema: Schema | None) -> Codec:
 
 def _made(encoding: str, schema: Schema | None) -> Codec:
     if encoding == "json":
-        from hybridlog.schema.json_codec import JsonCodec
-
         return JsonCodec()
     if state_of(encoding) is State.REDUCED:
         from hybridlog.schema.reduced_codec import ReducedCodec
@@ -82,3 +91,35 @@ def _defined(encoding: str, schema: Schema | None) -> Codec:
         f"{schema.name}: encoding {encoding!r} with a definition in {schema.encoding!r} "
         "is stored and fetched, not indexed"
     )
+
+
+class JsonCodec:
+    """Messages in JSON. A JSON schema is ignored."""
+
+    indexed = True
+    reason: str | None = None
+
+    def paths(self) -> list[FieldPath]:
+        """No fields: a message may have any content."""
+        return []
+
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None = None,
+    ) -> Decoded:
+        """Decode messages; see `Codec.columns`."""
+        return decode_each(self.decode, partial(Objects, fields=fields), buffer, offset, length)
+
+    def decode(self, payload: Buffer) -> Plain:
+        """Decode the JSON text into Python objects.
+
+        Raises:
+            PayloadError: the payload is not JSON.
+        """
+        try:
+            return cast("Plain", json.loads(str(memoryview(payload), "utf-8-sig")))
+        except (ValueError, RecursionError) as error:
+            raise PayloadError(f"the payload is not JSON: {error}") from error

@@ -17,7 +17,7 @@ from bson.int64 import Int64
 
 from hybridlog.schema.column import RESERVED, top_level_names
 from hybridlog.schema.summary import nearest_double, summary_of
-from hybridlog.schema.utf8 import repaired_text
+from hybridlog.schema.text import repaired_text
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:

@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from bson.int64 import Int64
 
-from hybridlog.schema.codec import decode_each
-from hybridlog.schema.column import top_level_names
-from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
-from hybridlog.schema.objects import Duration, Nanoseconds, Objects, top
-from hybridlog.schema.protobuf_fields import (
+from hybridlog.schema.arrow_protobuf import (
     TIMES,
     TYPES,
     is_map,
@@ -22,6 +18,10 @@ from hybridlog.schema.protobuf_fields import (
     map_key,
     nanoseconds_of,
 )
+from hybridlog.schema.codec import decode_each
+from hybridlog.schema.column import top_level_names
+from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
+from hybridlog.schema.objects import Duration, Nanoseconds, Objects, top
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:

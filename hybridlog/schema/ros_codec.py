@@ -23,7 +23,7 @@ from hybridlog.schema.definition import (
 from hybridlog.schema.wire import WireReader
 from hybridlog.schema.wire_scan import MisfitError
 from hybridlog_storage.errors import DefinitionError, PayloadError
-from hybridlog_storage.forks import taken_by_forks
+from hybridlog_storage.threads import taken_by_forks
 
 if TYPE_CHECKING:
     from collections.abc import Collection

@@ -25,7 +25,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.forks import begins_anew
+from hybridlog_storage.threads import begins_anew
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -19,7 +19,7 @@ from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of
-from hybridlog.schema.plain import without_nan
+from hybridlog.schema.text import without_nan
 from hybridlog.view.context import SQL_MEMORY
 from hybridlog_storage.errors import PayloadError, TimeError, TopicError, UsageError
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.forks import taken_by_forks
+from hybridlog_storage.threads import taken_by_forks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

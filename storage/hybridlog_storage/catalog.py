@@ -55,7 +55,6 @@ from hybridlog_storage.errors import (
     StoreError,
     exhausted,
 )
-from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.ordering import run_starts
@@ -70,6 +69,7 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
+from hybridlog_storage.threads import taken_by_forks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -452,7 +452,6 @@ def _serve() -> NoReturn:
     import hybridlog.maintenance.copying
     import hybridlog.maintenance.edit
     import hybridlog.maintenance.index
-    import hybridlog.maintenance.removal
     import hybridlog.maintenance.repair
     import hybridlog.record.recorder
     import hybridlog.store

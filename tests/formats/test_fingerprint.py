@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.formats import fingerprint as module
-from hybridlog.formats.fingerprint import SAMPLE_BYTES, SAMPLES, WHOLE
+from hybridlog.formats import reading as module
+from hybridlog.formats.reading import SAMPLE_BYTES, SAMPLES, WHOLE
 from hybridlog_storage.errors import SourceError
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.live import budget
+from hybridlog.live import memory as module
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.live.recording import LiveOptions
 
@@ -26,14 +26,14 @@ def groups(root: Path, name: str, limits: dict[str, str]) -> tuple[Path, Path]:
 
 def test_a_limit_counts_wherever_it_is_set(tmp_path: Path) -> None:
     limits = {"a/b": "max\n", "a": f"{1 << 20}\n", "other": "7\n"}
-    assert budget.memory_bytes(*groups(tmp_path, "/a/b", limits)) == 1 << 20
+    assert module.memory_bytes(*groups(tmp_path, "/a/b", limits)) == 1 << 20
 
 
 def test_no_limit_is_the_machine(tmp_path: Path) -> None:
-    assert budget.memory_bytes(*groups(tmp_path, "/a", {"a": "max\n"})) == MACHINE
-    assert budget.memory_bytes(*groups(tmp_path, "/gone", {})) == MACHINE
-    assert budget.memory_bytes(*groups(tmp_path, "/../..", {})) == MACHINE
-    assert budget.memory_bytes(tmp_path / "none", tmp_path / "nowhere") == MACHINE
+    assert module.memory_bytes(*groups(tmp_path, "/a", {"a": "max\n"})) == MACHINE
+    assert module.memory_bytes(*groups(tmp_path, "/gone", {})) == MACHINE
+    assert module.memory_bytes(*groups(tmp_path, "/../..", {})) == MACHINE
+    assert module.memory_bytes(tmp_path / "none", tmp_path / "nowhere") == MACHINE
 
 
 @pytest.mark.parametrize(
@@ -41,11 +41,11 @@ def test_no_limit_is_the_machine(tmp_path: Path) -> None:
     [(512 << 20, 64 << 20), (8 << 30, 512 << 20), (24 << 30, 1536 << 20), (1 << 40, 2 << 30)],
 )
 def test_a_sixteenth(monkeypatch: pytest.MonkeyPatch, memory: int, want: int) -> None:
-    monkeypatch.setattr(budget, "memory_bytes", lambda: memory)
-    budget.default_budget.cache_clear()
+    monkeypatch.setattr(module, "memory_bytes", lambda: memory)
+    module.default_budget.cache_clear()
     try:
-        assert budget.default_budget() == want
+        assert module.default_budget() == want
         assert LiveOptions().budget_bytes == RecorderOptions().budget_bytes == want
     finally:
         monkeypatch.undo()
-        budget.default_budget.cache_clear()
+        module.default_budget.cache_clear()

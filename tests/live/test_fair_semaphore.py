@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from hybridlog.live.fair_semaphore import FairSemaphore
+from hybridlog.live.recording import FairSemaphore
 from tests.test_faults import wait_for
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live import recording
-from hybridlog.live.frozen_objects import FrozenObjects
+from hybridlog.live.memory import FrozenObjects
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.contract.contract import Contract, TopicRules
-from hybridlog.live.machine_clock import MachineClock
+from hybridlog.live.clocks import MachineClock
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.snapshots import SnapshotOptions

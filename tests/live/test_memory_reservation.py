@@ -11,8 +11,8 @@ from contextlib import closing
 import pytest
 
 import hybridlog as hl
-from hybridlog.live import memory_reservation as module
-from hybridlog.live.memory_reservation import MemoryReservation
+from hybridlog.live import memory as module
+from hybridlog.live.memory import MemoryReservation
 from hybridlog_storage import buffers as pool_module
 from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE

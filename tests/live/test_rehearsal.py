@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.live import rehearsal
-from hybridlog.live.machine_clock import MachineClock
+from hybridlog.live.clocks import MachineClock
 from hybridlog.live.rehearsal import snapshot_spans
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger
 from hybridlog.record.losses import Ledger

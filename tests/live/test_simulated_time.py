@@ -11,9 +11,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live import recorder as recorder_module
+from hybridlog.live.clocks import clock_time
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.simulated_time import clock_time
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause

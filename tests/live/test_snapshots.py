@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.live.clocks import MachineClock
 from hybridlog.live.control_server import request
-from hybridlog.live.machine_clock import MachineClock
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.ring import BufferedMessage, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger, _happened, _Watch

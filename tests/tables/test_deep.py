@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.schema.plain import MAX_DEPTH
+from hybridlog.schema.text import MAX_DEPTH
 from tests.query.test_engines import WAYS, only
 
 KINDS = {"lists": ("[", "]"), "objects": ('{"a":', "}"), "both": ('[{"a":', "}]")}

@@ -28,6 +28,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, Protocol, cast
 
+from hybridlog_storage.errors import StoreError
+
 IN_STORE: Final = 1
 """Depth of a file in the store's own folder."""
 IN_FOLDER: Final = 2
@@ -472,3 +474,25 @@ def _split(path: Path, depth: int) -> tuple[Path, tuple[str, ...]]:
     if depth <= 0:
         return path, ()
     return Path(*path.parts[:-depth]), path.parts[-depth:]
+
+
+def user_directory(variable: str, below_home: str, purpose: str) -> Path:
+    """The directory of hybridlog in one of the user's base directories; it need not exist.
+
+    Args:
+        variable: Environment variable with an absolute path; a relative one does not count.
+        below_home: Path below the home directory that counts without it.
+        purpose: What is kept there, for the error.
+
+    Raises:
+        StoreError: This user has no home directory.
+    """
+    named = os.environ.get(variable, "")
+    if os.path.isabs(named):  # noqa: PTH117 - a relative one does not count
+        return Path(named, "hybridlog")
+    try:
+        return Path.home() / below_home / "hybridlog"
+    except RuntimeError as error:
+        raise StoreError(
+            f"This user has no home directory to keep {purpose} in: set {variable}."
+        ) from error

@@ -21,10 +21,10 @@ from typing import Final
 from weakref import WeakValueDictionary
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk.user_directories import user_directory
+from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import ObjectChangedError, ResourceError
-from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.remote.bucket import Bucket, Object, joined_ranges
+from hybridlog_storage.threads import taken_by_forks
 
 MAX_CACHED: Final = 16 << 30
 """Bytes that the cached blocks of a user may take."""

@@ -31,7 +31,6 @@ from hybridlog_storage.errors import (
     ObjectExistsError,
     StoreError,
 )
-from hybridlog_storage.forks import taken_by_forks
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
@@ -48,6 +47,7 @@ from hybridlog_storage.remote.lists import (
 )
 from hybridlog_storage.settings import EXPIRED, NONE, StoreSettings, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
+from hybridlog_storage.threads import taken_by_forks
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for a newer list, unless this process changes something."""

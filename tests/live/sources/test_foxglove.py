@@ -40,9 +40,9 @@ from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 from websockets.uri import parse_uri
 
-from hybridlog.live.sources.foxglove import client as foxglove_client
 from hybridlog.live.sources.foxglove import connection as foxglove_connection
 from hybridlog.live.sources.foxglove import handshake as foxglove_handshake
+from hybridlog.live.sources.foxglove import session as foxglove_client
 
 # A server that sends whatever bytes a test wants.
 

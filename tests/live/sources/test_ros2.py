@@ -11,13 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.base import Cause, one_line
 from hybridlog.live.sources.ros2 import process as ros2_process
 from hybridlog.live.sources.ros2 import source as ros2
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.live.sources.ros2.process import PYTHON_VARIABLE, candidates, environment_for
 from hybridlog.live.sources.ros2.source import Ros2Source
-from hybridlog.live.sources.text import one_line
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.live.sources.heard import must_return
 from tests.live.sources.ros2_peers import Memory, fake_child, is_alive, starts, wait_until

@@ -23,7 +23,6 @@ from hybridlog.live.sources.ros2.child.definitions import (
 )
 from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Offer
-from hybridlog.live.sources.ros2.child.middleware_losses import MiddlewareLossCounter
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
 from hybridlog.live.sources.ros2.child.publication_gaps import (
@@ -31,6 +30,7 @@ from hybridlog.live.sources.ros2.child.publication_gaps import (
     RECOVERED_AFTER,
     SUSPICIOUS_NS,
     Loss,
+    MiddlewareLossCounter,
     PublicationGapDetector,
 )
 from hybridlog.live.sources.ros2.child.qos import (

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol, TypeGuard
 from urllib.parse import urlsplit
 
-from hybridlog.live.sources.text import one_line
+from hybridlog.live.sources.base import one_line
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 

@@ -74,7 +74,7 @@ class FoxgloveSource(LiveSource):
         """
         address = parse_address(self._url)
         try:
-            from hybridlog.live.sources.foxglove.client import Client
+            from hybridlog.live.sources.foxglove.session import Client
         except ImportError as error:
             raise MissingDependencyError(
                 "recording from Foxglove needs websockets: pip install 'hybridlog[foxglove]'"

@@ -10,7 +10,7 @@ import threading
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
-from hybridlog.live.sources.text import one_line
+from hybridlog.live.sources.base import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

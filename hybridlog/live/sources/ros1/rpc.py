@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
+from hybridlog.live.sources.base import one_line
 from hybridlog.live.sources.ros1.network import (
     PATIENCE_S,
     Endpoint,
@@ -24,7 +25,6 @@ from hybridlog.live.sources.ros1.network import (
     endpoint_of,
     reason_of,
 )
-from hybridlog.live.sources.text import one_line
 
 if TYPE_CHECKING:
     import socket

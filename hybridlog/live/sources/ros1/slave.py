@@ -6,8 +6,8 @@ import os
 import socket
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.live.sources.base import one_line
 from hybridlog.live.sources.ros1.network import Endpoint, reason_of
-from hybridlog.live.sources.text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -12,16 +12,13 @@ import secrets
 import threading
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import LiveSource
-from hybridlog.live.sources.ros1.error_aggregator import ErrorAggregator
-from hybridlog.live.sources.ros1.graph import Graph
-from hybridlog.live.sources.ros1.master import Master
+from hybridlog.live.sources.base import LiveSource, one_line
+from hybridlog.live.sources.ros1.graph import Graph, Master
 from hybridlog.live.sources.ros1.network import Endpoint, Network, PeerError, endpoint_of
 from hybridlog.live.sources.ros1.reader import Reader
 from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.slave import listen, methods, uri_of
-from hybridlog.live.sources.ros1.subscription import Context
-from hybridlog.live.sources.text import one_line
+from hybridlog.live.sources.ros1.subscription import Context, ErrorAggregator
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -16,14 +16,13 @@ import termios
 import time
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import Cause
-from hybridlog.live.sources.ros1.wire import u32
+from hybridlog.live.sources.base import Cause, one_line
+from hybridlog.live.sources.ros1.handshake import u32
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
     SequenceGapDetector,
     has_sequence_numbers,
 )
-from hybridlog.live.sources.text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

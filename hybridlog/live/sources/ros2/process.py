@@ -20,6 +20,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.live.sources.base import one_line
 from hybridlog.live.sources.ros2.child.wire import (
     EVENT,
     HEADER,
@@ -27,7 +28,6 @@ from hybridlog.live.sources.ros2.child.wire import (
     check_frame,
     parse_object,
 )
-from hybridlog.live.sources.text import one_line
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import time
 from json import dumps
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.base import Cause, one_line
 from hybridlog.live.sources.ros2.child.wire import (
     COUNT,
     ENTRY,
@@ -18,7 +18,6 @@ from hybridlog.live.sources.ros2.child.wire import (
     check_frame,
     parse_object,
 )
-from hybridlog.live.sources.text import one_line
 from hybridlog_storage.messages import Channel, Schema
 
 if TYPE_CHECKING:

@@ -10,12 +10,11 @@ import time
 from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING
 
-from hybridlog.live.sources.base import LiveSource
+from hybridlog.live.sources.base import LiveSource, one_line
 from hybridlog.live.sources.ros2.child.wire import WireError
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.live.sources.ros2.process import ChildError, Process, launch
 from hybridlog.live.sources.ros2.receiver import Receiver, report_outage
-from hybridlog.live.sources.text import one_line
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 
 if TYPE_CHECKING:

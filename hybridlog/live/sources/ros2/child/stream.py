@@ -10,10 +10,10 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.middleware import publisher_id
-from hybridlog.live.sources.ros2.child.middleware_losses import MiddlewareLossCounter
 from hybridlog.live.sources.ros2.child.publication_gaps import (
     MAX_PUBLISHERS,
     Loss,
+    MiddlewareLossCounter,
     PublicationGapDetector,
 )
 from hybridlog.live.sources.ros2.child.qos import RELIABLE

@@ -1,12 +1,10 @@
-"""Plain Python values as JSON text."""
+"""Plain Python values as JSON text, and text that UTF-8 can encode."""
 
 from __future__ import annotations
 
 import json
 import math
 from typing import Any
-
-from hybridlog.schema.utf8 import repaired_text
 
 MAX_DEPTH = 32
 """Values with deeper nesting are JSON text in columns.
@@ -40,3 +38,12 @@ def without_nan(value: Any) -> Any:
     elif isinstance(value, list):
         return [without_nan(item) for item in value]
     return value
+
+
+def repaired_text(text: str) -> str:
+    """The text, with U+FFFD for unpaired surrogates, which UTF-8 cannot encode."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return text.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
+    return text
