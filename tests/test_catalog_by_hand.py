@@ -141,18 +141,16 @@ def test_a_line_that_was_lost_is_made_again(store: Path, kept: Path, want: Told)
     for number in range(len(lines)):
         begin = sum(map(len, lines[:number]))
         middle = begin + len(lines[number]) // 2
-        for changed in (
-            content[:begin] + content[begin + len(lines[number]) :],
-            content[:middle] + b"x" + content[middle + 1 :],
-        ):
-            kept.write_bytes(changed)
-            assert tell(store) == want, number
-            if found(store) != findings:
-                # No question has needed it; who reads everything is told, and of the cure.
-                with hl.open(store) as opened:
-                    assert [f.place for f in opened.verify().findings if f.place == "catalog"]
-                    opened.repair()
-                assert found(store) == findings, number
+        without = content[:begin] + content[begin + len(lines[number]) :]
+        altered = content[:middle] + b"x" + content[middle + 1 :]
+        kept.write_bytes(altered if number % 2 else without)
+        assert tell(store) == want, number
+        if found(store) != findings:
+            # No question has needed it; who reads everything is told, and of the cure.
+            with hl.open(store) as opened:
+                assert [f.place for f in opened.verify().findings if f.place == "catalog"]
+                opened.repair()
+            assert found(store) == findings, number
 
 
 @pytest.mark.parametrize("how", ["gone", "empty", "cut", "other file", "directory's journal"])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import functools
 import inspect
 import json
 import math
@@ -34,6 +36,7 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.types import check
 from hybridlog_storage import errors
 from hybridlog_storage.errors import HybridlogError
+from tests.cli.fork_server import ForkServer
 from tests.format_reader import (
     Content,
     Damaged,
@@ -56,6 +59,8 @@ TUTORIAL = DOCS / "tutorial.md"
 """It goes on where the README ends."""
 # A terminal of this many columns.
 COLUMNS = 150
+HEAVY = ("pyarrow.dataset", "duckdb", "matplotlib.pyplot", "PIL.Image", "mcap.reader")
+"""Modules that many commands of the pages import."""
 START_NS = 1_748_937_600_000_000_000
 
 
@@ -190,10 +195,19 @@ def missing_lines(shown: list[str], output: str) -> list[str]:
 # --- running it -----------------------------------------------------------------------
 
 
+@functools.cache
+def forking() -> ForkServer:
+    """Commands of the pages."""
+    server = ForkServer({**os.environ, "LC_ALL": "C.UTF-8"}, *HEAVY)
+    atexit.register(server.close)
+    return server
+
+
 class Shell:
     """Runs commands one by one; what they export and where they go is kept.
 
-    Standard output is a terminal, because that is where people read it.
+    Standard output is a terminal, because that is where people read it. Commands of hybridlog are
+    forked from a process that has imported what they need.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -203,7 +217,8 @@ class Shell:
         hidden = ("HYBRIDLOG_", "COLUMNS", "LINES")
         self._env = {
             **{k: v for k, v in os.environ.items() if not k.startswith(hidden)},
-            "PATH": f"{python}{os.pathsep}{os.environ['PATH']}",
+            "PATH": os.pathsep.join([str(forking().path), python, os.environ["PATH"]]),
+            "LC_ALL": "C.UTF-8",
             "TERM": "xterm",
             "NO_COLOR": "1",
         }

@@ -225,18 +225,18 @@ def test_a_late_key_and_a_late_type(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(answer, "_BLOCK_ROWS", 1)
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("x") as recorder:
-            for n in range(3000):
-                value: Any = n if n < 2990 else {"k": n}
-                message = {"v": value} | ({"late": 1} if n > 2995 else {})
+            for n in range(600):
+                value: Any = n if n < 590 else {"k": n}
+                message = {"v": value} | ({"late": 1} if n > 595 else {})
                 text = json.dumps(message).encode()
                 recorder.write(Channel("/o", "json", None), text, log_time=1 + n)
         query = store.topic("/o")
         for form, read in (("parquet", parquet), ("csv", csv_rows)):
             found = read(query)
-            assert (found.num_rows if form == "parquet" else len(found)) == 3000
+            assert (found.num_rows if form == "parquet" else len(found)) == 600
         values = [json.loads(text) for text in parquet(query)["v"].to_pylist()]
         assert values[0] == 0
-        assert values[-1] == {"k": 2999}
+        assert values[-1] == {"k": 599}
 
 
 # --- ROS --------------------------------------------------------------------------------

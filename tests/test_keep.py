@@ -380,22 +380,31 @@ def cut_pass(path: Path, calls: int | None, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 CUTS = [
-    *(n / 7 for n in range(7)),
+    *(n / 5 for n in range(5)),
     *(pytest.param(n / 100, marks=pytest.mark.exhaustive) for n in range(100)),
 ]
 
 
+@pytest.fixture(scope="module")
+def pinned(tmp_path_factory: pytest.TempPathFactory, recorded: Path) -> tuple[Path, int]:
+    """A store with a pin, and the calls of the system that a pass makes."""
+    base = tmp_path_factory.mktemp("pinned")
+    store = Path(shutil.copytree(recorded, base / "store", copy_function=shutil.copy2))
+    pin("+50s", "9s", store)
+    whole = Path(shutil.copytree(store, base / "whole", copy_function=shutil.copy2))
+    with pytest.MonkeyPatch.context() as patch:
+        return store, cut_pass(whole, None, patch).calls
+
+
 @pytest.mark.parametrize("share", CUTS)
 def test_a_cut_costs_no_pinned_byte_and_no_count(
-    tmp_path: Path, recorded: Path, share: float, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, pinned: tuple[Path, int], share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = Path(shutil.copytree(recorded, tmp_path / "store", copy_function=shutil.copy2))
-    pin("+50s", "9s", store)
-    whole = Path(shutil.copytree(store, tmp_path / "whole", copy_function=shutil.copy2))
-    calls = cut_pass(whole, None, monkeypatch).calls
+    kept, calls = pinned
     assert calls > 100
+    store = Path(shutil.copytree(kept, tmp_path / "store", copy_function=shutil.copy2))
     power = cut_pass(store, 1 + round(share * calls), monkeypatch)
-    for fate in range(3):
+    for fate in range(2):
         found = tmp_path / f"found{fate}"
         power.after_cut(found, random.Random(f"{share}{fate}"))
         for _ in range(2):  # as it was left, and after another pass

@@ -102,16 +102,17 @@ def test_wheel_says_what_it_is(wheel: Path) -> None:
         assert sum(f"'{word}'" in line for line in embedded) == 1, word
 
 
-def test_everything_has_wheels_for_arm(tmp_path: Path) -> None:
-    """The lock file resolves on a robot's computer, without a compiler."""
+@pytest.mark.parametrize("extras", ["", pytest.param("[all]", marks=pytest.mark.exhaustive)])
+def test_what_is_needed_has_wheels_for_arm(extras: str, wheel: Path, tmp_path: Path) -> None:
+    """By the lock file, it is installed on a robot's computer without a compiler."""
     versions = ("2014", "_2_17", "_2_24", "_2_28")
     tags = [f"manylinux{version}_aarch64" for version in versions]
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "pip", "install", "--dry-run", "--no-deps", "--quiet"),
+            *(sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", f"{wheel}{extras}"),
             *("--only-binary=:all:", "--python-version", "3.11", "--target", str(tmp_path)),
             *(word for tag in tags for word in ("--platform", tag)),
-            *("-r", str(ROOT / "requirements.lock")),
+            *("-c", str(ROOT / "requirements.lock")),
         ],
         capture_output=True,
         text=True,

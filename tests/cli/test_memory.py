@@ -15,7 +15,7 @@ from tests.some import in_turn
 
 from .running import run
 
-SIZE = 48 << 20
+SIZE = 16 << 20
 PROGRAM = "from hybridlog.cli.main import main; import sys; sys.exit(main())"
 
 

@@ -311,7 +311,7 @@ def test_an_interruption_at_any_instant_leaves_the_file_or_nothing(
         steps = interrupted(0, write, name, target)
     whole = contents(target)
     outcomes = set()
-    for at in range(1, steps + 1, max(1, steps // 150)):
+    for at in range(1, steps + 1, max(1, steps // 60)):
         place = tmp_path / str(at)
         place.mkdir()
         interrupted(at, write, name, place / "out")

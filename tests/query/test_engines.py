@@ -421,14 +421,14 @@ def check(world: World, question: dict[str, Any]) -> None:
 relaxed = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
 
 
-@settings(max_examples=30, suppress_health_check=relaxed)
+@settings(max_examples=15, suppress_health_check=relaxed)
 @given(question=questions())
 def test_every_engine_answers_as_a_loop_does(world: World, question: dict[str, Any]) -> None:
     check(world, question)
 
 
 @pytest.mark.exhaustive
-@settings(max_examples=3000, suppress_health_check=relaxed)
+@settings(max_examples=1500, suppress_health_check=relaxed)
 @given(question=questions())
 def test_three_thousand_questions(world: World, question: dict[str, Any]) -> None:
     check(world, question)

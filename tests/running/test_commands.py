@@ -101,7 +101,7 @@ def test_while_segments_are_sealed(
     running: Running, one: Asked, tmp_path: Path, seen: list[dict[str, int]]
 ) -> None:
     """A command is of one state: what it sees at its end is what it has answered about."""
-    with running.writing(40, 0.004) as writing:
+    with running.writing(16, 0.004) as writing:
         asked = 0
         while writing.is_alive() or not asked:
             words, out = place_for(one.words, tmp_path / "out")

@@ -317,7 +317,7 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
     return os.waitstatus_to_exitcode(status) == 9
 
 
-@pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("stride", [11, pytest.param(1, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("what", ["make", "make again", "remove"])
 def test_killed_at_each_step(
     few: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str, stride: int
