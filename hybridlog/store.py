@@ -177,10 +177,20 @@ def open_store(
 
 
 @contextmanager
-def _place(to: str | Path, options: CopyOptions, source: StoreDirectory) -> Iterator[Place]:
+def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place]:
     """The place that recordings of a store are copied to."""
     from hybridlog.maintenance.ssh import is_ssh, ssh_place
 
+    source, address = store.directory, address_of(to)
+    if address is not None:
+        from hybridlog.maintenance.bucket_place import BucketPlace
+        from hybridlog_storage.remote.store import RemoteDirectory
+
+        if source.place == address:
+            raise UsageError(f"{address} is this very store: there is nothing to copy.")
+        target = RemoteDirectory.create_in(address)
+        yield BucketPlace(target, store.catalog, store.session.tables)
+        return
     if is_ssh(str(to)):
         with ssh_place(str(to), options.ssh, options.program) as server:
             yield server
@@ -188,7 +198,7 @@ def _place(to: str | Path, options: CopyOptions, source: StoreDirectory) -> Iter
     path = _local(to)
     if not source.is_remote and source.path.resolve() in path.resolve().parents:
         raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
-    with open_store(path, create=True) as store, store.receiving() as place:
+    with open_store(path, create=True) as other, other.receiving() as place:
         yield place
 
 
@@ -1508,10 +1518,7 @@ class Store:
             self.directory.check_writable()
         self.session.catch_up()
         chosen = self._chosen(recordings)
-        address = address_of(to)
-        if address is not None:
-            return self._publish(address, chosen, wanted, progress, found)
-        with _place(to, wanted, self.directory) as place:
+        with _place(to, wanted, self) as place:
 
             def expire(recording: str, digests: Mapping[int, str]) -> None:
                 self._expire(recording, digests, place.name, found, progress)
@@ -1526,40 +1533,6 @@ class Store:
                 report=found,
             )
         return found
-
-    def _publish(
-        self,
-        address: str,
-        chosen: Sequence[RecordingSummary],
-        options: CopyOptions,
-        progress: Progress | None,
-        report: CopyReport,
-    ) -> CopyReport:
-        """Copy recordings into a bucket."""
-        from hybridlog.maintenance.opening import open_catalog
-        from hybridlog.maintenance.publish import publish
-        from hybridlog_storage.remote.store import RemoteDirectory
-
-        if options.only_fields or options.then_expire or options.limit_rate:
-            raise UsageError(
-                "--only-fields, --then-expire and --limit-rate are for directories and servers: "
-                "recordings go into a bucket as a whole."
-            )
-        target = RemoteDirectory.create_in(address)
-        if isinstance(self.directory, RemoteDirectory) and self.directory.source is target.source:
-            raise UsageError(f"{address} is this very store: there is nothing to copy.")
-        own, tables = open_catalog(target), self.session.tables
-        for entry in self.session.entries(chosen):
-            try:
-                label, is_new = publish(
-                    self.directory, self.catalog, entry, target, progress, tables=tables, own=own
-                )
-            except StoreError as error:
-                report.refused[entry.label] = str(error)
-                continue
-            (report.copied if is_new else report.known).append(label)
-            report.bytes_copied += entry.stored_bytes if is_new else 0
-        return report
 
     def _expire(
         self,

@@ -421,8 +421,8 @@ FORMAT_2 = [
         "hybridlog/maintenance/copying.py",
         (
             "an-import-begins-anew",
-            "        if there == file.bytes and place.prove(file):\n",
-            "        if False:\n",
+            "self._bring(sent, file, begun.sizes.get(file.file, 0))",
+            "self._bring(sent, file, 0)",
             f"{IDENTITY}::test_an_import_goes_on_where_it_was_stopped",
         ),
     ),

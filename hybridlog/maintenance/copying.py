@@ -21,7 +21,6 @@ from hybridlog.maintenance.places import (
     CopiedFile,
     RefusedError,
     content_of,
-    digest_of,
     expired_in,
     files_of,
     pieces_of,
@@ -32,6 +31,7 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import REMOVED, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
+from hybridlog_storage.remote.bucket import digest_like
 from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
@@ -175,7 +175,6 @@ class _Copying:
                 self._place.drop()
                 self._report.refused[one.label] = str(error)
                 self._total -= one.stored_bytes
-                self._total -= one.stored_bytes
             finally:
                 self._place.leave()
         if self._proven:
@@ -271,13 +270,12 @@ class _Copying:
 
     def _missing(self, recording: str, state: JournalState, known: Copied) -> int:
         """Number of segments that its copy does not have, but for marks: they do not follow."""
-        if self._source.is_remote or content_of(state) == known.content:
+        listed = {number: one.digest for number, one in state.sealed.items()}
+        if self._source.is_remote or content_of(listed) == known.content:
             return 0
         there, marks = self._place.segments(recording), {mark["segment"] for mark in state.marks}
         return sum(
-            there.get(number) != one.digest
-            for number, one in state.sealed.items()
-            if number not in marks
+            there.get(number) != digest for number, digest in listed.items() if number not in marks
         )
 
     def _copy(self, one: RecordingEntry | RecordingSummary) -> None:
@@ -325,13 +323,20 @@ class _Copying:
             RefusedError: It is damaged here.
         """
         place, path = self._place, file.below(sent.path)
-        if there == file.bytes and place.prove(file):
+        damaged = RefusedError(
+            f"{path} is damaged: what was copied does not match its checksums. "
+            "`hybridlog verify` shows where."
+        )
+        if place.proves and there == file.bytes and place.prove(file):
             self._total -= file.bytes
             return
+        if not (place.proves or file.is_whole(sent.path)):
+            raise damaged
         at = 0
-        if 0 < there < file.bytes:
-            here = digest_of(sent.pieces(file, 0, there, _READ))
-            at = there if place.digest(file, there) == here else 0
+        if 0 < there <= file.bytes:
+            digest = place.digest(file, there)
+            here = digest_like(digest, sent.pieces(file, 0, there, _READ))
+            at = there if digest == here else 0
         self._total -= at
         piece, limit = self._options.piece, self._options.limit_rate
         if limit is not None:  # a server must not take a slow one for a dead one
@@ -341,10 +346,7 @@ class _Copying:
             at += len(data)
             self._count(sent.label, len(data))
         if not place.prove(file):
-            raise RefusedError(
-                f"{path} is damaged: what was copied does not match its checksums. "
-                "`hybridlog verify` shows where."
-            )
+            raise damaged
 
     def _count(self, label: str, size: int) -> None:
         """Count bytes that were sent, and wait as long as the limit of the rate asks for."""

@@ -11,7 +11,7 @@ import hashlib
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -32,6 +32,7 @@ from hybridlog_storage.disk.directory import (
 )
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
+from hybridlog_storage.remote.bucket import digest_like
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.settings import EXPIRED
@@ -135,7 +136,8 @@ class Copied:
 
     Attributes:
         label: Its label there.
-        lacks_payloads: Whether only its fields were copied.
+        lacks_payloads: Whether only its fields were copied, or objects of it were lost: the next
+            copy completes it.
         expired: Number of expired topics there, summed over its segments.
         content: As of `content_of`.
     """
@@ -165,6 +167,9 @@ class Place(Protocol):
     name: str
     """What people call it."""
 
+    proves: bool
+    """Whether `prove` reads what has arrived. Otherwise files are checked before they are sent."""
+
     def sees(self, mark: str) -> bool:
         """True if a file that another store has made among its recordings is here, too."""
 
@@ -183,7 +188,7 @@ class Place(Protocol):
         """
 
     def digest(self, file: CopiedFile, length: int) -> str:
-        """SHA-256 of the first bytes of a file that is there, in hexadecimal digits."""
+        """A digest of the first bytes of a file that is there; see `digest_like`."""
 
     def append(self, file: CopiedFile, at: int, data: Buffer) -> None:
         """Write bytes of a file, and cut off what is there behind them.
@@ -236,6 +241,8 @@ class DirectoryPlace:
         StoreError: It cannot be written.
     """
 
+    proves = True
+
     def __init__(self, directory: StoreDirectory, known: Callable[[], Mapping[str, str]]) -> None:
         directory.check_writable()
         self.name = str(directory.path)
@@ -268,7 +275,7 @@ class DirectoryPlace:
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """As of `Place`."""
         labels = self._labels()
-        return {one: self._copied(labels[one]) for one in recordings if one in labels}
+        return {one: copied_of(self._directory, labels[one]) for one in recordings if one in labels}
 
     def _labels(self) -> dict[str, str]:
         """Labels of all recordings, by id."""
@@ -278,10 +285,6 @@ class DirectoryPlace:
             with suppress(StoreError):
                 found[ids.get(label) or self._directory.id_of(label)] = label
         return found
-
-    def _copied(self, label: str) -> Copied:
-        state = journal.read(self._directory.recording(label)) or JournalState()
-        return Copied(label, state.lacks_payloads, expired_in(state), content_of(state))
 
     def segments(self, recording: str) -> dict[int, str]:
         """As of `Place`."""
@@ -342,7 +345,7 @@ class DirectoryPlace:
     def digest(self, file: CopiedFile, length: int) -> str:
         """As of `Place`."""
         path = file.below(self._path)
-        return digest_of(pieces_of(path, 0, length, _PIECE, depth=file.depth))
+        return digest_like("", pieces_of(path, 0, length, _PIECE, depth=file.depth))
 
     def append(self, file: CopiedFile, at: int, data: Buffer) -> None:
         """As of `Place`."""
@@ -403,14 +406,11 @@ class DirectoryPlace:
     def publish(self, label: str, lines: bytes, *, lacks_payloads: bool) -> str:
         """As of `Place`."""
         path, state = self._path, journal.parse(lines)
-        self._check(state)
+        check_proven(state, self._recording, self._proven)
         self._clear(state)
         if any(file.has_fields for file in state.payloads.values()):
             self._directory.require(EXPIRED)
-        own: dict[str, Any] = {"store": self._directory.settings.store_id}
-        if lacks_payloads or state.lacks_payloads:
-            own["lacks"] = "payloads"
-        added: list[journal.Event] = [journal.event(journal.ADOPTED, **own)]
+        added = [adopted_line(self._directory, state, lacks_payloads=lacks_payloads)]
         with ExitStack() as held:
             before = self.have([self._recording]).get(self._recording)
             if before is not None:
@@ -428,23 +428,6 @@ class DirectoryPlace:
         self.published.append(self._recording)
         self.leave()
         return label
-
-    def _check(self, state: JournalState) -> None:
-        """Raise unless every file that a journal names is proven.
-
-        Raises:
-            StoreError: One is not, or it is another recording's journal.
-        """
-        if state.id != self._recording or not state.is_proof or state.torn:
-            raise StoreError("The journal of the recording is damaged, or of another one.")
-        for number, sealed in state.sealed.items():
-            found = self._proven.get(sealed_name(number))
-            right = {(sealed.digest, sealed.bytes), *state.thinned.get(number, ())}
-            if found is None or (found.digest, found.bytes) not in right:
-                raise StoreError(f"{sealed_name(number)} was not copied, and the journal lists it.")
-        for name, file in state.payloads.items():
-            if self._proven.get(name) != CopiedFile(**asdict(file)):
-                raise StoreError(f"{name} was not copied, and the journal lists it.")
 
     def _clear(self, state: JournalState) -> None:
         """Remove what an interrupted copy has left, and force the names of files to the disk."""
@@ -526,21 +509,62 @@ class DirectoryPlace:
 
     def problems(self, recording: str) -> list[str]:
         """As of `Place`."""
-        label = self._labels().get(recording)
-        if label is None:
-            return ["it is gone"]
-        inventory = take_inventory(self._directory, label)
-        found = [misfit.reason for misfit in inventory.misfits]
-        if not inventory.is_proven:
-            found.append("it is incomplete")
-        path = self._directory.recording(label)
-        return found + [f"{f.file} is damaged" for f in files_of(inventory) if not f.is_whole(path)]
+        return problems_of(self._directory, self._labels().get(recording))
 
 
-def content_of(state: JournalState) -> str:
+def problems_of(directory: StoreDirectory, label: str | None) -> list[str]:
+    """Read a whole recording, and say what is wrong with it.
+
+    Args:
+        directory: Its store.
+        label: Its label; None if it is gone.
+    """
+    if label is None:
+        return ["it is gone"]
+    inventory = take_inventory(directory, label)
+    found = [misfit.reason for misfit in inventory.misfits]
+    if not inventory.is_proven:
+        found.append("it is incomplete")
+    path = directory.recording(label)
+    return found + [f"{f.file} is damaged" for f in files_of(inventory) if not f.is_whole(path)]
+
+
+def copied_of(directory: StoreDirectory, label: str) -> Copied:
+    """A recording of a store, by its journal."""
+    state = journal.read(directory.recording(label)) or JournalState()
+    digests = {number: sealed.digest for number, sealed in state.sealed.items()}
+    return Copied(label, state.lacks_payloads, expired_in(state), content_of(digests))
+
+
+def adopted_line(
+    directory: StoreDirectory, state: JournalState, *, lacks_payloads: bool
+) -> journal.Event:
+    """The last line of the journal of a copy."""
+    lacks = {"lacks": "payloads"} if lacks_payloads or state.lacks_payloads else {}
+    return journal.event(journal.ADOPTED, store=directory.settings.store_id, **lacks)
+
+
+def check_proven(state: JournalState, recording: str, proven: Mapping[str, CopiedFile]) -> None:
+    """Raise unless every file that a journal names is proven.
+
+    Raises:
+        StoreError: One is not, or it is another recording's journal.
+    """
+    if state.id != recording or not state.is_proof or state.torn:
+        raise StoreError("The journal of the recording is damaged, or of another one.")
+    for number, sealed in state.sealed.items():
+        found = proven.get(sealed_name(number))
+        right = {(sealed.digest, sealed.bytes), *state.thinned.get(number, ())}
+        if found is None or (found.digest, found.bytes) not in right:
+            raise StoreError(f"{sealed_name(number)} was not copied, and the journal lists it.")
+    for name, file in state.payloads.items():
+        if proven.get(name) != CopiedFile(**asdict(file)):
+            raise StoreError(f"{name} was not copied, and the journal lists it.")
+
+
+def content_of(digests: Mapping[int, str]) -> str:
     """A value that is the same for two copies of a recording with the same segments."""
-    sealed = sorted((number, one.digest) for number, one in state.sealed.items())
-    return hashlib.sha256(str(sealed).encode()).hexdigest()[:32]
+    return hashlib.sha256(str(sorted(digests.items())).encode()).hexdigest()[:32]
 
 
 def expired_in(state: JournalState) -> int:
@@ -555,14 +579,6 @@ def files_of(inventory: Any) -> list[CopiedFile]:
         digest, size = inventory.stored_file(number)
         listed.append(CopiedFile(inventory.listing.sealed[number], size, digest))
     return sorted(listed, key=lambda file: (not file.is_segment, file.file))
-
-
-def digest_of(pieces: Iterable[bytes]) -> str:
-    """SHA-256 of bytes, in hexadecimal digits."""
-    found = hashlib.sha256()
-    for piece in pieces:
-        found.update(piece)
-    return found.hexdigest()
 
 
 def pieces_of(path: Path, at: int, end: int, piece: int, *, depth: int) -> Iterator[bytes]:

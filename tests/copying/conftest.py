@@ -16,12 +16,13 @@ import hybridlog as hl
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance.places import Place
 from hybridlog.maintenance.ssh import Server, serve
+from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.payloads.logs import robot, write_log
 
 SETTINGS = SegmentSettings(chunk_size=8 << 10, segment_size=14 << 10)
-STATES = ("recorded", "compacted", "dropped", "expired", "noted")
+STATES = ("recorded", "damaged", "compacted", "dropped", "expired", "noted")
 PlaceAt = Callable[[Path], AbstractContextManager[Place]]
 
 
@@ -31,7 +32,9 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("robot")
     with hl.open(path / "store", create=True, mongo="none") as store:
         for number, name in enumerate(STATES):
-            log = write_log(path / f"{name}.mcap", robot(20 + number))
+            log = write_log(path / f"{name}.mcap", robot(20 + number), 8 << 10)
+            if name == "damaged":
+                log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
             store.record(log, name=name, settings=SETTINGS)
         store.compact(["compacted"])
         store.compact(["dropped"], drop_mcap=True)
@@ -153,22 +156,32 @@ class Disturbed:
 
 def answers(path: Path, label: str) -> dict[str, Any]:
     """What a recording answers."""
+    return all_answers(path, label)[label]
+
+
+def all_answers(path: Path, *labels: str) -> dict[str, dict[str, Any]]:
+    """What recordings answer, by label."""
     with hl.open(path, mongo="none") as store:
-        (entry,) = store.recordings(label)
-        of = store.recordings(label)
-        found: dict[str, Any] = {
-            "entry": (entry.id, entry.status, entry.messages, entry.span, entry.tags),
-            "notes": entry.notes,
-            "pins": entry.pins,
-            "marks": [(mark["time"], mark["text"]) for mark in entry.marks],
-            "near": of.topic("/scan").where("ranges.min < 1.5").count(),
-            "rings": of.topic("/cloud").fields("width", "height").to_arrow().to_pylist(),
-        }
-        for message in of.topic("/cloud", "/image", "/number", "/scan"):
-            with suppress(PayloadError):
-                key = (message.topic, message.log_time_ns, message.seq, message.publish_time_ns)
-                found[str(key)] = message.raw
-        return found
+        return {label: _answers(store, label) for label in labels or STATES}
+
+
+def _answers(store: hl.Store, label: str) -> dict[str, Any]:
+    (entry,) = store.recordings(label)
+    of = store.recordings(label)
+    found: dict[str, Any] = {
+        "entry": (entry.id, entry.status, entry.messages, entry.span, entry.tags),
+        "lost": losses_of(entry),
+        "notes": entry.notes,
+        "pins": entry.pins,
+        "marks": [(mark["time"], mark["text"]) for mark in entry.marks],
+        "near": of.topic("/scan").where("ranges.min < 1.5").count(),
+        "rings": of.topic("/cloud").fields("width", "height").to_arrow().to_pylist(),
+    }
+    for message in of.topic("/cloud", "/image", "/number", "/scan"):
+        with suppress(PayloadError):
+            key = (message.topic, message.log_time_ns, message.seq, message.publish_time_ns)
+            found[str(key)] = message.raw
+    return found
 
 
 def files_in(recording: Path) -> dict[str, str]:

@@ -94,10 +94,12 @@ def number(n: int) -> bytes:
     return bytes(typestore().serialize_cdr(typestore().types[NUMBER](n), NUMBER))
 
 
-def write_log(path: Path, said: Iterable[tuple[str, str, int, bytes]]) -> Path:
+def write_log(
+    path: Path, said: Iterable[tuple[str, str, int, bytes]], chunk_size: int = 1 << 20
+) -> Path:
     """A log of messages: topic, type, log time and payload of each."""
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size)
         writer.start("ros2")
         schemas: dict[str, int] = {}
         channels: dict[tuple[str, str], int] = {}

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.maintenance.publish import publish
 from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.remote.server import Moto, Proxy, make_bucket
 
@@ -91,10 +89,8 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def publish_all(here: Path, address: str, names: tuple[str, ...] = RECORDINGS) -> None:
-    target = RemoteDirectory.create_in(address)
     with hl.open(here, mongo="none") as store:
-        for name in names:
-            publish(store.directory, store.catalog, store.entry(name), target)
+        assert sorted(store.copy(address, [*names]).copied) == sorted(names)
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,10 @@ class Moto:
         code = f"from moto.server import main; main(['-H', '127.0.0.1', '-p', '{self.port}'])"
         with log.open("w") as errors:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", code], stdout=errors, stderr=errors
+                [sys.executable, "-c", code],
+                stdout=errors,
+                stderr=errors,
+                env={**os.environ, "S3_UPLOAD_PART_MIN_SIZE": "1000"},
             )
         until = time.monotonic() + 60
         while True:

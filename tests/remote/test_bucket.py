@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 
@@ -14,13 +14,20 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.remote import bucket as bucket_module
-from hybridlog_storage.remote.bucket import Bucket, joined_ranges
+from hybridlog_storage.remote.bucket import (
+    Bucket,
+    Object,
+    Upload,
+    digest_like,
+    joined_ranges,
+    path_of,
+)
 from tests.remote.server import Proxy
 
 DATA = random.Random(1).randbytes(300_000)
 
 
-def test_create_replace_read_delete(address: str, proxy: Proxy, tmp_path: Path) -> None:
+def test_create_replace_read_delete(address: str, proxy: Proxy) -> None:
     bucket = Bucket(address)
     version = bucket.create("a/one", DATA)
     assert bucket.create("a/one", DATA) == version
@@ -52,22 +59,28 @@ def test_far_ranges_are_read_apart() -> None:
     assert joined_ranges([(50, 60), (0, 20)], gap=30) == [(0, 60)]
 
 
-def test_large_files_go_in_parts(
-    address: str, proxy: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_large_objects_go_in_parts(
+    address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bucket_module, "PART_BYTES", 20 << 20)  # parts of 5 MiB, the least
-    path = tmp_path / "large"
-    path.write_bytes(DATA * 80)
-    bucket = Bucket(address)
-    with path.open("rb") as file:
-        bucket.create("large", file)
+    monkeypatch.setattr(bucket_module, "PART_BYTES", 200_000)
+    monkeypatch.setattr(bucket_module, "_PART", 100_000)
+    bucket, data = Bucket(address), DATA[:250_000]
+
+    def sent(content: bytes) -> Object:
+        upload = Upload(bucket, "large", len(content))
+        for at in range(0, len(content), 30_000):
+            upload.write(content[at : at + 30_000])
+        return upload.close()
+
+    first = sent(data)
     assert sum("uploadId" in name for _, name, _ in proxy.requests) > 3
-    assert bucket.head("large").size == path.stat().st_size  # type: ignore[union-attr]
-    with path.open("rb") as file:
-        bucket.create("large", file)
-    path.write_bytes(DATA * 79 + DATA[::-1])
-    with path.open("rb") as file, pytest.raises(ObjectExistsError):
-        bucket.create("large", file)
+    assert bucket.head("large") == replace(first, modified=bucket.head("large").modified)  # type: ignore[union-attr]
+    for pieces in ([data], [data[at : at + 70_000] for at in range(0, len(data), 70_000)]):
+        assert digest_like(bucket.digest(first), pieces) == bucket.digest(first)
+    assert digest_like(bucket.digest(first), [data[1:]]) != bucket.digest(first)
+    other = sent(data[::-1])
+    assert path_of(other.name) == "large" != other.name
+    assert bucket.head("large").version == first.version  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("first", range(3))

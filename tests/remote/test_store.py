@@ -10,14 +10,14 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.maintenance.copying import CopyOptions
-from hybridlog.maintenance.publish import publish
+from hybridlog.maintenance.bucket_place import BucketPlace
 from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
@@ -137,9 +137,6 @@ def test_the_command_copies(here: Path, address: str, proxy: Proxy) -> None:
     said = answer("copy", "-r", "short-*", address, "--json", store=here).json
     assert (said["copied"], said["known"]) == ([], ["short-0", "short-1", "short-2"])
     assert len(proxy.requests) <= 3 + 3
-    with pytest.raises(UsageError, match="as a whole"):
-        with hl.open(here, mongo="none") as store:
-            store.copy(address, options=CopyOptions(only_fields=True))
     with hl.open(address) as store:
         assert store.topic("/arm").count() == 60
 
@@ -174,39 +171,6 @@ def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
     with hl.open(address) as last:
         assert last.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
         assert last.entry("short-0").tags == {"c": "3", "d": "4"}
-
-
-def test_publishing_goes_on_after_each_request(
-    here: Path, address: str, proxy: Proxy, expected: dict[str, Any]
-) -> None:
-    target = RemoteDirectory.create_in(address)
-    with hl.open(here, mongo="none") as store:
-        arguments = store.directory, store.catalog, store.entry("moved"), target
-        for allowed in range(1, 100, 3):
-            proxy.requests.clear()
-            proxy.spoil = lambda number, last=allowed: "403" if number > last else ""
-            try:
-                assert publish(*arguments) == ("moved", True)
-                break
-            except BucketError:
-                assert target.labels() == []
-        else:
-            pytest.fail("it never ends")
-        assert allowed > 8
-        assert not [
-            name for method, name, _ in proxy.requests if method == "GET" and "parq" in name
-        ]
-        proxy.reset()
-        assert publish(*arguments) == ("moved", False)
-        assert len(proxy.requests) == 1
-    with hl.open(address) as store:
-        (known,) = (one for one in expected["recordings"] if one[1] == "moved")
-        (found,) = everything(store)["recordings"]
-        assert found == known
-        begin, end = known[6]
-        assert [(m.log_time_ns, m.topic, bytes(m.raw)) for m in store.topic("/arm", "/scan")] == [
-            message for message in expected["messages"] if begin <= message[0] <= end
-        ]
 
 
 def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Proxy) -> None:
@@ -252,24 +216,25 @@ def test_two_who_send_large_files_at_once(
     here: Path, address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Some servers give a new version to the same bytes when they come again."""
-    target = RemoteDirectory.create_in(address)
-    create, is_first = Bucket.create, True
+    monkeypatch.setattr(bucket_module, "PART_BYTES", 10_000)
+    monkeypatch.setattr(bucket_module, "_PART", 5_000)
+    publish = BucketPlace.publish
 
-    def created(bucket: Bucket, name: str, content: Any) -> str:
-        nonlocal is_first
-        version = create(bucket, name, content)
-        if name.endswith(".mcap") and is_first:
-            is_first = False
-            assert publish(*arguments) == ("short-0", True)  # by another process
-            other = bucket._put(name, content, "overwrite")
-            assert other != version
-            version = other
-        return version
+    def overtaken(place: BucketPlace, label: str, lines: bytes, **options: Any) -> str:
+        monkeypatch.setattr(BucketPlace, "publish", publish)
+        with hl.open(here, mongo="none") as other:
+            assert other.copy(address, ["short-0"]).copied == ["short-0"]
+        bucket = place._target.source.bucket
+        for path, one in place._there.items():
+            content = bucket.read(one.name, [(0, one.size)])[0]
+            version = bucket._put(one.name, content, "overwrite")
+            assert version != one.version
+            place._there[path] = replace(one, version=version)
+        return publish(place, label, lines, **options)
 
+    monkeypatch.setattr(BucketPlace, "publish", overtaken)
     with hl.open(here, mongo="none") as store:
-        arguments = store.directory, store.catalog, store.entry("short-0"), target
-        monkeypatch.setattr(Bucket, "create", created)
-        publish(*arguments)
+        assert store.copy(address, ["short-0"]).copied == ["short-0"]
     files.mounted.clear()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "elsewhere"))
     with hl.open(address) as store:

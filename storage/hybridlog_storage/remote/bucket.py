@@ -18,11 +18,11 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import partial
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from hybridlog_storage.errors import (
     BucketError,
@@ -37,12 +37,15 @@ if TYPE_CHECKING:
     from obstore import GetOptions, GetResult, PutMode
     from obstore.store import ObjectStore
 
+    from hybridlog_storage.messages import Buffer
+
 SCHEMES: Final = ("s3://", "gs://", "az://")
 """How the address of a store in a bucket begins."""
 JOINED_GAP: Final = 1 << 20
 """Bytes between two ranges that cost less than another request."""
 PART_BYTES: Final = 64 << 20
-"""Size from which an object is uploaded in parts of this size."""
+"""Size from which an object is uploaded in parts."""
+_PART: Final = 16 << 20
 UNLISTED_DAYS: Final = 7
 """Age in days from which an object that no list names may be deleted. `create` takes one that is
 there for its own only if it is a day younger: a copy that is under way needs it for a while."""
@@ -56,6 +59,8 @@ _RETRY_S: Final = 60
 _CUT = re.compile(r"(?i)body|reset|closed|incomplete|timed? ?out|eof|sending request")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
 _ROLES = re.compile(r"169\.254\.|metadata\.google")  # asked if the environment has no key
+_MD5: Final = re.compile(r"[0-9a-f]{32}(-[0-9]{1,5})?")  # of the whole, or of parts
+_SUFFIX: Final = re.compile(r"~[0-9a-f]{8}$")
 _HOST = re.compile(r"https?://[^/\s]+")
 _SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
 
@@ -217,15 +222,8 @@ class Bucket:
         except FileNotFoundError:
             return None
 
-    def create(self, name: str, content: bytes | BinaryIO) -> str:
+    def create(self, name: str, content: bytes) -> str:
         """Create an object of a free name. A young one of this very content counts as created.
-
-        A file of more than `PART_BYTES` goes in parts, and only the check before it keeps
-        another writer of the same name away: give it a name that only this content has.
-
-        Args:
-            name: The object.
-            content: Its bytes, or a file at its beginning.
 
         Returns:
             Its version.
@@ -237,20 +235,55 @@ class Bucket:
         from obstore.exceptions import AlreadyExistsError
 
         self.check_conditions()
-        size = _size_of(content)
-        if size <= PART_BYTES and not isinstance(content, bytes):
-            content = content.read()
-        try:
-            if isinstance(content, bytes):
-                return self._put(name, content, "create")
-            if self.head(name) is None:
-                return self._put(name, content, "overwrite")
-        except AlreadyExistsError:
-            pass  # by another writer, or by this one whose connection broke
-        found = self._same(name, content, size)
-        if found is None:
+        with suppress(AlreadyExistsError):  # by another writer, or by this one whose answer is lost
+            return self._put(name, content, "create")
+        about = self.head(name)
+        if about is None or not self.is_young(about) or not self._holds(about, content):
             raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
-        return found
+        return about.version
+
+    def _holds(self, about: Object, content: bytes) -> bool:
+        tag = _tag(about)  # some servers have others that look like an MD5
+        if about.size != len(content) or digest_like(tag, [content]) == tag:
+            return about.size == len(content)
+        return b"".join(self._pieces(about)) == content
+
+    def _pieces(self, about: Object) -> Iterator[bytes]:
+        for at in range(0, about.size, _PART):
+            yield self._range(about.name, (at, min(at + _PART, about.size)), about.version)
+
+    def create_beside(self, name: str, content: bytes) -> Object:
+        """Create an object, under another name if this one is taken by other content.
+
+        Raises:
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        try:
+            return Object(name, len(content), self.create(name, content), 0)
+        except ObjectExistsError:
+            other = other_name(name)
+            return Object(other, len(content), self.create(other, content), 0)
+
+    def is_young(self, about: Object) -> bool:
+        """True if an object that no list names is safe from being tidied away for a day."""
+        return time.time_ns() - about.modified <= (UNLISTED_DAYS - 1) * _DAY_NS
+
+    def digest(self, about: Object) -> str:
+        """A digest of the content of an object: the server's, or it is read; see `digest_like`.
+
+        Raises:
+            FileNotFoundError: It does not exist.
+            ObjectChangedError: It has another version.
+            BucketError: The server does not answer, or refuses.
+        """
+        return _tag(about) or digest_like("", self._pieces(about))
+
+    def in_parts(self, name: str) -> Any:
+        """A writer of an object, which takes the place of one of its name."""
+        import obstore
+
+        self.check_conditions()
+        return obstore.open_writer(self._writing, name, buffer_size=_PART, max_concurrency=4)
 
     def delete(self, names: Sequence[str]) -> None:
         """Delete objects; those that do not exist are left out.
@@ -313,45 +346,11 @@ class Bucket:
             self.delete([name])
         return time.time_ns() if about is None else about.modified
 
-    def _same(self, name: str, content: bytes | BinaryIO, size: int) -> str | None:
-        """The version of an object, if it has this content."""
-        about = self.head(name)
-        if about is None or about.size != size:
-            return None
-        if time.time_ns() - about.modified > (UNLISTED_DAYS - 1) * _DAY_NS:
-            return None
-        if isinstance(content, bytes):
-            if about.version.strip('"') == hashlib.md5(content, usedforsecurity=False).hexdigest():
-                return about.version  # so it is on most servers that speak S3
-            pieces: Iterator[bytes] = iter([content])
-        else:
-            file = content
-            file.seek(0)
-            pieces = iter(lambda: file.read(PART_BYTES // 4), b"")
-        begin = 0
-        for piece in pieces:
-            end = begin + len(piece)
-            if self._range(name, (begin, end), about.version) != piece:
-                return None
-            begin = end
-        return about.version
-
-    def _put(self, name: str, content: bytes | BinaryIO, mode: PutMode) -> str:
+    def _put(self, name: str, content: bytes, mode: PutMode) -> str:
         import obstore
 
         def put() -> str:
-            if isinstance(content, bytes):
-                done = obstore.put(self._writing, name, content, mode=mode, use_multipart=False)
-            else:
-                content.seek(0)
-                done = obstore.put(
-                    self._writing,
-                    name,
-                    content,
-                    use_multipart=True,
-                    chunk_size=PART_BYTES // 4,
-                    max_concurrency=4,
-                )
+            done = obstore.put(self._writing, name, content, mode=mode, use_multipart=False)
             return _version(done)
 
         return self._again(name, put)
@@ -365,7 +364,7 @@ class Bucket:
         from obstore.exceptions import GenericError
 
         for attempt in range(_TRIES):
-            with self._explained(name):
+            with self.explained(name):
                 try:
                     return work()
                 except GenericError as error:
@@ -377,7 +376,7 @@ class Bucket:
         return f"{self.address}/{name}"
 
     @contextmanager
-    def _explained(self, name: str) -> Iterator[None]:
+    def explained(self, name: str) -> Iterator[None]:
         """Raise errors of the library as errors of this program."""
         from obstore import exceptions
 
@@ -421,6 +420,94 @@ class Bucket:
                 "AWS_ENDPOINT_URL its address?"
             )
         return f"{self._place(name)}: {reason}"
+
+
+class Upload:
+    """An object whose content arrives in pieces. It exists when all of it has arrived.
+
+    One of more than `PART_BYTES` goes in parts, where servers know no conditions: only a look
+    before keeps another writer of the same name away.
+
+    Args:
+        bucket: Where it is to be.
+        name: Its name. It gets a suffix if the name is taken, by other content.
+        size: Its bytes.
+    """
+
+    def __init__(self, bucket: Bucket, name: str, size: int) -> None:
+        self._bucket = bucket
+        self._name = name
+        self._size = size
+        self._held = bytearray()
+        self._parts: Any = None
+
+    def write(self, data: Buffer) -> None:
+        """Take the next piece.
+
+        Raises:
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        if self._size <= PART_BYTES:
+            self._held += data
+            return
+        if self._parts is None:
+            if self._bucket.head(self._name) is not None:
+                self._name = other_name(self._name)
+            self._parts = self._bucket.in_parts(self._name)
+        with self._bucket.explained(self._name):
+            self._parts.write(bytes(data))
+
+    def close(self) -> Object:
+        """End it, after its last byte.
+
+        Raises:
+            BucketError: The server does not answer, or refuses.
+        """
+        if self._parts is None:
+            return self._bucket.create_beside(self._name, bytes(self._held))
+        with self._bucket.explained(self._name):
+            self._parts.close()
+        about = self._bucket.head(self._name)
+        if about is None or about.size != self._size:
+            raise BucketError(f"{self._bucket.address}/{self._name} did not arrive.")
+        return replace(about, modified=0)
+
+
+def other_name(name: str) -> str:
+    """A name for an object whose name is taken; see `path_of`."""
+    return f"{name}~{secrets.token_hex(4)}"
+
+
+def path_of(name: str) -> str:
+    """The name of an object without the suffix of `other_name`."""
+    return _SUFFIX.sub("", name)
+
+
+def digest_like(found: str, pieces: Iterable[Buffer]) -> str:
+    """A digest of bytes, of the kind of another digest.
+
+    Args:
+        found: A digest of `Bucket.digest`: of objects that were sent in parts it is of theirs.
+        pieces: The bytes.
+    """
+    if not _MD5.fullmatch(found):
+        whole = hashlib.sha256()
+        for piece in pieces:
+            whole.update(piece)
+        return whole.hexdigest()
+    sums, now, left = [], hashlib.md5(usedforsecurity=False), _PART
+    for piece in pieces:
+        view = memoryview(piece)
+        while "-" in found and len(view) > left:
+            now.update(view[:left])
+            sums.append(now.digest())
+            view, now, left = view[left:], hashlib.md5(usedforsecurity=False), _PART
+        now.update(view)
+        left -= len(view)
+    if "-" not in found:
+        return now.hexdigest()
+    sums.append(now.digest())
+    return f"{hashlib.md5(b''.join(sums), usedforsecurity=False).hexdigest()}-{len(sums)}"
 
 
 def joined_ranges(
@@ -491,8 +578,10 @@ def _version(about: Any) -> str:
     return version
 
 
-def _size_of(content: bytes | BinaryIO) -> int:
-    return len(content) if isinstance(content, bytes) else os.fstat(content.fileno()).st_size
+def _tag(about: Object) -> str:
+    """The MD5 in the version of an object, as most servers that speak S3 have it; else empty."""
+    tag = about.version.strip('"')
+    return tag if _MD5.fullmatch(tag) else ""
 
 
 def _reason(error: Exception) -> str:

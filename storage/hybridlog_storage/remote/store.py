@@ -19,20 +19,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from hybridlog_storage import journal
 from hybridlog_storage.catalog_parts import MemoryFolder, Version
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import Listing, StoreDirectory
-from hybridlog_storage.errors import (
-    BucketError,
-    ObjectExistsError,
-    StoreError,
-)
+from hybridlog_storage.errors import ObjectExistsError, StoreError
 from hybridlog_storage.journal import JOURNAL
-from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
 from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object
 from hybridlog_storage.remote.lists import (
@@ -125,7 +120,7 @@ class BucketFiles:
         number = number_of(about.name)
         if number is None:
             raise StoreError(f"{place} is no list.")
-        return StoreList.from_bytes(store, number, self._content([about]), place)
+        return StoreList.from_bytes(store, number, self.read([about]), place)
 
     def commit(self, before: StoreList, after: StoreList) -> None:
         """Create the next list.
@@ -202,11 +197,11 @@ class BucketFiles:
         if isinstance(node, Mapping):
             raise IsADirectoryError(errno.EISDIR, "it is a folder", self._place(inner))
         with tempfile.TemporaryFile() as file:
-            file.write(node if isinstance(node, bytes) else self._content(node))
+            file.write(node if isinstance(node, bytes) else self.read(node))
             file.seek(0)
             return os.dup(file.fileno())
 
-    def _content(self, objects: Sequence[Object]) -> bytes:
+    def read(self, objects: Sequence[Object]) -> bytes:
         """Small objects, one behind the other."""
         if sum(one.size for one in objects) > MAX_LIST:
             raise StoreError(f"{self.bucket.address}/{objects[0].name} is too large.")
@@ -510,17 +505,18 @@ class RemoteDirectory(StoreDirectory):
                 continue
             # One that no list names is of a change that did not come to its end.
             with suppress(ObjectExistsError):
-                about = self._created(name, content)
+                version = self.source.bucket.create(name, content)
                 break
+        about = Object(name, len(content), version, 0)
         self._relist(label, replace(listed, files={**listed.files, path: about}))
 
     def refresh(self) -> None:
         """See what the newest list has."""
         self.source.look(self.settings.store_id, now=True)
 
-    def label_of_id(self, recording: str) -> str:
-        """The label of a recording, by its id; empty if it is not here."""
-        return next((name for name, one in self._now.recordings.items() if one.id == recording), "")
+    def labels_by_id(self) -> dict[str, str]:
+        """The labels of all recordings, by id."""
+        return {one.id: label for label, one in self._now.recordings.items()}
 
     def files_of(self, label: str) -> Mapping[str, Object]:
         """The object of each file of a recording, without those that are lost."""
@@ -529,26 +525,6 @@ class RemoteDirectory(StoreDirectory):
     def is_damaged(self, label: str) -> bool:
         """True if objects of a recording were lost, as far as it was compared with them."""
         return len(self.files_of(label)) < len(self._now.recordings[label].files)
-
-    def add_file(self, recording: str, path: str, content: bytes | BinaryIO) -> Object:
-        """Create the object of a file, under another name if what a crash left has its own.
-
-        Raises:
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
-        name = f"{recording}/{path}"
-        for _ in range(TRIES):
-            try:
-                return self._created(name, content)
-            except ObjectExistsError:
-                name = f"{recording}/{path}~{os.urandom(4).hex()}"
-                if not isinstance(content, bytes):
-                    content.seek(0)
-        raise BucketError(f"{self.source.bucket.address}/{name} cannot be created.")
-
-    def _created(self, name: str, content: bytes | BinaryIO) -> Object:
-        size = len(content) if isinstance(content, bytes) else os.fstat(content.fileno()).st_size
-        return Object(name, size, self.source.bucket.create(name, content), 0)
 
     def add_recording(
         self, label: str, recording: ListedRecording, tables: Mapping[str, Object]
