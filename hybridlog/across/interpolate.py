@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import numbers
-from hybridlog.schema.arrow_types import is_number, numpy_type
+from hybridlog.schema.arrow_types import COMPUTED_AS, is_number, numpy_type
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -80,9 +80,7 @@ def interpolated(
 
 
 def _doubles(column: pa.ChunkedArray[Any]) -> NDArray[np.float64]:
-    kind = column.type
-    if _types.is_float16(kind):
-        column = column.cast(pa.float32())
+    column = column.cast(COMPUTED_AS.get(column.type, column.type))
     values: NDArray[np.float64] = column.cast(pa.float64(), safe=False).fill_null(np.nan).to_numpy()
     return values
 

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.schema.arrow_types import is_bytes, is_list, is_text, is_time
+from hybridlog.schema.arrow_types import COMPUTED_AS, is_bytes, is_list, is_text, is_time
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -138,6 +138,7 @@ def _nested(array: pa.Array) -> pa.Array:
 
 def _floats(array: pa.Array) -> pa.Array:
     text = array.cast(pa.string())
+    array = array.cast(COMPUTED_AS.get(array.type, array.type))
     if pc.any(pc.equal(array, 0)).as_py():
         # Readers take -0 for an integer, which has no sign.
         text = pc.if_else(pc.equal(text, "-0"), "-0.0", text)

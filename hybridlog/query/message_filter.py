@@ -49,6 +49,7 @@ class MessageFilter:
         self._predicate = predicate
         self._types = types
         self._test = to_bool(predicate.root, types)
+        self._summary_test = to_bool(predicate.root, types, summarised=True)
         self._elements = _elements_of(predicate, types or {})
         self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
 
@@ -109,6 +110,7 @@ class MessageFilter:
     ) -> Matches:
         holds = np.zeros(len(batch), np.bool_)
         unreadable = 0
+        test = self._summary_test if channel.is_reduced else self._test
         for row in rows.tolist():
             try:
                 fields = plain_message(channel.codec, batch.payload(row), self._fields)
@@ -119,7 +121,7 @@ class MessageFilter:
                 fields = {}
             if "_meta" in self._fields:
                 fields["_meta"] = _meta_of(channel, batch, seq, row)
-            holds[row] = self._test(fields)
+            holds[row] = test(fields)
         return Matches(holds, unreadable)
 
 

@@ -11,13 +11,13 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
 from hybridlog.query.bounds import MIN_RECORDINGS, BoundsFinder, within_bounds
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
-from hybridlog.query.engines.base import Checking, Need, UndecidedError
+from hybridlog.query.engines.base import Checking, Counting, Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.question import Part
@@ -52,6 +52,11 @@ _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _Rows = TypeVar("_Rows", "MatchColumns", "Values")
 _Key = tuple[int, int]
+_COUNTING: Final[tuple[type[Counting], ...]] = (
+    Statistics,
+    ChunkIndex,
+)
+"""Engines that count without reading messages; the cheapest that can answers."""
 _FALLBACK_ERRORS = (ResourceError, SegmentError, StoreError, UndecidedError)
 """Failures of one engine that another engine may not have."""
 
@@ -75,7 +80,7 @@ class Planner:
         self._ranges = RangeResolver(session, question)
         self._is_of_many = False  # recordings
         self._scan = PayloadScan(session, counters)
-        self._catalog: tuple[Engine, ...] = (Statistics(), ChunkIndex(session, counters))
+        self._counting = tuple(engine(session, counters) for engine in _COUNTING)
 
     @lazy
     def index(self) -> IndexReader:
@@ -109,14 +114,14 @@ class Planner:
         """The engines that may be able to answer."""
         if part.recording.status in UNFINISHED:
             is_plain = part.predicate is None and need is not Need.VALUES
-            return *self._catalog, *(() if is_plain else (self._running,)), self._scan
+            return *self._counting, *(() if is_plain else (self._running,)), self._scan
         if part.predicate is None and need is Need.OUTCOMES:
-            return *self._catalog, self._tables, self._scan
+            return *self._counting, self._tables, self._scan
         if part.predicate is None and need is not Need.VALUES:
-            return *self._catalog, self._scan
+            return *self._counting, self._scan
         if part.recording.payloads:
-            return *self._catalog, self._tables, self._columns, self._scan
-        return *self._catalog, self._tables, self._scan
+            return *self._counting, self._tables, self._columns, self._scan
+        return *self._counting, self._tables, self._scan
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic; recordings oldest first.
@@ -425,9 +430,7 @@ class Planner:
 
     def _count_stored(self, part: Part) -> int:
         """Number of messages of a part without a predicate."""
-        by_times = self._catalog[1]
-        engine = self._scan if by_times.cost(part, Need.COUNT) is None else by_times
-        return engine.count([part])
+        return self._count_part(self._choose(part, Need.COUNT), part)
 
     def count_expired(self) -> int:
         """Number of messages, in the range, whose payloads were deleted to make room.

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _INT64_MAX = (1 << 63) - 1
 _SUMMARIES: Final = (("n", "min", "max", "mean"), ("n",))
 _types = pa.types
+COMPUTED_AS: Final = {pa.float16(): pa.float32()}
+"""Types that Arrow and DuckDB cannot compute with, and those that have all their values."""
 
 Array = Any
 """An Arrow array. Its stubs differ too much between versions to be useful here."""

@@ -21,6 +21,7 @@ from hybridlog.columns.layout import OWN_COLUMNS, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import json_array
 from hybridlog.schema.arrow_types import (
+    COMPUTED_AS,
     Rules,
     common_type,
     is_array,
@@ -249,6 +250,7 @@ _SQL_TYPES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Any], Any]]]] 
     (_types.is_null, lambda _: pa.int32()),  # as DuckDB has it
     (is_list, lambda kind: pa.list_(sql_type(kind.value_type))),
     (_types.is_struct, _sql_struct),
+    (COMPUTED_AS.__contains__, COMPUTED_AS.__getitem__),
 )
 
 

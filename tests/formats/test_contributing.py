@@ -2,37 +2,67 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import struct
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from hybridlog.formats import LOGS, OUTPUTS
 from tests.imports import ROOT
 
-TABLES = {"OUTPUTS": "OutputFormat]] = {\n", "LOGS": "LOGS: Final = (\n"}
+TABLES = {
+    "OUTPUTS": "OutputFormat]] = {\n",
+    "LOGS": "LOGS: Final = (\n",
+    "DTYPES": "DTYPES: Final = {\n",
+    "IMPORTS": "import numpy as np\n\n",
+    "COUNTING": "_COUNTING: Final[tuple[type[Counting], ...]] = (\n",
+}
+"""Where rows of a table begin."""
 LINES = '{"log_time_ns": 1000000001, "topic": "/a", "x": 1.5}\nno line\n' + "".join(
     f'{{"log_time_ns": {1_000_000_002 + n}, "topic": "/b", "n": {n}, "s": "p|q"}}\n'
     for n in range(2500)
 )
+
+HALF = """
+import json, sys
+import hybridlog as hl
+from hybridlog.query.engines.base import Need
+from hybridlog.query.planner import Planner
+
+with hl.open(sys.argv[1], create=True) as store:
+    store.record(sys.argv[2])
+    half = store["/half"]
+    where = half.where("r.max > 24 and x >= 49").count()
+    ((x, r),) = store.sql("select max(x), sum(list_sum(r)) from half").rows()
+    (mean,) = half.resample("1s", "mean").to_arrow()["x"].to_pylist()
+    print(json.dumps({"where": where, "x": x, "r": r, "mean": mean}))
+    print(*(line for lines in half.limit(2).to_json_lines() for line in lines[1:]))
+    for query in (half.between("+0s", "+1s"), half.between("+1ns", "+5ns")):
+        planner = Planner(query.session, query.question, query.counters)
+        engine, *_ = planner._choose(planner.parts()[0], Need.COUNT)
+        print(json.dumps([type(engine).__name__, query.count()]))
+"""
 
 
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A directory with a copy of the package to which the page was applied."""
     folder = tmp_path_factory.mktemp("extended")
-    package = folder / "hybridlog"
-    (package / "formats").mkdir(parents=True)
-    for below in (".", "formats"):
-        for path in (ROOT / "hybridlog" / below).iterdir():
-            copy = package / below / path.name
-            if path.name == "__init__.py":
-                copy.write_bytes(path.read_bytes())
-            elif path.name not in {"formats", "__pycache__"}:
-                copy.symlink_to(path)
+    package = ROOT / "hybridlog"
+    for path in package.rglob("*"):
+        copy = folder / path.relative_to(ROOT)
+        if path.is_dir():
+            copy.mkdir(parents=True, exist_ok=True)
+        elif path.suffix != ".pyc":
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.symlink_to(path)
     page = (ROOT / "docs" / "contributing.md").read_text("utf-8")
     blocks = re.findall(
         r"^```(?:python|text) (\S+) ?(\w*)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE
@@ -44,17 +74,27 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
             before, start, after = path.read_text("utf-8").partition(TABLES[table])
             assert start
             text = f"{before}{start}{text}{after}"
+            path.unlink()
         touched[name] = touched.get(name, 0) + 1
         path.write_text(text, "utf-8")
-    assert len(touched) == 3  # a writer, a reader, and the tables of both
+    # A writer, a reader and the tables of both; a type of number; an engine and its table.
+    assert len(touched) == 6
     return folder
 
 
 def run(folder: Path, *words: str, code: int = 0) -> tuple[str, str]:
+    return execute(folder, "-m", "hybridlog", *words, code=code)
+
+
+def execute(folder: Path, *words: str, code: int = 0) -> tuple[str, str]:
     environment = os.environ | {"PYTHONPATH": str(folder), "HYBRIDLOG_MONGO_URI": "none"}
-    command = [sys.executable, "-m", "hybridlog", *words]
     done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == code, done.stderr
     return done.stdout, done.stderr
@@ -80,6 +120,28 @@ def test_the_examples(extended: Path) -> None:
     run(extended, "export", "tables", "-F", "markdown", "-q")
     assert sorted(path.name for path in (extended / "tables").iterdir()) == ["a.md", "b.md"]
     assert "markdown" in run(extended, "align", "--help")[0]
+
+
+def test_a_field_type_and_another_way_to_count(extended: Path, tmp_path: Path) -> None:
+    log = tmp_path / "half.mcap"
+    with log.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("demo/Half", "ros2msg", b"float16 x\nfloat16[] r\n")
+        channel = writer.register_channel("/half", "cdr", schema)
+        for n in range(100):
+            r = np.arange(n, dtype=np.float16) / 4
+            head = b"\0\1\0\0" + np.float16(n / 2).tobytes() + b"\0\0"
+            payload = head + struct.pack("<I", n) + r.tobytes()
+            writer.add_message(channel, 10**9 + n, payload, 10**9 + n)
+        writer.finish()
+    found = execute(extended, "-c", HALF, str(tmp_path / "store"), str(log))[0]
+    assert list(map(json.loads, found.splitlines())) == [
+        {"where": 2, "x": 49.5, "r": sum(n * (n - 1) / 8 for n in range(100)), "mean": 24.75},
+        {"log_time_ns": 1_000_000_001, "topic": "/half", "x": 0.5, "r": [0]},
+        ["Covered", 100],
+        ["ChunkIndex", 4],
+    ]
 
 
 def test_the_tables_name_what_exists() -> None:

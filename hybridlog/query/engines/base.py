@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import ChunkKey, ChunkTask, RowSelection
+    from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part
+    from hybridlog.session import Session
 
 
 class UndecidedError(HybridlogError):
@@ -110,7 +112,24 @@ class Checking(Protocol):
 
 
 class Counting:
-    """An engine that only counts."""
+    """An engine that only counts. The planner has a table of them.
+
+    Args:
+        session: The open store.
+        counters: What it reads is counted here.
+    """
+
+    def __init__(self, session: Session, counters: Counters) -> None:
+        self._session = session
+        self._counters = counters
+
+    def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
+        """Estimated seconds for a count; None if it cannot give it."""
+        raise NotImplementedError
+
+    def count(self, parts: Sequence[Part]) -> int:
+        """Number of matching messages in all parts."""
+        raise NotImplementedError
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """Not supported: `cost` returns None."""

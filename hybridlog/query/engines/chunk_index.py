@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_counts import Placed
-from hybridlog.query.engines.base import Counting, MatchColumns, Need, Values
+from hybridlog.query.engines.base import Counting, MatchColumns, Need
 from hybridlog_storage.times import inside
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_counts import Parts
-    from hybridlog.query.chunk_scan import ChunkTask, RowSelection
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
@@ -27,10 +26,10 @@ if TYPE_CHECKING:
 _ENTRY_S = 2e-5  # seconds to fetch the entry of a chunk
 _READ_S = 1e-4  # seconds to read the message indexes of a chunk
 _TIME_S = 2e-7  # seconds to sort the log time of a message
-_MAX_KEPT = 4_000_000  # log times of chunks with several channels, until the question is answered
+_MAX_CACHED_TIMES = 4_000_000  # of chunks with several channels, until the question is answered
 
 
-class ChunkIndex:
+class ChunkIndex(Counting):
     """Answers questions about log time alone, without a predicate.
 
     Args:
@@ -39,10 +38,9 @@ class ChunkIndex:
     """
 
     def __init__(self, session: Session, counters: Counters) -> None:
-        self._session = session
-        self._counters = counters
-        self._kept: dict[tuple[str, int, int], dict[int, NDArray[np.int64]]] = {}
-        self._room = _MAX_KEPT
+        super().__init__(session, counters)
+        self._cached_times: dict[tuple[str, int, int], dict[int, NDArray[np.int64]]] = {}
+        self._room = _MAX_CACHED_TIMES
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """For counts and times by log time; it grows with the number of chunks in the range."""
@@ -82,14 +80,6 @@ class ChunkIndex:
         time = time[inside(time, windows)]
         yield MatchColumns(time, np.zeros(len(time), np.int64), np.ones(len(time), np.bool_))
 
-    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """Not supported: `cost` returns None."""
-        raise NotImplementedError
-
-    def select(self, parts: Sequence[Part], tasks: Sequence[ChunkTask]) -> RowSelection:
-        """Not supported: `cost` returns None."""
-        raise NotImplementedError
-
     def _count(self, parts: Sequence[Part]) -> int:
         """Number of messages of some topics of one recording in the same windows."""
         edges = parts[0].log_windows.ravel()
@@ -108,15 +98,15 @@ class ChunkIndex:
         self, recording: RecordingEntry, segment: int, chunk: int
     ) -> dict[int, NDArray[np.int64]]:
         key = recording.id, segment, chunk
-        if key in self._kept:
-            return self._kept[key]
+        if key in self._cached_times:
+            return self._cached_times[key]
         reader = self._session.segment(recording.id, segment)
         read_before = reader.bytes_read
         times = self._session.times(recording, segment, chunk)
         self._counters.bytes_read += reader.bytes_read - read_before
         size = sum(map(len, times.values()))
         if len(times) > 1 and size <= self._room:  # another topic may be asked about next
-            self._kept[key] = times
+            self._cached_times[key] = times
             self._room -= size
         return times
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -17,15 +18,19 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from pymongo.collection import Collection
 
+from hybridlog.query.message_filter import MessageFilter
 from hybridlog.query.predicate.from_mongo import from_mongo
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import statistic, to_bool, to_truth
 from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog.query.predicate.tree import Predicate
+from hybridlog.query.question import RecordedChannel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.index_bodies import index_fields
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog.schema.reduced_codec import reduce, reduced_channel
+from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.messages import Batch, Channel, Schema
 from tests.schema.wire_oracle import oracle
 
 Message = dict[str, object]
@@ -543,3 +548,19 @@ def test_of_filters(ask: Ask, question: Message, messages: list[Message]) -> Non
         [question],
         types,
     )
+
+
+@pytest.mark.parametrize(
+    ("where", "holds"),
+    [("r > 5", True), ("r > 999", False), ("r.max > 5", True), ("r.n == 1000", True)]
+    # What a summary cannot decide is not certain, with `not` in front of it either.
+    + [(f"{word}{test}", False) for word in ("", "not ") for test in ("r == 5", "r != 5")],
+)
+def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
+    channel = Channel("/r", "json", None, {}, has_publish_time=False)
+    payload = reduce(codec_for(channel), json.dumps({"r": [*range(1000)]}).encode())
+    zero = np.zeros(1, np.int64)
+    batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
+    recorded = RecordedChannel(cast("Any", None), 0, reduced_channel(channel), ChannelStats(), None)
+    found = MessageFilter(parse(where), None).matches(recorded, batch, zero)
+    assert found.holds.tolist() == [holds]
