@@ -1228,6 +1228,7 @@ class Store:
             self.refresh()
         return found
 
+    @_again_if_overtaken
     def keep(
         self,
         rules: Mapping[str, Any] | None = None,
@@ -1251,13 +1252,16 @@ class Store:
             StoreError: Another process deletes here, too; or the store is read-only.
         """
         from hybridlog.maintenance.keep import Keeper, Kept
+        from hybridlog.maintenance.opening import put_entry
         from hybridlog.maintenance.retention import Rules
 
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
-        keeper = Keeper(self.directory, self.remove)
+        is_remote = self.directory.is_remote
+        put = partial(put_entry, self.directory, self.catalog)
+        keeper = Keeper(self.directory, self.remove, changed=put if is_remote else lambda _: None)
         if dry_run:
             return Kept(keeper.plan(wanted))
-        self.directory.check_writable()
+        self.directory.check_changes()
         try:
             return keeper.keep(wanted, progress)
         finally:
@@ -1287,6 +1291,7 @@ class Store:
             self.directory.source.bucket.delete([one.name for one in found])
         return len(found), sum(one.size for one in found)
 
+    @_again_if_overtaken
     def pin(
         self,
         recording: str | RecordingEntry,
@@ -1310,7 +1315,6 @@ class Store:
         Raises:
             TimeError: A time is invalid, or the range is empty or outside of the recording.
         """
-        self._check_on_disk()
         from hybridlog.maintenance.keep import append_pins, may_hold, pin_of
 
         (entry,) = self.select([recording])
@@ -1322,17 +1326,17 @@ class Store:
             raise TimeError(f"Nothing to pin: recording {entry.label!r} has no message then.")
         name = secrets.token_hex(4)
         line = pin_of(name, (times[0], times[1]), topics, text(reason))
-        append_pins(self.directory, entry.label, entry.id, [line])
+        append_pins(self.directory, self.catalog, entry, line)
         self.session.catch_up(entry.id)
         return name
 
+    @_again_if_overtaken
     def unpin(self, *names: str) -> None:
         """Remove pins.
 
         Raises:
             UsageError: There is no pin of a name.
         """
-        self._check_on_disk()
         from hybridlog.maintenance.keep import append_pins
 
         known = {pin["id"]: entry for entry in self.select(None) for pin in entry.pins}
@@ -1341,7 +1345,7 @@ class Store:
                 raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")
         for name in names:
             entry, line = known[name], journal.event(journal.UNPINNED, id=name)
-            append_pins(self.directory, entry.label, entry.id, [line])
+            append_pins(self.directory, self.catalog, entry, line)
             self.session.catch_up(entry.id)
 
     @_again_if_overtaken
@@ -1412,6 +1416,7 @@ class Store:
         self.session.catch_up(entry.id)
         return self.entry(entry.id)
 
+    @_again_if_overtaken
     def mark(
         self,
         recording: str,
@@ -1435,7 +1440,6 @@ class Store:
                 before `moment`.
             StoreError: The recording is being written; use `hybridlog mark` without `--at`.
         """
-        self._check_on_disk()
         from hybridlog.maintenance import edit
 
         self.session.catch_up()
@@ -1459,6 +1463,7 @@ class Store:
         self.session.catch_up(entry.id)
         return self.entry(entry.id)
 
+    @_again_if_overtaken
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
         """Remove marks of a recording that were set after its end.
 

@@ -996,8 +996,8 @@ SILENT = [
         ),
         (
             "the-recording-that-has-the-label-is-marked",
-            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        inventory",
-            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        path = directory.recording(label)\n        inventory",
+            "    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:\n        with directory.at_hand(label) as here:\n            path",
+            "    with directory.writing(entry.label, wait_s=LOCK_WAIT_S) as label:\n        with directory.at_hand(label) as here:\n            path",
             f"{CHOSEN}[mark-3]",
         ),
     ),

@@ -221,7 +221,7 @@ def _keep(
             "--fields-age, or write them into [retention] of hybridlog.toml, as --save does."
         )
     if given["save"]:
-        store.directory.check_writable()
+        store.directory.check_changes()
         store.directory.change_settings(retention=rules)
     dry_run = given["dry_run"]
     with (
@@ -254,9 +254,8 @@ def _lines(found: Kept, *, dry_run: bool) -> Iterator[str]:
     pinned = f", {output.size(plan.pinned_bytes)} pinned" if plan.pinned_bytes else ""
     count = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
     did = f"{output.size(count)} would become free" if dry_run else f"{output.size(count)} freed"
-    yield (
-        f"{output.size(plan.used_bytes)} used{pinned}, {output.size(plan.free_bytes)} free: {did}"
-    )
+    free = "" if plan.free_bytes is None else f", {output.size(plan.free_bytes)} free"
+    yield f"{output.size(plan.used_bytes)} used{pinned}{free}: {did}"
 
 
 def _told(step: Step) -> str:

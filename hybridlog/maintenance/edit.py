@@ -121,32 +121,35 @@ def mark(
     if end is not None and end < moment:
         raise TimeError("A mark cannot end before it begins.")
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        path = directory.recording(label)
-        inventory = take_inventory(directory, label)
-        numbers = {*inventory.listing.sealed, *inventory.listing.open}
-        numbers.update(inventory.state.sealed if inventory.state is not None else ())
-        number = max(numbers, default=-1) + 1
-        channel, channel_id, schema_id = _channel(inventory)
-        payload = mark_payload(text, tags, end)
-        seq = _next_seq(directory, label, inventory)
-        segment = SegmentFile.create(path, number, recording_metadata(entry), seq)
-        until = {} if end is None else {"end": end}
-        marked = journal.event(
-            journal.MARKED, time=moment, **until, text=text, tags=dict(tags), segment=number
-        )
+        with directory.at_hand(label) as here:
+            path = here.recording(label)
+            inventory = take_inventory(directory, label)
+            numbers = {*inventory.listing.sealed, *inventory.listing.open}
+            numbers.update(inventory.state.sealed if inventory.state is not None else ())
+            number = max(numbers, default=-1) + 1
+            channel, channel_id, schema_id = _channel(inventory)
+            payload = mark_payload(text, tags, end)
+            seq = _next_seq(directory, label, inventory)
+            segment = SegmentFile.create(path, number, recording_metadata(entry), seq)
+            until = {} if end is None else {"end": end}
+            marked = journal.event(
+                journal.MARKED, time=moment, **until, text=text, tags=dict(tags), segment=number
+            )
 
-        def announce(sealed: Sealed) -> None:
-            # In this order: a mark whose segment is not listed does not exist.
-            Journal(path).append(marked, sealed_event(sealed))
+            def announce(sealed: Sealed) -> None:
+                # In this order: a mark whose segment is not listed does not exist.
+                Journal(path).append(marked, sealed_event(sealed))
 
-        try:
-            segment.define([(channel_id, schema_id, channel)])
-            segment.append_chunks([_chunk(channel_id, moment, payload, seq)], segment.position + 1)
-            segment.seal(sync=True, on_sealing=announce)
-        except BaseException:
-            segment.abandon()
-            _take_back(segment)
-            raise
+            try:
+                segment.define([(channel_id, schema_id, channel)])
+                segment.append_chunks(
+                    [_chunk(channel_id, moment, payload, seq)], segment.position + 1
+                )
+                segment.seal(sync=True, on_sealing=announce)
+            except BaseException:
+                segment.abandon()
+                _take_back(segment)
+                raise
         now = put_entry(directory, catalog, label)
         if entry.is_decoded:
             decode_again(directory, catalog, now)
@@ -175,8 +178,7 @@ def unmark(
         UsageError: It has no such mark.
     """
     with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        path = directory.recording(label)
-        state = journal.read(path)
+        state = journal.read(directory.recording(label))
         marks = state.marks if state is not None else []
         gone = [m for m in marks if m["text"] == text and moment in {None, m["time"]}]
         if not gone:
@@ -186,10 +188,12 @@ def unmark(
                 "a recorder are messages, and stay."
             )
         lines = [journal.event(journal.UNMARKED, segment=mark["segment"]) for mark in gone]
-        Journal(path).append(*lines)
-        state = journal.read(path)
-        assert state is not None
-        remove_marks(path, state)
+        with directory.at_hand(label, [mark["segment"] for mark in gone]) as here:
+            path = here.recording(label)
+            Journal(path).append(*lines)
+            state = journal.read(path)
+            assert state is not None
+            remove_marks(path, state)
         now = put_entry(directory, catalog, label)
         if entry.is_decoded:
             decode_again(directory, catalog, now)

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
+from hybridlog.maintenance.edit import append
 from hybridlog.maintenance.expiry import expire
 from hybridlog.maintenance.retention import (
     Held,
@@ -37,11 +38,12 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.journal import Journal
+from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import Event, JournalState
 
@@ -88,6 +90,7 @@ class Keeper:
         remove: Removes a whole recording, by its id.
         own: The recording that this process makes; None if it makes none.
         is_wanted: Returns whether to go on; asked before each deletion.
+        changed: Called with the label of each recording that lost payloads, while it is held.
     """
 
     def __init__(
@@ -97,11 +100,13 @@ class Keeper:
         own: Own | None = None,
         *,
         is_wanted: Callable[[], bool] = lambda: True,
+        changed: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._directory = directory
         self._remove = remove
         self._own = own
         self._is_wanted = is_wanted
+        self._changed = changed
         self._known: dict[str, tuple[str, Held]] = {}  # by label, with its look
         # Ids and segments that this pass could not change; -1 for the whole recording.
         self._failed: set[tuple[str, int]] = set()
@@ -109,6 +114,9 @@ class Keeper:
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
         path, now = self._directory.path, time.time_ns()
+        if isinstance(self._directory, RemoteDirectory):
+            used = self._directory.listed_bytes
+            return plan(self._held(now), rules, used=used, free=None, now=now)
         used, free = disk_bytes(path), shutil.disk_usage(path).free
         return plan(self._held(now), rules, used=used, free=free, now=now)
 
@@ -245,11 +253,13 @@ class Keeper:
                 if pinned & {*step.topics} if step.topics else pinned:
                     raise StoreError(f"{label}: a pin was set meanwhile.")
 
-        log = Journal(self._directory.recording(label), check=check)
         topics = step.topics or None
-        done = expire(self._directory, label, step.segments, topics, log=log, progress=progress)
         said = {} if topics is None else {"topics": [*topics]}
-        log.append(journal.event(journal.RETAINED, segments=[*step.segments], **said))
+        with self._directory.at_hand(label, step.segments) as here:
+            log = Journal(here.recording(label), check=check)
+            done = expire(here, label, step.segments, topics, log=log, progress=progress)
+            log.append(journal.event(journal.RETAINED, segments=[*step.segments], **said))
+        self._changed(label)
         return done.freed
 
 
@@ -261,29 +271,23 @@ def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
 
 
 def append_pins(
-    directory: StoreDirectory, label: str, recording: str, lines: Sequence[Event]
+    directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry, line: Event
 ) -> None:
-    """Append lines about pins to the journal of a recording, also of a running one.
-
-    Args:
-        directory: The store.
-        label: Label of the recording.
-        recording: Its id.
-        lines: The lines.
+    """Append a line about a pin to the journal of a recording, also of a running one.
 
     Raises:
         StoreError: Another command holds it, or it cannot be written.
         TopicError: It is gone.
     """
+    label, recording = entry.label, entry.id
     try:
-        with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
-            Journal(directory.recording(now)).append(*lines)
-            return
+        append(directory, catalog, entry, [line])
+        return
     except HeldError as error:
         if not error.is_recording:
             raise
     path = directory.recording(directory.label_now(label, recording))
-    Journal(path).append(*lines)
+    Journal(path).append(line)
     state = journal.read(path)
     if state is None or state.id != recording:  # it ended, and was renamed or removed
         raise StoreError(f"Recording {label!r} was changed meanwhile. Try again.")

@@ -318,7 +318,7 @@ class Plan:
 
     Attributes:
         used_bytes: Bytes that the store takes.
-        free_bytes: Free bytes of the disk.
+        free_bytes: Free bytes of the disk; None in a bucket.
         steps: The deletions.
         pinned_bytes: Bytes of segments that pins and tags keep.
         pins: Number of pins.
@@ -327,7 +327,7 @@ class Plan:
     """
 
     used_bytes: int
-    free_bytes: int
+    free_bytes: int | None
     steps: list[Step] = field(default_factory=list)
     pinned_bytes: int = 0
     pins: int = 0
@@ -335,14 +335,14 @@ class Plan:
     is_short: bool = False
 
 
-def plan(held: Iterable[Held], rules: Rules, *, used: int, free: int, now: int) -> Plan:
+def plan(held: Iterable[Held], rules: Rules, *, used: int, free: int | None, now: int) -> Plan:
     """Plan deletions: their order, and the reason of each.
 
     Args:
         held: What each recording holds, without segments that another process records.
         rules: The rules.
         used: Bytes that the store takes.
-        free: Free bytes of its disk.
+        free: Free bytes of its disk; None in a bucket.
         now: The time, ns.
     """
     return _Planning([*held], rules, used, free, now).made()
@@ -362,7 +362,9 @@ class _Piece:
 
 
 class _Planning:
-    def __init__(self, held: list[Held], rules: Rules, used: int, free: int, now: int) -> None:
+    def __init__(
+        self, held: list[Held], rules: Rules, used: int, free: int | None, now: int
+    ) -> None:
         self._held = held
         self._rules = rules
         self._now = now
@@ -432,8 +434,9 @@ class _Planning:
         rules, need = self._rules, -math.inf
         if rules.quota is not None:
             need = self._plan.used_bytes - share * rules.quota
-        if rules.min_free is not None:
-            need = max(need, times * rules.min_free - self._plan.free_bytes)
+        free = self._plan.free_bytes
+        if rules.min_free is not None and free is not None:
+            need = max(need, times * rules.min_free - free)
         return need - self._freed
 
     def _reason(self, share: float, times: float) -> str:

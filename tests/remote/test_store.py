@@ -173,6 +173,55 @@ def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
         assert last.entry("short-0").tags == {"c": "3", "d": "4"}
 
 
+def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
+    """Objects are added, and those that are not listed any more can be tidied away."""
+    publish_all(here, address, ("run", "moved"))
+    with hl.open(address) as store:
+        directory = store.directory
+        assert isinstance(directory, RemoteDirectory)
+        whole = {label: {*directory.files_of(label).values()} for label in ("run", "moved")}
+        raw = [message.raw for message in store.topic("/scan").in_recording("run")]
+        kept = store.mark("run", "+2s", "seen", {"by": "lab"}, until="+3s").marks
+        assert [mark["text"] for mark in kept] == ["slipped", "seen"]
+        store.mark("run", "+4s", "wrong")
+        assert len(store.unmark("run", "wrong").marks) == 2
+        pin = store.pin("run", "+0s", "+5s", reason="to keep")
+        assert store.unpin(store.pin("moved")) is None
+        said = answer("keep", "--quota", "1MB", "--save", "--json", store=Path(address), code=None)
+        print(said.err)
+        assert said.json["freed_bytes"] > 500_000
+        assert store.keep({"quota": "1MB"}).freed_bytes == 0
+    files.mounted.clear()
+    with hl.open(address) as store:
+        directory = store.directory
+        assert isinstance(directory, RemoteDirectory)
+        assert directory.settings.retention == {"quota": "1MB"}
+        (entry,) = store.recordings("run")
+        assert ([one["id"] for one in entry.pins], entry.marks) == ([pin], kept)
+        assert not store.verify().findings
+        for label, topic in (("run", "/scan"), ("moved", "/scan"), ("run", "/arm")):
+            assert store.topic(topic).in_recording(label).count() == 400
+        found = [*store.topic("/scan").in_recording("run")]
+        states = [message.state for message in found]
+        pinned = [
+            number for number, one in enumerate(found) if one.log_time_ns < BEGIN + 5 * SECOND
+        ]
+        assert {states[number] for number in pinned} == {"whole"}
+        assert {"expired", "whole"} == {*states}
+        assert [found[number].raw for number in pinned] == [raw[number] for number in pinned]
+        assert store.topic("/arm").in_recording("run").where("x >= 100").count() == 200
+        gone = set().union(*whole.values()) - {
+            one for label in whole for one in directory.files_of(label).values()
+        }
+        now = directory.source.bucket.now()
+        names = {one.name for one in directory.unneeded(now + 8 * 24 * 3600 * SECOND)}
+        assert gone
+        assert {one.name for one in gone} <= names
+        directory.source.bucket.delete([*names])
+        assert not store.verify().findings
+        assert [m.raw for m in store.topic("/scan").in_recording("run").limit(10)] == raw[:10]
+
+
 def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "short-0"))
     hour, week = 3600 * SECOND, 7 * 24 * 3600 * SECOND
@@ -442,9 +491,6 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
         refused: list[Callable[[], Any]] = [
             store.compact,
             store.repair,
-            lambda: store.mark("run", "+1s", "x"),
-            lambda: store.pin("run"),
-            lambda: store.keep({"quota": "1GB"}),
             lambda: store.import_from(published),
             lambda: store.start("new"),
         ]

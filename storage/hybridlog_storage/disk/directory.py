@@ -22,7 +22,7 @@ import stat
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -192,6 +192,10 @@ class StoreDirectory:
                 "another with --store."
             )
 
+    def check_changes(self) -> None:
+        """Raise if what users change by their commands cannot be changed; see `check_writable`."""
+        self.check_writable()
+
     def require(self, feature: str) -> None:
         """Note in the settings that only readers that know a feature may read the store.
 
@@ -312,6 +316,16 @@ class StoreDirectory:
             StoreError: It cannot be written.
         """
         journal.Journal(self.recording(label)).append(*lines)
+
+    @contextmanager
+    def at_hand(self, label: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
+        """A directory where files of a recording can be changed, within `writing`: this one.
+
+        Args:
+            label: The recording.
+            segments: Numbers of segments that must be there.
+        """
+        yield self
 
     def has(self, label: str) -> bool:
         """True if this name exists below `recordings`."""

@@ -246,11 +246,22 @@ class Bucket:
         tag = _tag(about)  # some servers have others that look like an MD5
         if about.size != len(content) or digest_like(tag, [content]) == tag:
             return about.size == len(content)
-        return b"".join(self._pieces(about)) == content
+        return b"".join(self.pieces(about)) == content
 
-    def _pieces(self, about: Object) -> Iterator[bytes]:
+    def pieces(self, about: Object) -> Iterator[bytes]:
+        """The content of an object, some megabytes at a time; errors as of `read`."""
         for at in range(0, about.size, _PART):
             yield self._range(about.name, (at, min(at + _PART, about.size)), about.version)
+
+    def replace(self, name: str, content: bytes, version: str) -> None:
+        """Replace an object that has still a version.
+
+        Raises:
+            ObjectChangedError: It has another one.
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        self.check_conditions()
+        self._put(name, content, {"e_tag": version})
 
     def create_beside(self, name: str, content: bytes) -> Object:
         """Create an object, under another name if this one is taken by other content.
@@ -276,7 +287,7 @@ class Bucket:
             ObjectChangedError: It has another version.
             BucketError: The server does not answer, or refuses.
         """
-        return _tag(about) or digest_like("", self._pieces(about))
+        return _tag(about) or digest_like("", self.pieces(about))
 
     def in_parts(self, name: str) -> Any:
         """A writer of an object, which takes the place of one of its name."""

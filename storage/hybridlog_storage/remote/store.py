@@ -15,7 +15,7 @@ import stat
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,11 +25,12 @@ from hybridlog_storage import journal
 from hybridlog_storage.catalog_parts import MemoryFolder, Version
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import Listing, StoreDirectory
-from hybridlog_storage.errors import ObjectExistsError, StoreError
+from hybridlog_storage.disk.directory import LOCK, PAYLOADS, Listing, StoreDirectory
+from hybridlog_storage.errors import ObjectChangedError, ObjectExistsError, StoreError
 from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
-from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object
+from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object, Upload
 from hybridlog_storage.remote.lists import (
     LISTS,
     MAX_LIST,
@@ -40,7 +41,8 @@ from hybridlog_storage.remote.lists import (
     list_name,
     number_of,
 )
-from hybridlog_storage.settings import EXPIRED, NONE, StoreSettings, settings_text
+from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.settings import EXPIRED, NONE, StoreSettings, read_settings, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.threads import taken_by_forks
 
@@ -75,7 +77,7 @@ class BucketFiles:
         self.path = Path(bucket.address)
         self.list = StoreList("")
         self._cache = cache
-        self._settings: bytes | None = None
+        self._settings: tuple[bytes, str] | None = None  # and their version
         self._looked_at = 0.0
         self._tables: tuple[Any, _Node] = None, {}  # of what list, and as folders
         self._compared: set[str] = set()
@@ -263,8 +265,30 @@ class BucketFiles:
         """
         with self.lock:
             if self._settings is None:
-                self._settings = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)[1]
-            return self._settings
+                about, data = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)
+                self._settings = data, about.version
+            return self._settings[0]
+
+    def change_settings(self, change: Callable[[], bytes]) -> None:
+        """Replace the file of settings by what is made of the newest one.
+
+        Raises:
+            BucketError: The server does not answer, or refuses; or they change all the time.
+        """
+        with self.lock:
+            for left in reversed(range(TRIES)):
+                self._settings = None
+                self.read_settings()
+                assert self._settings is not None
+                _, version = self._settings
+                try:
+                    self.bucket.replace(SETTINGS, change(), version)
+                    return
+                except ObjectChangedError:
+                    if not left:
+                        raise
+                finally:
+                    self._settings = None
 
     def _place(self, inner: tuple[str, ...]) -> str:
         return "/".join([self.bucket.address, *inner])
@@ -398,6 +422,16 @@ class RemoteDirectory(StoreDirectory):
             "it in a store on a disk, and bring that here with `hybridlog copy`."
         )
 
+    def change_settings(self, **changes: Any) -> None:
+        """Change settings of the store."""
+
+        def changed() -> bytes:
+            self.settings = replace(read_settings(self.path), **changes)
+            return settings_text(self.settings)
+
+        self.check_changes()
+        self.source.change_settings(changed)
+
     def new_recording(self, name: str) -> str:
         """Raise: nothing is recorded into a bucket."""
         self.check_writable()
@@ -451,6 +485,17 @@ class RemoteDirectory(StoreDirectory):
         yield
 
     @contextmanager
+    def retaining(self) -> Iterator[bool]:
+        """True: who deletes and comes second begins again."""
+        yield True
+
+    @property
+    def listed_bytes(self) -> int:
+        """Bytes of all files that the newest list names."""
+        recordings = [one.files for one in self._now.recordings.values()]
+        return sum(o.size for files_ in (*recordings, self._now.tables) for o in files_.values())
+
+    @contextmanager
     def writing(
         self, label: str, recording: str = "", *, wait_s: float = 0.0, records: bool = False
     ) -> Iterator[str]:
@@ -473,8 +518,7 @@ class RemoteDirectory(StoreDirectory):
         Raises:
             ObjectExistsError: Another process was faster: begin again.
         """
-        if self.read_only:
-            raise StoreError(f"The store {self.place} was opened for reading only.")
+        self.check_changes()
         with self.source.lock:
             self.source.look(self.settings.store_id, now=True)
             before = self._now
@@ -492,10 +536,17 @@ class RemoteDirectory(StoreDirectory):
                 self.source.is_changing = False
                 self._folder.end()
 
+    def check_changes(self) -> None:
+        """Raise if the store was opened for reading only."""
+        if self.read_only:
+            raise StoreError(f"The store {self.place} was opened for reading only.")
+
     def append(self, label: str, *lines: journal.Event) -> None:
         """Append lines to the journal of a recording, within `writing`: one more object."""
+        self._append(label, b"".join(map(journal.encode, lines)))
+
+    def _append(self, label: str, content: bytes) -> None:
         listed = self._now.recordings[label]
-        content = b"".join(map(journal.encode, lines))
         number = 1
         while True:
             path = f"{JOURNAL}.{number}"
@@ -509,6 +560,55 @@ class RemoteDirectory(StoreDirectory):
                 break
         about = Object(name, len(content), version, 0)
         self._relist(label, replace(listed, files={**listed.files, path: about}))
+
+    @contextmanager
+    def at_hand(self, label: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
+        """As of a directory; what the block leaves on the disk becomes objects.
+
+        Raises:
+            StoreError: An object that is needed is lost.
+        """
+        objects, bucket = self.files_of(label), self.source.bucket
+        names = {sealed_name(number) for number in segments}
+        wanted = set(names)
+        if wanted:  # payloads belong to all segments
+            wanted |= {path for path in objects if path.startswith(f"{PAYLOADS}/")}
+        if any(not path.startswith(f"{PAYLOADS}/{journal.FIELDS}") for path in wanted - names):
+            wanted |= {path for path in objects if path.endswith(".mcap")}
+        with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
+            there = StoreDirectory.create(Path(place) / "store")
+            folder = there.recording(label)
+            lines = files.read_file(self.recording(label) / JOURNAL, journal.MAX_JOURNAL)
+            folder.mkdir()
+            (folder / JOURNAL).write_bytes(lines)
+            for path in wanted:
+                try:
+                    self._fetch(objects[path], folder / path)
+                except (KeyError, FileNotFoundError, ObjectChangedError) as error:
+                    raise StoreError(f"{self.recording(label) / path} is lost.") from error
+            before = _files_below(folder)
+            yield there
+            after = _files_below(folder)
+            listed = dict(self._now.recordings[label].files)
+            for path, about in after.items():
+                if before.get(path) != about:
+                    name = f"{RECORDINGS}/{self._now.recordings[label].id}/{path}"
+                    upload = Upload(bucket, name, about[0])
+                    with (folder / path).open("rb") as file:
+                        while piece := file.read(1 << 20):
+                            upload.write(piece)
+                    listed[path] = upload.close()
+            for path in before.keys() - after.keys():
+                del listed[path]
+            self._relist(label, replace(self._now.recordings[label], files=listed))
+            if added := (folder / JOURNAL).read_bytes()[len(lines) :]:
+                self._append(label, added)
+
+    def _fetch(self, about: Object, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as file:
+            for piece in self.source.bucket.pieces(about):
+                file.write(piece)
 
     def refresh(self) -> None:
         """See what the newest list has."""
@@ -595,6 +695,16 @@ class RemoteDirectory(StoreDirectory):
 
     def _relist(self, label: str, recording: ListedRecording) -> None:
         self.source.list = replace(self._now, recordings={**self._now.recordings, label: recording})
+
+
+def _files_below(folder: Path) -> dict[str, tuple[int, int]]:
+    """Size and inode of the files of a recording, by path; without its journal and lock."""
+    found = {}
+    for path in folder.rglob("[!.]*"):
+        if path.is_file() and path.name not in {JOURNAL, LOCK}:
+            about = path.stat()
+            found[path.relative_to(folder).as_posix()] = about.st_size, about.st_ino
+    return found
 
 
 def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
