@@ -634,14 +634,21 @@ class Store:
         a: Texts,
         b: Texts,
         *,
+        topics: Sequence[str] = (),
+        between: tuple[TimeLike | None, TimeLike | None] | None = None,
         tolerance: float = 0.0,
         contract: Contract | None = None,
     ) -> list[Difference]:
         """Compare two recordings, or two choices of recordings, by topic.
 
+        Of two recordings of different length, the time that only one has is one difference,
+        and the others are those of the time that both have.
+
         Args:
             a: Label, name, id or glob; several recordings are compared together.
             b: The same.
+            topics: Only these; empty for all.
+            between: Only messages of this range of each; None for the time that both have.
             tolerance: Numbers are equal that differ by at most this share of the greater one.
             contract: Also compare which of its rules are broken; None for no contract.
 
@@ -651,7 +658,14 @@ class Store:
         from hybridlog.contract.diff import diff
 
         sides = (self.recordings(one).check() for one in (a, b))
-        return diff(self.session, *sides, tolerance=tolerance, contract=contract)
+        return diff(
+            self.session,
+            *sides,
+            topics=topics,
+            between=between,
+            tolerance=tolerance,
+            contract=contract,
+        )
 
     @of_one_moment
     def align(

@@ -564,6 +564,8 @@ def params_of(command: click.Command) -> list[click.Parameter]:
     return [param for each in command.commands.values() for param in each.params]
 
 
+ASKING = {"-t", "--between", "--where", "--strict", "-n", "-F", "-o", "-f", "--json", "-q", "-v"}
+"""Options that all commands have which ask about topics."""
 CHOICE = (
     "| `-r`, `--tag`, `--has`, `--type`, `--during`, `--last`, `--older-than`, `--with` "
     "| [which recordings]"
@@ -575,9 +577,11 @@ _CHOOSING = {"recording", "tag", "has", "types", "during", "last", "older_than",
 def option_rows(text: str) -> dict[str, str]:
     """The rows of tables of options, by the first spelling of the option."""
     return {
-        row.split("`")[1].split()[0]: row
+        re.findall(r"`(-[^` ]+)", row)[0]: row
         for row in text.splitlines()
-        if row.startswith("| `-") and "[which recordings]" not in row and "[common" not in row
+        if row.startswith(("| `-", "| `TOPIC`, `-"))
+        and "[which recordings]" not in row
+        and "[common" not in row
     }
 
 
@@ -588,11 +592,15 @@ def test_every_option_is_described(name: str) -> None:
     text = pages[name]
     common = re.findall(r"^\| (.*) \| \[common options\]", text, flags=re.MULTILINE)
     named = set(re.findall(r"`([^`]+)`", "".join(common)))
+    asks = re.search(r"^\| asking options \| \[once for all\](.*) \|$", text, re.MULTILINE)
+    if asks is not None:
+        named |= ASKING - set(re.findall(r"`([^`]+)`", asks[1]))
     shared = option_rows(pages["Common options"])
     chosen = option_rows(pages["Choosing recordings"])
     own = option_rows(text)
     params = params_of(commands()[name])
-    if CHOICE in text:
+    everywhere = {"--store", "--mongo", "--help"}
+    if CHOICE in text or asks is not None:
         assert {parameter.name for parameter in params} >= _CHOOSING
         assert len(chosen) == len(_CHOOSING)
         params = [p for p in params if p.name not in _CHOOSING]
@@ -603,7 +611,7 @@ def test_every_option_is_described(name: str) -> None:
             assert shown in text, f"{name}: the argument {shown}"
             continue
         row = own.get(spellings[0], "")
-        if not row and named.intersection(spellings):
+        if not row and (named | everywhere).intersection(spellings):
             row = shared[spellings[0]]
         assert row, f"{name}: {spellings[0]} has no row"
         assert set(spellings) <= set(re.findall(r"--?[a-zA-Z][\w-]*", row)), (name, spellings)

@@ -130,28 +130,19 @@ class Destination:
             check_room(self.path, force=self.force, is_directory=folder)
 
 
-def format_of(form: str | None, path: Path | None, names: Sequence[str]) -> str:
-    """The format of an answer: as given, by the suffix, or the usual one for standard output.
+def format_option(formats: Sequence[str], piped: str = " on a terminal, else jsonl") -> Any:
+    """The option `--format`.
 
     Args:
-        form: As given.
-        path: The output.
-        names: Formats that the command has.
-
-    Raises:
-        UsageError: The suffix names none of them.
+        formats: Formats that the command has.
+        piped: What it does without this option, behind `else a table`.
     """
-    if form is not None:
-        return form
-    if path is None:
-        return SCREEN if sys.stdout.isatty() else "jsonl"
-    suffixes = suffixes_of(names)
-    if path.suffix.lower() not in suffixes:
-        raise UsageError(
-            f"The name {path} does not give the format: add --format, or end it in "
-            f"{', '.join(suffixes)}."
-        )
-    return suffixes[path.suffix.lower()]
+    return option(
+        f"Without: by the suffix of -o, else a table{piped}.",
+        name="--format",
+        short="-F",
+        type=click.Choice([SCREEN, *formats]),
+    )
 
 
 def output_option(what: str) -> Any:
@@ -167,20 +158,17 @@ def output_option(what: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tabular(Forced):
+class Tabular(Forced, AsJson):
     """Options of commands that answer with rows.
 
     Attributes:
         formats: Formats that the command has.
+        unasked: The format on a terminal, and elsewhere.
     """
 
     formats: ClassVar[Sequence[str]] = TABLE_FORMATS
-    form: str | None = option(
-        "Without: by the suffix of -o, else a table on a terminal, else jsonl.",
-        name="--format",
-        short="-F",
-        type=click.Choice([SCREEN, *TABLE_FORMATS]),
-    )
+    unasked: ClassVar[tuple[str, str]] = SCREEN, "jsonl"
+    form: str | None = format_option(TABLE_FORMATS)
     output: Path | None = output_option("Write to this file")
     limit: int | None = option("At most so many.", "N", short="-n", type=click.IntRange(min=0))
 
@@ -189,42 +177,46 @@ class Tabular(Forced):
         """Format and place of the answer.
 
         Raises:
-            UsageError: The file exists, or the format does not fit the place.
+            UsageError: The file exists, or the format does not fit the place or `--json`.
         """
-        to = Destination(
-            form=format_of(self.form, self.output, self.formats),
-            path=self.output,
+        to = self.destination()
+        to.check()
+        return to
+
+    def destination(self) -> Destination:
+        """Format and place, which are yet to be checked.
+
+        Raises:
+            UsageError: The format does not fit `--json`, or the name does not give it.
+        """
+        if self.as_json and self.form not in {None, "json"}:
+            raise UsageError("--json is --format json: leave out one of them.")
+        form, path = "json" if self.as_json else self.form, self.output
+        if form is None and path is None:
+            form = self.unasked[not sys.stdout.isatty()]
+        elif form is None and path is not None:
+            suffixes = suffixes_of(self.formats)
+            if path.suffix.lower() not in suffixes:
+                raise UsageError(
+                    f"The name {path} does not give the format: add --format, or end it in "
+                    f"{', '.join(suffixes)}."
+                )
+            form = suffixes[path.suffix.lower()]
+        return Destination(
+            form=form or SCREEN,
+            path=path,
             force=self.force,
             limit=self.limit,
             quiet=getattr(self, "quiet", False),
         )
-        to.check()
-        return to
 
 
 @dataclass(frozen=True, kw_only=True)
-class Listing(Tabular, AsJson):
+class Listing(Tabular):
     """Options of commands that answer with rows, which are text unless another form is given."""
 
-    form: str | None = option(
-        "Without: by the suffix of -o, else a table.",
-        name="--format",
-        short="-F",
-        type=click.Choice([SCREEN, *TABLE_FORMATS]),
-    )
-
-    @property
-    def to(self) -> Destination | None:  # type: ignore[override]
-        """Format and place of the answer; None for text and JSON.
-
-        Raises:
-            UsageError: As of `Tabular`, or `--json` is given as well.
-        """
-        if self.output is None and self.form in {None, SCREEN}:
-            return None
-        if self.as_json:
-            raise UsageError("--json is a form of its own: leave out --format and --output.")
-        return super().to
+    unasked: ClassVar[tuple[str, str]] = SCREEN, SCREEN
+    form: str | None = format_option(TABLE_FORMATS, "")
 
     def answer(
         self,
@@ -243,13 +235,9 @@ class Listing(Tabular, AsJson):
             spare: Columns that may be left out, see `output.fitted`.
             titles: Number of cells in the title of a block, see `output.print_rows`.
         """
-        from hybridlog.schema.text import without_nan
-
         to, limited = self.to, islice(rows, self.limit)
-        if to is not None:
+        if to.form != SCREEN:
             answer_tables(_tables_of(limited), lambda: None, to)
-        elif self.as_json:
-            output.print_json_list(map(without_nan, limited))
         elif titles or spare:
             shown = [cells(row) for row in limited]
             if shown:

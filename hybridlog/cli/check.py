@@ -10,11 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering, check_room
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import InStore, Quiet, Strict, Topics, Verbose, one_recording
+from hybridlog.cli.options import (
+    Between,
+    InStore,
+    Quiet,
+    Strict,
+    Topics,
+    Verbose,
+    one_recording,
+    topics,
+)
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Check(options.Named, Strict, Topics, Verbose, Listing):
+class _Check(Strict, Topics, Verbose, Listing):
     contract: Path | None = option(
         "Judge recordings by the rules in this file; exit code 12 if one is broken.",
         "FILE",
@@ -47,8 +56,8 @@ def check_command(given: _Check) -> None:
     contract, make = given.contract, given.make
     if sum(map(bool, (contract, make))) > 1 or (given.junit and not contract):
         raise UsageError("--contract and --make exclude each other; --junit is for --contract.")
-    if contract and (given.topic or given.between):
-        raise UsageError("A contract is about whole recordings: leave out -t and --between.")
+    if contract and (given.topics or given.between):
+        raise UsageError("A contract is about whole recordings: leave out topics and --between.")
     for path in filter(None, (make, given.junit)):
         check_room(path, force=given.force)
     if contract is not None:
@@ -138,12 +147,13 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Diff(InStore, Quiet, Listing):
+class _Diff(Between, InStore, Quiet, Listing):
     a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
     b: str = one_recording("The same.", "B")
     tolerance: str = option(
         "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
     )
+    topic: tuple[str, ...] = topics()
     contract: Path | None = option("Also compare which rules in this file are broken.", "FILE")
 
 
@@ -151,15 +161,22 @@ class _Diff(InStore, Quiet, Listing):
 def diff_command(given: _Diff) -> None:
     """Show what differs between two recordings.
 
-    Topics, types, messages, rates, gaps, losses, and statistics of fields. Exit code 12 if
-    anything does.
+    First what only one has: times and topics. Then types, messages, rates, gaps, losses, and
+    statistics of fields of the time that both have. Exit code 12 if anything differs.
     """
     from hybridlog.contract.contract import Contract, parse_share
 
     rules = None if given.contract is None else Contract.read(given.contract)
     share = parse_share(given.tolerance)
     with given.opened() as store:
-        found = store.diff(given.a, given.b, tolerance=share, contract=rules)
+        found = store.diff(
+            given.a,
+            given.b,
+            topics=given.topic,
+            between=given.between,
+            tolerance=share,
+            contract=rules,
+        )
         verdicts = [
             f"{name}: {_verdict(store.judge(rules, name))}"
             for name in (given.a, given.b)
@@ -175,6 +192,8 @@ def diff_command(given: _Diff) -> None:
     sys.stdout.flush()
     if not (given.quiet or given.as_json):
         output.notes(verdicts)
-        output.note(output.counted(len(found), "difference") + "." if found else "No difference.")
+        total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
+        is_cut = given.limit is not None and given.limit < len(found)
+        output.note(f"The first {given.limit} of {total}" if is_cut else total)
     if found:
         raise click.exceptions.Exit(DIFFERENT)

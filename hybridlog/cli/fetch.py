@@ -17,7 +17,7 @@ from hybridlog.cli.answers import (
     Destination,
     Tabular,
     answer_query,
-    format_of,
+    format_option,
     latched,
     output_option,
     print_cost,
@@ -44,6 +44,12 @@ _FORMATS = formats_of()
 class _Choices(Asking, Tabular, Slices):
     needs_topic: ClassVar[bool] = True
     formats: ClassVar[Sequence[str]] = _FORMATS
+
+    @property
+    def unasked(self) -> tuple[str, str]:  # type: ignore[override]
+        """The format on a terminal, and elsewhere."""
+        return "jsonl" if self.follow else SCREEN, "jsonl"
+
     clock: str = option(
         "The clock of --between.", type=click.Choice(["log", "publish", "header"]), default="log"
     )
@@ -70,12 +76,7 @@ class _Choices(Asking, Tabular, Slices):
         "With such a --where, in place of --within: until this long after each match.", "DURATION"
     )
     count: bool = option("Only print how many.")
-    form: str | None = option(
-        "Without: by the suffix of -o, else a table on a terminal, else jsonl.",
-        name="--format",
-        short="-F",
-        type=click.Choice([SCREEN, *_FORMATS]),
-    )
+    form: str | None = format_option(_FORMATS)
     output: Path | None = output_option(
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
     )
@@ -202,8 +203,9 @@ def _destination(choices: _Choices) -> Destination:
     assert choices.topics
     _check_near(choices)
     _check_together(choices)
-    usual = "jsonl" if choices.follow else None
-    form = format_of(choices.form or usual, choices.output, _FORMATS)
+    to = choices.destination()
+    form = to.form
+    to = replace(to, settings=options.bag_settings(choices.storage, choices.file_size, form))
     options.check_latched(
         no_latched=choices.no_latched, original_times=choices.original_times, form=form
     )
@@ -211,13 +213,6 @@ def _destination(choices: _Choices) -> Destination:
     as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
     if choices.frame is not None and (as_it_came or form == "raw"):
         raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
-    to = Destination(
-        form=form,
-        path=choices.output,
-        force=choices.force,
-        quiet=choices.quiet,
-        settings=options.bag_settings(choices.storage, choices.file_size, form),
-    )
     if choices.split is not None and to.path is None:
         raise UsageError("--split-by writes files: name them with -o.")
     if not choices.count and choices.split is None:
@@ -249,7 +244,8 @@ def _check_together(choices: _Choices) -> None:
         ]
     if choices.follow:
         alone["--follow prints messages as they come, in lines (jsonl, csv)"] = [
-            (not _is_text(choices.form), f"--format {choices.form}"),
+            (choices.as_json, "--json"),
+            (not _is_lines(choices.form), f"--format {choices.form}"),
             (choices.output is not None, "--output"),
             (choices.reverse, "--reverse"),
             (choices.count, "--count"),
@@ -264,8 +260,9 @@ def _check_together(choices: _Choices) -> None:
                 raise UsageError(f"{reason}: leave out {name}.")
 
 
-def _is_text(form: str | None) -> bool:
-    return form is None or (form in OUTPUTS and OUTPUTS[form].is_text)
+def _is_lines(form: str | None) -> bool:
+    """True for text without an end, which a list in JSON has."""
+    return form is None or (form in OUTPUTS and OUTPUTS[form].is_text and form != "json")
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:

@@ -106,7 +106,9 @@ class Command(click.Command):
         except TopicError as error:
             for argument in self.params:
                 given = ctx.params.get(argument.name or "")
-                if not isinstance(argument, click.Argument) or "did you mean" in str(error):
+                if not isinstance(argument, click.Argument) or hasattr(error, "__notes__"):
+                    continue
+                if "did you mean" in str(error):
                     continue
                 for word in given if isinstance(given, tuple) else [str(given or "")]:
                     hint = self._meant(word, argument)

@@ -172,7 +172,7 @@ def _rehearse(given: _Given, trigger: str) -> None:
     Raises:
         UsageError: Options that do not fit are given.
     """
-    if given.words or given.topic or given.where or given.between or given.to is not None:
+    if given.words or given.topic or given.where or given.between or given.form or given.output:
         raise UsageError(
             "--rehearse is about whole snapshots: leave out topics, --where, --between, --format "
             "and --output."

@@ -14,7 +14,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Filtered, Forced, names_argument
+from hybridlog.cli.options import Filtered, Forced, Served
 from hybridlog.cli.serve import check_installed, play
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats.slices import SliceCache
@@ -52,24 +52,18 @@ _VIEWERS: Final = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Filtered, Forced):
+class _Given(Filtered, Forced, Served):
     viewer: str = argument(
         "foxglove, lichtblick or rerun, which is started; websocket plays to those that "
         "connect. Where only Lichtblick is installed, foxglove is that.",
         "VIEWER",
         type=click.Choice([*sorted(_VIEWERS), _WEBSOCKET]),
     )
-    names: tuple[str, ...] = names_argument()  # type: ignore[misc]
     path: Path | None = option(
         "Write the slice to this MCAP file; without, into the user's cache.",
         "FILE",
         name="--output",
         short="-o",
-    )
-    port: int | None = option(
-        "With websocket: TCP port on this computer, 0 for a free one; without, 8765.",
-        "N",
-        type=click.IntRange(0, 65535),
     )
     speed: float | None = option(
         "With websocket: times as fast as recorded, 0.01 to 100; viewers can change it.",
@@ -78,12 +72,6 @@ class _Given(Filtered, Forced):
     )
     loop: bool = option("With websocket: begin again at the end.")
     paused: bool = option("With websocket: wait until a viewer plays.")
-    origins: tuple[str, ...] = option(
-        "With websocket: let a web page of this origin connect, such as "
-        "https://viewer.example; Foxglove and pages of this computer may.",
-        "URL",
-        name="--allow-origin",
-    )
 
 
 @command(_Given)

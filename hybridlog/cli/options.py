@@ -24,10 +24,11 @@ from hybridlog.cli.completion import (
 from hybridlog.cli.open_store import opened_store
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
+    from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
     from hybridlog.store import Store
 
@@ -208,16 +209,17 @@ class Topics(Between, Choosing, InStore, Quiet):
     """Options of commands about messages of some topics.
 
     Attributes:
-        words: Topics as arguments of the command.
         where: Predicates that all messages satisfy.
         strict: Incomplete answers are refused.
         needs_topic: Without a topic, the question is refused: all would be too much.
     """
 
     needs_topic: ClassVar[bool] = False
-    words: ClassVar[tuple[str, ...]] = ()
     where: ClassVar[tuple[str, ...]] = ()
     strict: ClassVar[bool] = False
+    words: tuple[str, ...] = argument(
+        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
+    )
     topic: tuple[str, ...] = topics()
 
     @property
@@ -248,13 +250,22 @@ class Topics(Between, Choosing, InStore, Quiet):
             query.completeness().check()
         return query
 
-    def bounded(self, query: Query) -> Query:
-        """The messages of a query in the range of `--between` or `--last`."""
+    @property
+    def span(self) -> tuple[TimeLike, TimeLike | None] | None:
+        """The range of `--between` or `--last`; None for all times.
+
+        Raises:
+            UsageError: Both are given.
+        """
         if self.between is None:
-            return query if self.last is None else query.between(self.since)
+            return None if self.last is None else (self.since, None)
         if self.last is not None:
             raise UsageError("--last is a range of time, as --between: give one of them.")
-        return query.between(*self.between)
+        return self.between
+
+    def bounded(self, query: Query) -> Query:
+        """The messages of a query in that range."""
+        return query if self.span is None else query.between(*self.span)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,10 +292,24 @@ class Verbose:
 
 @dataclass(frozen=True, kw_only=True)
 class Asking(Filtered, Verbose):
-    """Options of commands that answer about topics."""
+    """Options of commands that answer about messages."""
 
-    words: tuple[str, ...] = argument(  # type: ignore[misc]
-        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
+
+@dataclass(frozen=True, kw_only=True)
+class Served:
+    """Options of commands that serve other programs on this computer."""
+
+    port: int | None = option(
+        "Port of 127.0.0.1 to serve on, 0 for a free one; without, a free one for the page, 8765 "
+        "for viewers that connect.",
+        "N",
+        type=click.IntRange(0, 65535),
+    )
+    origins: tuple[str, ...] = option(
+        "Let web pages of this origin read what is served, such as https://viewer.example; "
+        "Foxglove's may.",
+        "URL",
+        name="--allow-origin",
     )
 
 
@@ -451,14 +476,17 @@ def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Quer
     Raises:
         TopicError: A name fits nothing, or several things; or no recording is chosen.
     """
-    if choice.is_everything:
-        if not topics:
-            return store.all_topics()
-        return store.topic(*topics)
-    chosen = recordings_of(store, choice)
+    chosen = None if choice.is_everything else recordings_of(store, choice)
+    asked = store if chosen is None else chosen
     if not topics:
-        return chosen.all_topics()
-    return chosen.topic(*topics)
+        return asked.all_topics()
+    try:
+        return asked.topic(*topics)
+    except TopicError as error:
+        for name in topics:
+            if store.session.snapshot().called(name):
+                error.add_note(f"{name} is a recording: -r {name}.")
+        raise
 
 
 def parse_fields(text: str, option: str = "--fields") -> list[str]:

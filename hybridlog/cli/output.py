@@ -244,15 +244,6 @@ def print_json(value: object) -> None:
     print(_json(value))  # noqa: T201
 
 
-def print_json_list(values: Iterable[object]) -> None:
-    """Print values as a list in JSON, one at a time: memory does not grow with them."""
-    before = "["
-    for value in values:
-        print(before, _json(value).replace("\n", "\n  "), sep="\n  ", end="")  # noqa: T201
-        before = ","
-    print("[]" if before == "[" else "\n]")  # noqa: T201
-
-
 def _json(value: object) -> str:
     return json.dumps(value, default=_plain, indent=2, ensure_ascii=False)
 

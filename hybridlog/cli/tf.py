@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_recording, complete_topic
-from hybridlog.cli.options import Between, InStore, Quiet, Strict, Verbose
+from hybridlog.cli.options import Strict, Topics, Verbose, topics
 from hybridlog.cli.output import notes, print_table, short_duration
 from hybridlog.query.times import parse_duration, parse_range, parse_time
-from hybridlog.wording import counted
+from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
 
 _MAX_TIMES = 10_000_000
@@ -21,32 +20,25 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hybridlog.query.times import TimeLike
     from hybridlog.tf.tree import FrameTree
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Between, InStore, Tabular, Strict, Quiet, Verbose):
+class _Given(Strict, Topics, Tabular, Verbose):
+    words: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
     target: str | None = argument("The frame of the results.", "[TARGET]")
     source: str | None = argument(
         "The frame to transform from; with -t, without, that of the topic's messages.", "[SOURCE]"
     )
     at: tuple[str, ...] = option("At this time.", "TIME")
     step: str | None = option("At regular times, such as 100ms.", "DURATION")
-    topic: str | None = option(
-        "At the header stamps of a topic, or the log times of one without.",
-        "TOPIC",
-        short="-t",
-        shell_complete=complete_topic,
+    topic: tuple[str, ...] = topics(
+        "At the header stamps of this topic, or the log times of one without."
     )
     extrapolate: str | None = option(
         "So long before its first and after its last, a transform holds; without, it does not.",
         "DURATION",
-    )
-    recording: str | None = option(
-        "The recording; without, the only one.",
-        "RECORDING",
-        short="-r",
-        shell_complete=complete_recording,
     )
 
 
@@ -59,7 +51,8 @@ def tf_command(given: _Given) -> None:
     pitch and yaw in rad; by default at the latest time that has a transform. Rows of times
     without one are empty, and the reasons are printed.
     """
-    target, source, topic, between = given.target, given.source, given.topic, given.between
+    target, source, topic = given.target, given.source, given.topic
+    between = given.span if given.step or topic else given.between
     if sum(map(bool, (given.at, given.step, topic))) > 1:
         raise UsageError("--at, --step and --topic exclude each other.")
     if target is None and (given.at or given.step or topic or between):
@@ -68,19 +61,20 @@ def tf_command(given: _Given) -> None:
 
     to = given.to
     with given.opened() as store:
-        tree = store.tf(given.recording)
+        chosen = given.recordings_in(store)
+        tree = store.tf(chosen.ids or None)
         if given.strict and tree.remarks:
             raise IncompleteError(" ".join(tree.remarks))
         if target is None:
             _show_tree(tree, to, quiet=given.quiet)
             return
-        if topic is None:
+        if not topic:
             stamps = _times(tree, target, source, at=given.at, step=given.step, between=between)
         else:
-            query = store.recordings(given.recording).topic(topic)
-            frames, stamps = frames_and_stamps(
-                query if between is None else query.between(*between)
-            )
+            query = given.bounded(chosen.topic(*topic))
+            if len(query.topics) > 1:
+                raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
+            frames, stamps = frames_and_stamps(query)
             if source is None and len(frames) == 1:
                 source = frames[0]
         if source is None:
@@ -105,7 +99,7 @@ def _times(
     *,
     at: tuple[str, ...],
     step: str | None,
-    between: tuple[str, str] | None,
+    between: tuple[TimeLike, TimeLike | None] | None,
 ) -> NDArray[np.int64]:
     """The times that are wanted, ns."""
     import numpy as np

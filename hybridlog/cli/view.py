@@ -12,31 +12,19 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, InStore, one_recording
+from hybridlog.cli.options import AsJson, InStore, Served, one_recording
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 
 _MAX_FOLDERS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(InStore, AsJson):
+class _Given(InStore, AsJson, Served):
     recording: str | None = one_recording(
         "Show this one first; without, the list of recordings.", "[RECORDING]"
     )
-    port: int = option(
-        "Port of 127.0.0.1 to serve on.",
-        type=click.IntRange(0, 65535),
-        default=0,
-        show_default="any free one",
-    )
     opens: bool = option("Open the page in the browser.", name="--open")
     mcap: bool = option("Also serve selections as MCAP, to Foxglove and Lichtblick.")
-    origins: tuple[str, ...] = option(
-        "With --mcap: let web pages of this origin read them, such as "
-        "http://localhost:8080; those of Foxglove may.",
-        "URL",
-        name="--allow-origin",
-    )
 
 
 @command(_Given)
@@ -61,7 +49,7 @@ def view_command(given: _Given) -> None:
     if given.origins and not given.mcap:
         raise UsageError("--allow-origin is about --mcap: add that.")
     with given.opened(is_lasting=True) as store:
-        server = ViewServer(store, given.port, viewers=given.mcap, origins=given.origins)
+        server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
         url = server.url
         label = ""
         if given.recording is not None:

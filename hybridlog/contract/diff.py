@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hybridlog.contract.judge import broken, judge
 from hybridlog.query.times import format_duration
+from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
 from hybridlog.wording import counted
 
@@ -17,11 +18,14 @@ if TYPE_CHECKING:
     from hybridlog.contract.contract import Contract
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.regularity import TopicCheck
-    from hybridlog.query.query import Query
+    from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
     from hybridlog.session import Session
 
 Value = float | str | None
+Range = tuple["TimeLike | None", "TimeLike | None"]
+_LEAST_SHARE: Final = 0.01
+"""Of the longer recording: only a difference in length above that is one of times."""
 _STATISTICS: Final = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
@@ -31,7 +35,7 @@ class Difference:
 
     Attributes:
         topic: Full name of the topic; empty for the whole recording.
-        what: `topic`, `type`, `messages`, `rate`, `longest_gap`, `jitter`, `late_start`,
+        what: `times`, `topic`, `type`, `messages`, `rate`, `longest_gap`, `jitter`, `late_start`,
             `early_stop`, `lost`, the path of a field, or a rule of the contract.
         a: What the first choice has, in words; empty if it has no such thing.
         b: The same for the second one.
@@ -46,14 +50,22 @@ class Difference:
 class _Side:
     """Figures of some recordings together, to be compared."""
 
-    def __init__(self, recordings: Recordings) -> None:
-        self.query: Query = recordings.all_topics()
+    def __init__(
+        self, recordings: Recordings, topics: Collection[str], between: Range | None
+    ) -> None:
         self.summaries = recordings.summaries
         self.topics: dict[str, list[TopicCheck]] = defaultdict(list)
-        for one in self.query.check():
-            self.topics[one.topic].append(one)
         self.fields: dict[str, dict[str, FieldStatistics]] = defaultdict(dict)
-        for row in self.query.stats():
+        # Marks are about a recording, and not of it.
+        known = [one for one in recordings.topics() if one in topics and one != MARKS]
+        if not known:
+            return
+        query = recordings.topic(*known)
+        if between is not None:
+            query = query.between(*between)
+        for one in query.check():
+            self.topics[one.topic].append(one)
+        for row in query.stats():
             self.fields[row.topic][row.field] = row
 
     def values(self, topic: str) -> dict[str, Value]:
@@ -79,22 +91,33 @@ def diff(
     a: Recordings,
     b: Recordings,
     *,
+    topics: Sequence[str] = (),
+    between: Range | None = None,
     tolerance: float = 0.0,
     contract: Contract | None = None,
 ) -> list[Difference]:
-    """Differences between two choices of recordings, by topic.
+    """Differences between two choices of recordings: what only one has first, then by topic.
+
+    Of two recordings of different length, the time that only one has is one difference, and
+    the others are those of the time that both have.
 
     Args:
         session: The open store.
         a: The first choice.
         b: The second one.
+        topics: Only these, as `Store.topic` takes them; empty for all.
+        between: Only messages of this range of each; None for all times.
         tolerance: Numbers are equal that differ by at most this share of the greater one.
         contract: Also compare which of its rules are broken; None for no contract.
     """
-    sides = _Side(a), _Side(b)
-    found: list[Difference] = []
-    # Marks are about a recording, and not of it.
-    for topic in sorted({*sides[0].topics, *sides[1].topics} - {MARKS}):
+    known = sorted({*a.topics(), *b.topics()})
+    wanted = resolve(topics, known) if topics else known
+    ranges, found = (between, between), []
+    if between is None and (shared := _shared(a, b)) is not None:
+        ranges, found = shared.ranges, [Difference("", "times", *shared.others)]
+    sides = _Side(a, wanted, ranges[0]), _Side(b, wanted, ranges[1])
+    rest: list[Difference] = []
+    for topic in sorted({*sides[0].topics, *sides[1].topics}):
         if not all(topic in side.topics for side in sides):
             words = [
                 ""
@@ -108,16 +131,56 @@ def diff(
         for what, value in first.items():
             if not _same(value, second[what], tolerance):
                 words = [_worded(what, one) for one in (value, second[what])]
-                found.append(Difference(topic, what, *words))
-        found += _of_fields(topic, sides[0].fields[topic], sides[1].fields[topic], tolerance)
+                rest.append(Difference(topic, what, *words))
+        rest += _of_fields(topic, sides[0].fields[topic], sides[1].fields[topic], tolerance)
+    found += rest
     if contract is not None:
         broke = [_broken(session, contract, side) for side in sides]
         rules = sorted({*broke[0], *broke[1]})
         changed = [rule for rule in rules if (rule in broke[0]) != (rule in broke[1])]
-        for topic, rule, wanted in changed:
-            words = [one.get((topic, rule, wanted), "holds") for one in broke]
-            found.append(Difference(topic, f"{rule} {wanted}", *words))
+        for topic, rule, limit in changed:
+            words = [one.get((topic, rule, limit), "holds") for one in broke]
+            found.append(Difference(topic, f"{rule} {limit}", *words))
     return found
+
+
+class _Shared(NamedTuple):
+    """The time that two recordings have both.
+
+    Attributes:
+        ranges: Its begin and end in each, ns.
+        others: What only the one and only the other has, in words.
+    """
+
+    ranges: tuple[Range, Range]
+    others: tuple[str, str]
+
+
+def _shared(a: Recordings, b: Recordings) -> _Shared | None:
+    """The time that two recordings of different length share: the same, else since the begin.
+
+    None if both have about the same, or if there are more recordings.
+    """
+    if len(a) != 1 or len(b) != 1:
+        return None
+    spans = [one.summaries[0].extent for one in (a, b)]
+    lengths = [end - begin for begin, end in spans]
+    begins, ends = zip(*spans, strict=True)
+    if max(begins) < min(ends):
+        ranges = [(max(begins), min(ends))] * 2
+    else:
+        ranges = [(begin, begin + min(lengths)) for begin in begins]
+    others = []
+    for (first, last), (begin, end) in zip(spans, ranges, strict=True):
+        parts = (first, begin), (end, last)
+        least = _LEAST_SHARE * max(lengths)
+        told = [
+            f"+{format_duration(low - first)} to +{format_duration(high - first)}"
+            for low, high in parts
+            if high - low > least
+        ]
+        others.append(", ".join(told))
+    return _Shared((ranges[0], ranges[1]), (others[0], others[1])) if any(others) else None
 
 
 def _of_fields(

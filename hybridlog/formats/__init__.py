@@ -122,6 +122,7 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
     "jsonl": OutputFormat(
         "lines", "hybridlog.formats.jsonl:JsonlWriter", (".jsonl", ".ndjson"), is_text=True
     ),
+    "json": OutputFormat("lines", "hybridlog.formats.jsonl:JsonWriter", (".json",), is_text=True),
     "csv": OutputFormat("table", "hybridlog.formats.tables:CsvWriter", (".csv",), is_text=True),
     "parquet": OutputFormat("table", "hybridlog.formats.tables:ParquetWriter", (".parquet",)),
     "arrow": OutputFormat("table", "hybridlog.formats.tables:ArrowWriter", (".arrow", ".feather")),

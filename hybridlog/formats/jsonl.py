@@ -1,4 +1,4 @@
-"""Writes JSON lines: one object for each message, in UTF-8.
+"""Writes JSON: one object for each message, a line each, in UTF-8; or one list of them.
 
 JSON has no NaN and no infinities: they are the strings `"NaN"`, `"Infinity"` and
 `"-Infinity"`, as in the JSON form of protobuf. Integers keep all their digits, also those
@@ -37,6 +37,9 @@ class JsonlWriter(FileWriter):
         target: Path or binary stream.
     """
 
+    end = "\n"
+    """What follows a line."""
+
     def __init__(self, target: Target) -> None:
         super().__init__()
         self._sink = Sink(target)
@@ -48,9 +51,9 @@ class JsonlWriter(FileWriter):
             DiskFullError: No space left.
         """
         block: list[str] = []
-        size = 0
+        size, end = 0, self.end
         for piece in chain.from_iterable(
-            (f"{line}\n",) if isinstance(line, str) else chain(line, "\n") for line in lines
+            (f"{line}{end}",) if isinstance(line, str) else chain(line, end) for line in lines
         ):
             block.append(piece)
             size += len(piece)
@@ -69,6 +72,38 @@ class JsonlWriter(FileWriter):
 
     def _discard(self) -> None:
         self._sink.abort()
+
+
+class JsonWriter(JsonlWriter):
+    """Writes the same objects as one list, a line each.
+
+    Args:
+        target: Path or binary stream.
+    """
+
+    end = ""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self._between = "[\n  "
+
+    def write(self, lines: Iterable[Line]) -> None:
+        """Append elements of the list.
+
+        Raises:
+            DiskFullError: No space left.
+        """
+        super().write(self._elements(lines))
+
+    def _elements(self, lines: Iterable[Line]) -> Iterator[Line]:
+        for line in lines:
+            yield self._between
+            yield line
+            self._between = ",\n  "
+
+    def _finish(self) -> None:
+        self._sink.write(b"[]\n" if self._between.startswith("[") else b"\n]\n")
+        super()._finish()
 
 
 def rows_within(size: int, rows: int, *, limit: int = 16 << 20) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from hybridlog.cli import output
+from hybridlog.formats.jsonl import JsonWriter
 from tests.independent import Seen, read_bag
 
 from .running import run
@@ -100,8 +102,12 @@ def test_long_answers_are_printed_some_rows_at_a_time(
     output.print_table([("none", "left")], [])
     assert capsys.readouterr().out == "none\n"
     for values in ([], [{"a": "1\n2", "b": [1, {"c": None}]}, {}], [3]):
-        output.print_json_list(iter(values))
-        assert capsys.readouterr().out == json.dumps(values, indent=2) + "\n"
+        target = io.BytesIO()
+        with JsonWriter(target) as writer:
+            for value in values:
+                writer.write([json.dumps(value)])
+                writer.write([iter(json.dumps(value))])
+        assert json.loads(target.getvalue()) == [one for one in values for _ in range(2)]
 
 
 def test_changes(store: Path, seen: list[Seen]) -> None:

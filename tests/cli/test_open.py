@@ -40,7 +40,7 @@ def scans(logs: Path) -> list[Seen]:
 def test_a_slice_is_handed_to_rerun(logs: Path, store: Path, tmp_path: Path, bin_: Path) -> None:
     install(bin_, "rerun")
     cache = tmp_path / "cache"
-    words = ("open", "rerun", "robot", "-t", "/base/scan", "--between", "+1s", "+2s")
+    words = ("open", "rerun", "/base/scan", "-r", "robot", "--between", "+1s", "+2s")
     env = {"PATH": str(bin_), "XDG_CACHE_HOME": str(cache)}
     done = run(*words, store=store, **env)
     program, *options, path = called(bin_)
@@ -62,7 +62,7 @@ def test_a_slice_is_handed_to_rerun(logs: Path, store: Path, tmp_path: Path, bin
 def test_foxglove_is_also_lichtblick(store: Path, tmp_path: Path, bin_: Path) -> None:
     install(bin_, "lichtblick")
     path = tmp_path / "own.mcap"
-    words = ("open", "foxglove", "robot", "-t", "/map", "-o", path)
+    words = ("open", "foxglove", "-r", "robot", "-t", "/map", "-o", path)
     run(*words, store=store, PATH=str(bin_))
     assert called(bin_) == ["lichtblick", str(path)]
     assert [m.topic for m in read_mcap(path)] == ["/map"]

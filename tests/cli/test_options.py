@@ -50,7 +50,7 @@ def _error(*words: str, store: Path) -> str:
         ("intervals", "scan", "-r", "robot", "--where", "ranges.min < 5"),
         ("stats", "scan", "odom", "-r", "robot"),
         ("stats", "scan", "odom", "-r", "robot", "--rate"),
-        ("check", "robot"),
+        ("check", "scan", "odom", "-r", "robot"),
         ("diff", "robot", "torn"),
     ],
     ids=" ".join,
@@ -66,7 +66,7 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
     assert len(lines) == 1
     assert _set(json.loads(lines[0])) == _set(rows[0])
     assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
-    assert "--json is a form" in _error(*words, "--json", "-F", "csv", store=store)
+    assert "--json is --format json" in _error(*words, "--json", "-F", "csv", store=store)
 
 
 def _set(row: dict[str, object]) -> dict[str, object]:
@@ -106,7 +106,7 @@ def test_ages_choose(tmp_path: Path) -> None:
 def test_what_people_read(store: Path, tmp_path: Path) -> None:
     """A contract's verdict in a comparison, and ends of marks as times."""
     rules = tmp_path / "rules.yaml"
-    answer("check", "robot", "--make", rules, store=store)
+    answer("check", "-r", "robot", "--make", rules, store=store)
     told = answer("diff", "robot", "torn", "--contract", rules, store=store, code=None).err
     assert "robot: " in told
     assert "rules: none broken." in told

@@ -18,7 +18,7 @@ from .running import run, started, wait_for
 
 def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:
     output = tmp_path / "output"
-    command = ("open", "websocket", "robot", "-t", "/imu/data", "-t", "/map", "--store", store)
+    command = ("open", "websocket", "/imu/data", "/map", "-r", "robot", "--store", store)
     with started(*command, "--port", 0, "--speed", 100, output=output) as process:
         wait_for(lambda: "Ctrl-C ends it." in output.read_text())
         lines = output.read_text().splitlines()
@@ -40,14 +40,14 @@ def test_wrong_ways(store: Path) -> None:
     assert "nothing" in run("open", "websocket", "nothing", store=store, code=2).err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        done = run("open", "websocket", "robot", "-t", "/map", "--port", port, store=store, code=2)
+        done = run("open", "websocket", "/map", "-r", "robot", "--port", port, store=store, code=2)
     assert f"Port {port} is in use" in done.err
     assert done.out == ""
 
 
 def test_topics_that_viewers_cannot_show_are_said(store: Path, tmp_path: Path) -> None:
     with started(
-        "open", "websocket", "odd", "--store", store, "--port", 0, output=tmp_path / "out"
+        "open", "websocket", "-r", "odd", "--store", store, "--port", 0, output=tmp_path / "out"
     ) as process:
         wait_for(lambda: "Ctrl-C ends it." in (tmp_path / "out").read_text())
         assert "Viewers cannot show" in (tmp_path / "out").read_text()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -104,6 +106,37 @@ def test_losses_choices_tolerance_and_verdicts(store: hl.Store) -> None:
     rules = Contract.parse(GOOD)
     judged = store.diff("base", "n-early-stop", tolerance=1.0, contract=rules)
     assert [d.what for d in judged if d.what.startswith("early_stop ")] == ["early_stop 100ms"]
+
+
+def test_what_only_one_has_comes_first(tmp_path: Path) -> None:
+    """A longer log differs by the time that the other lacks, and not in every count."""
+    sent = good()
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        play(store, sent, "all")
+        play(store, [m for m in sent if m.time < LATE], "begin")
+        play(store, [m for m in sent if m.time >= LATE], "rest")
+        later = [replace(m, time=m.time + 100 * SECOND) for m in [*sent, EXTRA]]
+        play(store, [m for m in later if m.time < LATE + 100 * SECOND], "later")
+
+        def told(a: str, b: str, **how: Any) -> list[tuple[str, ...]]:
+            return [(d.topic, d.what, d.a, d.b) for d in store.diff(a, b, **how)]
+
+        (only,) = told("all", "begin")
+        assert only[:2] == ("", "times")
+        assert re.fullmatch(r"\+1\.9\d+s to \+\d\.\d+s", only[2])
+        assert only[3] == ""
+        assert told("rest", "all") == [("", "times", "", "+0s to +2s")]
+        # Of different times: since the beginnings.
+        first, topic, *others = told("all", "later", topics=["scan", "new"])
+        assert (first, topic) == (only, ("/new", "topic", "", "1 message"))
+        assert {one[0] for one in others} <= {"/scan"}
+        assert told("all", "begin", between=("+1s", "+1.5s")) == []
+        path = store.directory.path
+    asked = ("diff", "all", "later", "-t", "scan", "-t", "new", "-n", "1")
+    done = run(*asked, store=path, code=12)
+    assert len(done.lines) == 2
+    assert done.err == f"The first 1 of {2 + len(others)} differences.\n"
+    assert run("diff", "all", "begin", "--between", "+1s", "+1.5s", store=path).out == ""
 
 
 def test_the_command(store: hl.Store, tmp_path: Path) -> None:
