@@ -217,7 +217,7 @@ class Session:
         self._columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._lock = threading.Lock()
-        self._remember_meanings()
+        self._reset_meanings()
 
     # The index.
 
@@ -497,7 +497,7 @@ class Session:
             known[topic] = state.uncertain(topic)
         return turn, known[topic]
 
-    def forget_uncertain(self) -> None:
+    def clear_uncertain(self) -> None:
         """Look again: another process has changed the index."""
         self._uncertain = None
 
@@ -625,9 +625,9 @@ class Session:
             if now != summary:
                 moment.snapshot = snapshot.with_changes([now], {now.topics: running.topics})
                 if now.topics != summary.topics:
-                    self._remember_meanings()
+                    self._reset_meanings()
                 if entry.status not in UNFINISHED:
-                    self._forget_tables(entry)
+                    self._invalidate_tables(entry)
                 if self._latest.snapshot is snapshot:
                     self._latest = _Moment(moment.snapshot)
             return entry
@@ -803,8 +803,8 @@ class Session:
         snapshot = self.snapshot()
         chosen: dict[int, None] = {}
         for given in names:
-            asked = given if isinstance(given, str) else given.id
-            name = self.repairs.copies.get(asked, asked)
+            wanted = given if isinstance(given, str) else given.id
+            name = self.repairs.copies.get(wanted, wanted)
             found = snapshot.named(name)
             if len(found) != 1:
                 shown = found or range(len(snapshot))
@@ -983,7 +983,7 @@ class Session:
         check(found, self.field_types(topics, recordings))
         return found
 
-    def _remember_meanings(self) -> None:
+    def _reset_meanings(self) -> None:
         """Cache the results for patterns and predicates, which take half of a small count."""
         self._resolved = lru_cache(_MAX_MEANINGS)(self._resolve)
         self._parsed = lru_cache(_MAX_MEANINGS)(self._parse)
@@ -1239,12 +1239,12 @@ class Session:
             ):
                 repairs.noted_tables -= {(recording, topic) for topic in topics}
 
-    def _forget_tables(self, recording: RecordingEntry) -> None:
+    def _invalidate_tables(self, recording: RecordingEntry) -> None:
         """Look for the tables of a recording again, now that it has ended."""
         topics = {channel.topic for channel in recording.channels}
         self._tables_tried -= {(recording.id, topic) for topic in topics}
         if "tables" in vars(self):
-            self.tables.forget(recording, topics)
+            self.tables.look_again_for(recording, topics)
 
     # Changes.
 
@@ -1272,7 +1272,7 @@ class Session:
             self._changed, self._names = changed, names
             self._begin(_Moment(now))
             places = {before.by_label[label] for label in labels & before.by_label.keys()}
-            self._forget({before.summaries[place].id for place in places})
+            self._invalidate_recordings({before.summaries[place].id for place in places})
 
     def _begin(self, moment: _Moment) -> None:
         """Begin a moment, also in a block of this thread that asks about an earlier one."""
@@ -1285,7 +1285,7 @@ class Session:
         self._index_version = None
         self._places = None
 
-    def _forget(self, recordings: Collection[str]) -> None:
+    def _invalidate_recordings(self, recordings: Collection[str]) -> None:
         """Drop what was read of some recordings, by their ids."""
         for recording in recordings:
             self._channels.pop(recording, None)
@@ -1301,7 +1301,7 @@ class Session:
         self.cache.drop("chunk")
         if "tables" in vars(self):
             self.tables.look_again()
-        self._remember_meanings()
+        self._reset_meanings()
 
     # Closing.
 
@@ -1330,7 +1330,7 @@ class Session:
         self._tables_tried.clear()
         if "tables" in vars(self):
             self.tables.invalidate()
-        self._remember_meanings()
+        self._reset_meanings()
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""

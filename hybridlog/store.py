@@ -1117,12 +1117,12 @@ class Store:
         database = self.database_for("The contents of the index")
         places = self.session.places("The contents of the index").of(self.topics())
         known = [place for place in places.values() if place.is_listed]
-        asked = [(place.collection, place.documents()) for place in known]
-        counts = database.count_each([one for one in asked if one[1]])
+        filters = [(place.collection, place.documents()) for place in known]
+        counts = database.count_each([one for one in filters if one[1]])
         shared = iter(counts)
         return [
             (place.topic, collection, next(shared) if own else database.count(collection))
-            for place, (collection, own) in zip(known, asked, strict=True)
+            for place, (collection, own) in zip(known, filters, strict=True)
         ]
 
     @_again_if_lost
@@ -1569,14 +1569,14 @@ class Store:
         keeper = Keeper(self.directory, self.remove)
         try:
             reason = f"it was copied to {where}"
-            kept = keeper.expire_all(recording, digests, rules, reason, progress)
+            expired = keeper.expire_all(recording, digests, rules, reason, progress)
         except HeldError as error:
             report.problems.append(f"Payloads stay: {error}")
             return
         finally:
             self.session.catch_up(recording)
-        report.freed_bytes += kept.freed_bytes
-        report.problems += kept.problems
+        report.freed_bytes += expired.freed_bytes
+        report.problems += expired.problems
 
     def import_from(
         self,

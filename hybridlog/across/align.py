@@ -13,7 +13,7 @@ import pyarrow as pa
 from hybridlog.across.bins import AGGREGATES, Aggregate, Bins, RegularTimes
 from hybridlog.across.interpolate import interpolated
 from hybridlog.across.match import HOWS, UNKNOWN, How, match
-from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, together
+from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, concatenated
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.remarks import about_names, remarks
@@ -155,8 +155,8 @@ class Aligned:
         """
         streams = self._streams
         topics = tuple(topic for stream in streams for topic in stream.question.topics)
-        asked = replace(streams[0].question, topics=topics)
-        found = [*about_names(self._session, asked, names)]
+        named = replace(streams[0].question, topics=topics)
+        found = [*about_names(self._session, named, names)]
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
@@ -174,8 +174,8 @@ class Aligned:
 
     def completeness(self) -> Completeness:
         """Return what the rows lack, as `Query.completeness` does, after they were read."""
-        asked_for = [(stream.question, stream.counters) for stream in self._streams]
-        return completeness_of(self._session, *asked_for[0], *asked_for[1:])
+        answered = [(stream.question, stream.counters) for stream in self._streams]
+        return completeness_of(self._session, *answered[0], *answered[1:])
 
     def __repr__(self) -> str:
         names = [name for stream in self._others for name in stream.question.topics]
@@ -218,7 +218,7 @@ class Aligned:
 
     def to_arrow(self) -> pa.Table:
         """The rows as one Arrow table, first column log time."""
-        return together(list(self.to_tables()))
+        return concatenated(list(self.to_tables()))
 
     def to_pandas(self) -> pd.DataFrame:
         """The rows as a frame, indexed by log time (UTC, ns)."""
@@ -389,7 +389,7 @@ class _Partner:
                 parts.append(self._matched(times[begin:end]))
                 begin = end
             if begin == len(times):
-                return together(parts)
+                return concatenated(parts)
             self._advance()
 
     def _open(self, times: NDArray[np.int64]) -> None:
@@ -399,7 +399,7 @@ class _Partner:
         self._blocks = self._reader.tables(self._recording)
         found = [self._none, *self._blocks]
         all_times = np.concatenate([part for part, _ in found])
-        table = together([part for _, part in found])
+        table = concatenated([part for _, part in found])
         order = np.argsort(all_times, kind="stable")
         order = order[all_times[order] != UNKNOWN]
         self._times, self._table = all_times[order], table.take(pa.array(order))
@@ -444,11 +444,11 @@ class _Partner:
         parts = []
         if begin:
             around = np.array([self._last[0], self._times[0]])
-            two = together([self._last[1], self._table.slice(0, 1)])
+            two = concatenated([self._last[1], self._table.slice(0, 1)])
             parts.append(self._found(times[:begin], around, two))
         if begin < len(times) or not parts:
             parts.append(self._found(times[begin:], self._times, self._table))
-        return together(parts)
+        return concatenated(parts)
 
     def _found(
         self, times: NDArray[np.int64], known: NDArray[np.int64], table: pa.Table

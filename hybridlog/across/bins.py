@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.topic_reader import TIME, Stream, TopicReader, together
+from hybridlog.across.topic_reader import TIME, Stream, TopicReader, concatenated
 from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
@@ -219,7 +219,7 @@ class _Rows:
         if self._how == _COUNT:
             return pa.table({})
         missing = self._place < 0
-        return together(self._whole).take(pa.array(self._place, mask=missing))
+        return concatenated(self._whole).take(pa.array(self._place, mask=missing))
 
 
 class _Column:

@@ -251,8 +251,8 @@ def _times_of(session: Session, question: Question, clock: Clock, counters: Coun
     """
     if clock != "log":
         # Refused where the topic does not have the clock.
-        asked = replace(question, clock=clock, bounds=(None, None), during=None)
-        Planner(session, asked, Counters()).parts()
+        on_clock = replace(question, clock=clock, bounds=(None, None), during=None)
+        Planner(session, on_clock, Counters()).parts()
     planner = Planner(session, question, counters)
     log_times, times, has = (
         [np.empty(0, np.int64)],

@@ -88,8 +88,8 @@ class TopicReader:
         self._clock_column = TIME
         if clock != "log":
             # Refused where the topic does not have the clock.
-            asked = replace(question, clock=clock, bounds=question.bounds or (None, None))
-            Planner(session, asked, Counters()).parts()
+            on_clock = replace(question, clock=clock, bounds=question.bounds or (None, None))
+            Planner(session, on_clock, Counters()).parts()
             self._clock_column = STAMP if clock == "header" else "publish_time"
             question = self._with_clock(question, known)
         self.question = question
@@ -214,7 +214,7 @@ class TopicReader:
         return pa.table(found)
 
 
-def together(tables: Sequence[pa.Table]) -> pa.Table:
+def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
     """Tables one after the other; a column has the common exact type of all of them."""
     if len(tables) == 1:
         return tables[0]

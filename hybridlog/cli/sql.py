@@ -61,4 +61,4 @@ def sql_command(given: _Given) -> None:
             answer_sql(answer, to)
         sys.stdout.flush()
         if not given.quiet:
-            notes(answer.told())
+            notes(answer.sentences())

@@ -55,7 +55,7 @@ def run_prompt(
                     answer = connection.query(text, timeout=timeout)
                     answer_sql(answer, to)
                     sys.stdout.flush()
-                    notes(answer.told())
+                    notes(answer.sentences())
             except HybridlogError as error:
                 for line in str(error).splitlines():
                     note(line)

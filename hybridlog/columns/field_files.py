@@ -181,11 +181,11 @@ class Rows(NamedTuple):
 
 def rows_of(columns: pa.StructArray) -> Rows:
     """The fields and errors of rows of a file."""
-    kept = [field for field in columns.type if field.name not in _OWN]
+    present = [field for field in columns.type if field.name not in _OWN]
     fields = None
-    if kept:
-        arrays = [columns.field(field.name) for field in kept]
-        fields = pa.StructArray.from_arrays(arrays, fields=kept)
+    if present:
+        arrays = [columns.field(field.name) for field in present]
+        fields = pa.StructArray.from_arrays(arrays, fields=present)
     errors = []
     error = columns.field("error")
     for reason in pc.unique(error.drop_null()).to_pylist():

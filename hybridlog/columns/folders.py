@@ -37,10 +37,10 @@ from hybridlog.columns.layout import (
     parts_folder,
 )
 from hybridlog.columns.parquet_file import (
-    KeptBytes,
     NoRoomError,
     ParquetFileReader,
     ParquetFileWriter,
+    ReusedBytes,
 )
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
@@ -296,21 +296,21 @@ class TableFolders:
         table = pa.concat_tables(
             [rows if rows.schema.equals(schema) else rows.cast(schema) for _, rows in pieces]
         ).combine_chunks()
-        kept = None if before is None else before.kept()
+        reused = None if before is None else before.reusable()
         in_front = False
-        if kept is not None and before is not None:
-            size = len(kept.data) * table.num_rows / max(before.about.rows, 1)
-            in_front = size < kept.offset
+        if reused is not None and before is not None:
+            size = len(reused.data) * table.num_rows / max(before.about.rows, 1)
+            in_front = size < reused.offset
         try:
-            part = self._part(found, table, kept, in_front=in_front)
+            part = self._part(found, table, reused, in_front=in_front)
         except NoRoomError:
-            part = self._part(found, table, kept, in_front=False)
+            part = self._part(found, table, reused, in_front=False)
         if self._recording in sections and not (self._is_listed and path.name in self._shared):
             self._list(path.parent, path.name)
         files.rename(part, path, depth=files.IN_RECORDING, new_depth=IN_TYPE)
 
     def _part(
-        self, sections: Sequence[Section], table: Any, kept: KeptBytes | None, *, in_front: bool
+        self, sections: Sequence[Section], table: Any, reused: ReusedBytes | None, *, in_front: bool
     ) -> Path:
         """A finished file without its name."""
         parts = parts_folder(self._root, self._recording)
@@ -323,7 +323,7 @@ class TableFolders:
             table,
             depth=files.IN_RECORDING,
             is_all=True,
-            kept=kept,
+            reused=reused,
             in_front=in_front,
         )
         try:

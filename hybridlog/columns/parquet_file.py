@@ -48,7 +48,7 @@ _SEALED_BY: Final = "hybridlog.footer"
 _NUMBERS: Final = count()
 
 
-class KeptBytes(NamedTuple):
+class ReusedBytes(NamedTuple):
     """The row groups of the file that a new one replaces.
 
     They keep their place in the new file, where nothing refers to them: DuckDB reads the
@@ -79,7 +79,7 @@ class ParquetFileWriter:
         level: Level of zstd.
         is_all: True if the example rows are all rows of the file. Then floats without NaN
             have statistics: DuckDB answers wrongly from those of floats with NaN among them.
-        kept: Row groups of the file that this one replaces.
+        reused: Row groups of the file that this one replaces.
         in_front: True to write the new row groups in front of the kept ones.
 
     Raises:
@@ -95,7 +95,7 @@ class ParquetFileWriter:
         encodings: Mapping[str, str] | None = None,
         level: int = 1,
         is_all: bool = False,
-        kept: KeptBytes | None = None,
+        reused: ReusedBytes | None = None,
         in_front: bool = False,
     ) -> None:
         self.path = path
@@ -126,9 +126,9 @@ class ParquetFileWriter:
                 column_encoding={leaf: how for leaf, how in chosen.items() if how != DICTIONARY},
                 write_statistics=[leaf for leaf in kinds if leaf in ordered],
             )
-            self._behind = kept if in_front else None
-            if kept is not None and not in_front:
-                self._put(kept)
+            self._behind = reused if in_front else None
+            if reused is not None and not in_front:
+                self._put(reused)
             self._begin = self._file.tell()
         except BaseException:
             self.discard()
@@ -191,10 +191,10 @@ class ParquetFileWriter:
             self.discard()
             raise
 
-    def _put(self, kept: KeptBytes) -> None:
+    def _put(self, reused: ReusedBytes) -> None:
         """Write kept bytes at their place."""
-        self._file.write(bytes(kept.offset - self._file.tell()))
-        self._file.write(kept.data)
+        self._file.write(bytes(reused.offset - self._file.tell()))
+        self._file.write(reused.data)
 
     def discard(self) -> None:
         """Delete the unfinished file."""
@@ -351,7 +351,7 @@ class ParquetFileReader:
         """Number of values in a column of a row group, nulls included."""
         return int(self._parquet.metadata.row_group(group).column(leaf).num_values)
 
-    def kept(self) -> KeptBytes:
+    def reusable(self) -> ReusedBytes:
         """The bytes of its row groups.
 
         Raises:
@@ -359,7 +359,7 @@ class ParquetFileReader:
         """
         begin, end = self.about.span
         try:
-            return KeptBytes(begin, self._source.checked(begin, end))
+            return ReusedBytes(begin, self._source.checked(begin, end))
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
 

@@ -119,7 +119,7 @@ class ArrayTable(TopicTable):
         place: tuple[int, int],
         offset: NDArray[np.int64],
         paths: Collection[str] | None,
-        tell: Callable[[Path, int], None],
+        note: Callable[[Path, int], None],
     ) -> Any:
         """Fields of some messages of a chunk.
 
@@ -127,7 +127,7 @@ class ArrayTable(TopicTable):
             place: Numbers of the segment and the chunk.
             offset: int64[n], where each lies in the content of the chunk.
             paths: Dotted paths of the fields; None for all.
-            tell: Called with the file and the number of each row group that is read.
+            note: Called with the file and the number of each row group that is read.
 
         Returns:
             n rows, typed as the codec's; None if the columns do not have all of it.
@@ -140,7 +140,7 @@ class ArrayTable(TopicTable):
             if found is None:
                 continue
             part = TablePart(reader, *found, FIRST, LAST)
-            tell(reader.path, part.group)
+            note(reader.path, part.group)
             try:
                 own, records = self.read(part, paths, {"ref"})
                 fields = self._fitted(records, kind)

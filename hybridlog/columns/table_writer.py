@@ -615,7 +615,7 @@ class TableWriter:
                 additions.setdefault(folder, Addition()).files.append(path)
         for folder, found in waiting.items():
             addition = additions.setdefault(folder, Addition())
-            addition.section, addition.rows = self._together(entry, found)
+            addition.section, addition.rows = self._joined(entry, found)
         replaced: set[str] = set()
         if not self._is_new:
             replaced = topics_of(entry) if self._wanted is None else {*self._wanted, *incomplete}
@@ -626,7 +626,7 @@ class TableWriter:
             folders = TableFolders(self._root, self._recording, entry.digests)
             folders.add(additions, replaced, types)
 
-    def _together(
+    def _joined(
         self, entry: RecordingEntry, found: Sequence[tuple[_Topic, Any, list[Piece]]]
     ) -> tuple[Section, Any]:
         """Rows of topics of one shape, one topic after the other."""

@@ -254,7 +254,7 @@ class Tables:
         found = None
         with suppress(FileNotFoundError, StoreError):
             found = self.check(recording, topic)
-        self._remember(key, found, generation)
+        self._note_found(key, found, generation)
         return found
 
     def look_again(self) -> None:
@@ -264,7 +264,7 @@ class Tables:
             self._found.clear()
             self._looked_at.clear()
 
-    def forget(self, recording: RecordingEntry, topics: Collection[str]) -> None:
+    def look_again_for(self, recording: RecordingEntry, topics: Collection[str]) -> None:
         """Look for tables of a recording again."""
         with self._lock:
             for topic in topics:
@@ -274,9 +274,9 @@ class Tables:
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """Ignore the table from now on, because it was found to be damaged."""
-        self._remember((recording.id, topic), None, self._generation)
+        self._note_found((recording.id, topic), None, self._generation)
 
-    def _remember(self, key: tuple[str, str], found: TopicTable | None, generation: int) -> None:
+    def _note_found(self, key: tuple[str, str], found: TopicTable | None, generation: int) -> None:
         with self._lock:
             if generation == self._generation:
                 self._found[key] = found

@@ -125,8 +125,8 @@ def may_hold(node: Node, zones: Mapping[str, Zone]) -> bool:
         zones: The arrays with zones, by the path of their field.
     """
     if isinstance(node, And | Or):
-        together = all if isinstance(node, And) else any
-        return together(may_hold(item, zones) for item in node.items)
+        combine = all if isinstance(node, And) else any
+        return combine(may_hold(item, zones) for item in node.items)
     if isinstance(node, Member) and not node.negated:
         return any(_may_compare(Compare(node.field, "==", value), zones) for value in node.values)
     return not isinstance(node, Compare) or _may_compare(node, zones)

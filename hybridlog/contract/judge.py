@@ -113,19 +113,19 @@ class _Judge:
             wanted = f"{rules.rate:g} Hz ± {100 * rules.tolerance:g} %"
             yield self._result(one.topic, "rate", wanted, found, holds=holds)
         late, early = one.late_ns or 0, (one.early_ns or 0) + beyond
-        yield from self._most(
+        yield from self._at_most(
             one.topic, "longest_gap", rules.longest_gap, max(one.gap_ns or 0, late, early)
         )
-        yield from self._most(one.topic, "jitter", rules.jitter, one.jitter_ns or 0)
-        yield from self._most(one.topic, "late_start", rules.late_start, late)
-        yield from self._most(one.topic, "early_stop", rules.early_stop, early)
+        yield from self._at_most(one.topic, "jitter", rules.jitter, one.jitter_ns or 0)
+        yield from self._at_most(one.topic, "late_start", rules.late_start, late)
+        yield from self._at_most(one.topic, "early_stop", rules.early_stop, early)
         if rules.lost is not None:
             yield self._lost(one.topic, rules.lost, one.lost)
 
     def _of_stamps(self, rules: TopicRules, topic: str) -> Iterator[Result]:
         limits = {"least_age": rules.least_age, "greatest_age": rules.greatest_age}
-        asked = [name for name, limit in limits.items() if limit is not None]
-        if not asked and not rules.stamps_in_order:
+        limited = [name for name, limit in limits.items() if limit is not None]
+        if not limited and not rules.stamps_in_order:
             return
         least, greatest, backwards = None, None, 0
         last: NDArray[np.int64] = np.empty(0, np.int64)
@@ -139,7 +139,7 @@ class _Judge:
                 greatest = high if greatest is None else max(greatest, high)
                 backwards += int((np.diff(np.concatenate([last, stamp])) < 0).sum())
                 last = stamp[-1:]
-        for name in asked:
+        for name in limited:
             limit, age_ns = limits[name], least if name == "least_age" else greatest
             assert limit is not None
             holds = age_ns is not None and (
@@ -176,7 +176,7 @@ class _Judge:
         found = match_times(self._session, self._question(topic), Counters())
         return np.concatenate([np.empty(0, np.int64), *(one.log_time for one in found)])
 
-    def _most(self, topic: str, rule: str, limit: int | None, ns: float) -> Iterator[Result]:
+    def _at_most(self, topic: str, rule: str, limit: int | None, ns: float) -> Iterator[Result]:
         if limit is not None:
             found = format_duration(round(ns))
             yield self._result(topic, rule, format_duration(limit), found, holds=ns <= limit)

@@ -143,12 +143,12 @@ class _Recorded:
 
     def period(self, recording: RecordingEntry, span: tuple[int, int], topic: str) -> float:
         chunks = self.follow(recording)
-        known, told = self._periods.get(topic, (0.0, 0))
+        known, counted = self._periods.get(topic, (0.0, 0))
         if known and recording.status != "open":
             return known
         parts = chunks.parts(span, [topic])
         messages = int(parts.messages.sum())
-        if not known or messages > 2 * told:
+        if not known or messages > 2 * counted:
             known = sampled_period(chunks, parts) or known
             self._periods[topic] = known, messages
         return known

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hybridlog.drawing.fields import SeriesQuery
 
 DPI: Final = 100
-FEW: Final = 100
+MAX_MARKED_POINTS: Final = 100
 """Messages of a line that are marked, each of them."""
 _UNITS = ((300, 1, "seconds"), (3 * 3600, 60, "minutes"), (3 * 86_400, 3600, "hours"))
 _EXACT_COLOURS = 10  # of matplotlib's own
@@ -105,7 +105,9 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
         times, values = line.series.polyline()
         at = (times - line.start) / (1e9 * step)
         (curve,) = axes.plot(at, drawable(values), color=colour, linewidth=1.2)
-        is_marked = line.series.alone() if len(line.series.times) > FEW else slice(None)
+        is_marked = (
+            line.series.alone() if len(line.series.times) > MAX_MARKED_POINTS else slice(None)
+        )
         marks = (line.series.times[is_marked] - line.start) / (1e9 * step)
         axes.plot(marks, drawable(line.series.least[is_marked]), ".", color=colour, markersize=4)
         drawn.append(curve)

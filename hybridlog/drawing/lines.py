@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hybridlog.drawing.fields import SeriesQuery
     from hybridlog.drawing.series import Numbers
 
-MOST: Final = 50
+MAX_LINES: Final = 50
 """Lines that can be told apart, with good will."""
 _GREATEST: Final = 1e300
 _MAX_NAMES = 8  # names in a message
@@ -51,7 +51,7 @@ def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Lin
 
     Raises:
         TopicError: no topic has such a field.
-        UsageError: no field, a field that is no number, `reverse`, or more than `MOST` lines.
+        UsageError: no field, a field that is no number, `reverse`, or more than `MAX_LINES` lines.
         TimeError: the range is outside all recordings.
     """
     if not fields:
@@ -75,9 +75,9 @@ def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Lin
                     query.counters.add(part.counters)
                     had.update(group)
                     found += [Line(one.topics[0], about.label, about.extent[0], x) for x in drawn]
-                if len(found) > MOST:
+                if len(found) > MAX_LINES:
                     raise UsageError(
-                        f"A plot has at most {MOST} lines: name fewer fields, or choose "
+                        f"A plot has at most {MAX_LINES} lines: name fewer fields, or choose "
                         "recordings with -r."
                     )
     for field, problem in missing.items():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.drawing.matches import AskedMatches, Matches, Rows
+from hybridlog.drawing.matches import Matches, QueriedMatches, Rows
 from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.answers.match_times import match_times
 from hybridlog_storage.stopping import held
@@ -106,5 +106,5 @@ class MatchCache:
                     make=lambda: (CachedMatches.of(ask(), self._cache.max_bytes // 2),),
                     size_of=lambda made: made[0].size if made[0] is not None else 0,
                 )
-        (kept,) = found
-        return AskedMatches(ask()) if kept is None else kept
+        (cached,) = found
+        return QueriedMatches(ask()) if cached is None else cached

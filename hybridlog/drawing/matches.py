@@ -59,7 +59,7 @@ class Matches(Protocol):
         """The number of those before a time, ns since the epoch."""
 
 
-class AskedMatches:
+class QueriedMatches:
     """The matches of a query, which is asked anew each time.
 
     Args:
@@ -82,8 +82,8 @@ class AskedMatches:
         """See `Matches`."""
         query = self._between(begin, end)
         if query is not None:
-            asked = IntervalQueries(query.session, query.question, query.counters)
-            yield from (rows[:, :2] for _, rows in asked.held(None))
+            queries = IntervalQueries(query.session, query.question, query.counters)
+            yield from (rows[:, :2] for _, rows in queries.held(None))
 
     def count_until(self, end: int) -> int:
         """See `Matches`."""

@@ -115,17 +115,17 @@ def series(
     if pixels < 1:
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
     wanted = [_Wanted.of(text) for text in fields]
-    asked, (begin, end) = _asked(query, wanted, span)
+    narrowed, (begin, end) = _narrowed(query, wanted, span)
     if begin >= end:
         none = np.empty(0)
         return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
     with query.counters.timed():
-        found = _read(asked.to_tables(), wanted, _Grid.over(span or (begin, end), pixels))
-        query.counters.add(asked.counters)
+        found = _read(narrowed.to_tables(), wanted, _Grid.over(span or (begin, end), pixels))
+        query.counters.add(narrowed.counters)
     return found
 
 
-def _asked(
+def _narrowed(
     query: SeriesQuery, wanted: Sequence[_Wanted], span: Span | None
 ) -> tuple[SeriesQuery, Span]:
     """The query for the wanted fields, and the part of the span that it covers.
@@ -137,8 +137,8 @@ def _asked(
         raise UsageError("Time runs from left to right here: leave out reverse.")
     if not wanted:
         raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
-    asked = query.fields(*dict.fromkeys(one.path for one in wanted))
-    _check(wanted, asked.field_types() or {})
+    narrowed = query.fields(*dict.fromkeys(one.path for one in wanted))
+    _check(wanted, narrowed.field_types() or {})
     spans = query.spans()
     if len(query.topics) != 1 or len(spans) > 1:
         raise UsageError(
@@ -149,8 +149,8 @@ def _asked(
     if span is not None:
         begin, end = max(begin, span[0]), min(end, span[1])
         window = np.array([[begin, max(begin, end), 0]], np.int64)
-        asked = asked.during(Intervals.of([(recording, window)])) if recording else asked
-    return asked, (begin, end)
+        narrowed = narrowed.during(Intervals.of([(recording, window)])) if recording else narrowed
+    return narrowed, (begin, end)
 
 
 def numbers_of(query: SeriesQuery) -> list[str]:

@@ -193,16 +193,16 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     paths = list(position.paths)
     if position.is_geographic and (known is None or _STATUS in known):
         paths.append(_STATUS)
-    asked, (begin, end) = _asked(query, paths, span)
+    narrowed, (begin, end) = _narrowed(query, paths, span)
     made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
     with query.counters.timed():
-        for table in asked.to_tables() if begin < end else ():
+        for table in narrowed.to_tables() if begin < end else ():
             made.add(table, paths)
-        query.counters.add(asked.counters)
+        query.counters.add(narrowed.counters)
     return made.track()
 
 
-def _asked(query: Query, paths: Sequence[str], span: Span | None) -> tuple[Query, Span]:
+def _narrowed(query: Query, paths: Sequence[str], span: Span | None) -> tuple[Query, Span]:
     """The query for some fields, and the part of the span that it covers.
 
     Raises:
@@ -216,13 +216,13 @@ def _asked(query: Query, paths: Sequence[str], span: Span | None) -> tuple[Query
             f"A track is of one topic in one recording; these are {len(query.topics)} topics in "
             f"{len(spans)} recordings."
         )
-    asked = query.fields(*paths)
+    narrowed = query.fields(*paths)
     recording, whole = next(iter(spans.items()), ("", (0, 0)))
     begin, end = _common(whole, span)
     if span is not None and recording:
         window = np.array([[begin, max(begin, end), 0]], np.int64)
-        asked = asked.during(Intervals.of([(recording, window)]))
-    return asked, (begin, end)
+        narrowed = narrowed.during(Intervals.of([(recording, window)]))
+    return narrowed, (begin, end)
 
 
 def _common(whole: Span, span: Span | None) -> Span:
@@ -285,18 +285,18 @@ class _Builder:
         self._exact = False
         pixel = (self._times - self._begin) // self._width
         has_fix = ~np.isnan(self._xy[:, 0])
-        kept = np.zeros(len(pixel), np.bool_)
-        kept[_first_of_each(pixel, np.flatnonzero(~has_fix))] = True
+        keep = np.zeros(len(pixel), np.bool_)
+        keep[_first_of_each(pixel, np.flatnonzero(~has_fix))] = True
         places = np.flatnonzero(has_fix)
-        kept[_first_of_each(pixel, places)] = True
+        keep[_first_of_each(pixel, places)] = True
         if len(places):
             begins = run_starts(pixel[places])
             counts = np.diff(begins, append=len(places))
             for values in self._xy[places].T:
                 for extreme in (np.minimum, np.maximum):
                     found = extreme.reduceat(values, begins).repeat(counts)
-                    kept[_first_of_each(pixel, places[values == found])] = True
-        self._times, self._xy = self._times[kept], self._xy[kept]
+                    keep[_first_of_each(pixel, places[values == found])] = True
+        self._times, self._xy = self._times[keep], self._xy[keep]
 
     def track(self) -> Track:
         """The track of the messages that were added."""

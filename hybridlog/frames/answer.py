@@ -241,8 +241,8 @@ class Decoder:
         self._counters.unreadable += len(batch) - len(found.rows)
         channel, records = self.channels[number], found.records
         if isinstance(records, ExpiredFields) and records.is_typed:
-            asked = {path.replace("[]", "") for path in self._chosen or ()}
-            summarised = {path.rpartition(".")[0] for path in asked} - asked
+            requested = {path.replace("[]", "") for path in self._chosen or ()}
+            summarised = {path.rpartition(".")[0] for path in requested} - requested
             self._counters.lacking += int(records.lacking(summarised).sum())
         elif isinstance(records, ExpiredFields):
             found, lacking = without_lossy(found)
@@ -262,8 +262,8 @@ class Decoder:
         own = self.own_columns(number, batch, seq, stamps)
         order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
         topic = channel.channel.topic
-        kept = decoded.records
-        summaries = self._summaries(kept, channel) if isinstance(kept, ExpiredFields) else {}
+        values = decoded.records
+        summaries = self._summaries(values, channel) if isinstance(values, ExpiredFields) else {}
         return Block(topic, batch.log_time, order, own, records, batch.payload_bytes, summaries)
 
     def _summaries(
@@ -271,9 +271,9 @@ class Decoder:
     ) -> dict[str, pa.Array[Any]]:
         """The requested summaries of arrays of expired messages."""
         known = {path.path: path.type for path in channel.codec.paths()}
-        asked = (path.replace("[]", "") for path in self._chosen or ())
+        requested = (path.replace("[]", "") for path in self._chosen or ())
         found = {}
-        for path in (path for path in asked if is_summary(path, known)):
+        for path in (path for path in requested if is_summary(path, known)):
             array, _, what = path.rpartition(".")
             made = records.statistic(array, what)
             if made is not None:
@@ -306,13 +306,13 @@ def _own(planner: Planner) -> list[str]:
     """Built-in columns of a table, without the log time."""
     question, channels = planner.question, planner.examples
     defined = {path.path for c in channels if c.is_typed for path in c.codec.paths()}
-    asked = own_columns(question.fields, defined)
-    unasked = []
+    requested = own_columns(question.fields, defined)
+    added = []
     if len(question.topics) > 1:
-        unasked.append("topic")
+        added.append("topic")
     if question.names_recording or len(planner.session.chosen(question)) > 1:
-        unasked.append("recording")
-    return [name for name in dict.fromkeys([*unasked, *asked]) if name != "log_time"]
+        added.append("recording")
+    return [name for name in dict.fromkeys([*added, *requested]) if name != "log_time"]
 
 
 def _own_column(

@@ -69,7 +69,7 @@ def _with_fields(array: pa.Array[Any]) -> pa.Array[Any]:
 
 def with_summaries(
     leaves: dict[str, pa.Array[Any]],
-    asked: Collection[str] | None,
+    requested: Collection[str] | None,
     known: Mapping[str, pa.Array[Any]] = MappingProxyType({}),
 ) -> dict[str, pa.Array[Any]]:
     """The leaves with the requested summaries (`ranges.min`).
@@ -78,10 +78,10 @@ def with_summaries(
 
     Args:
         leaves: By dotted path.
-        asked: Requested paths; None for all fields.
+        requested: Requested paths; None for all fields.
         known: Summaries of arrays that are not there.
     """
-    wanted = [path.replace("[]", "") for path in asked or ()]
+    wanted = [path.replace("[]", "") for path in requested or ()]
     found = {}
     for path in wanted:
         summary = summary_of(path)
@@ -93,8 +93,8 @@ def with_summaries(
     if not found:
         return leaves
     arrays = {path.rpartition(".")[0] for path in found}
-    unasked = {a for a in arrays if not any(_covers(path, a) for path in wanted)}
-    return {path: a for path, a in leaves.items() if path not in unasked} | found
+    not_requested = {a for a in arrays if not any(_covers(path, a) for path in wanted)}
+    return {path: a for path, a in leaves.items() if path not in not_requested} | found
 
 
 def _covers(path: str, field: str) -> bool:

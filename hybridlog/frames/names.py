@@ -29,15 +29,15 @@ TAG: Final = b"hybridlog.tag"
 _SUMMARIES = ("n", "min", "max", "mean")
 
 
-def own_columns(asked: Sequence[str] | None, defined: Collection[str]) -> list[str]:
+def own_columns(requested: Sequence[str] | None, defined: Collection[str]) -> list[str]:
     """The built-in columns among the requested names.
 
     Args:
-        asked: Names given to `fields`; None for all fields.
+        requested: Names given to `fields`; None for all fields.
         defined: Paths in the definitions of the topics. A name among them is the
             field, unless it is reserved.
     """
-    names = dict.fromkeys(asked or ())
+    names = dict.fromkeys(requested or ())
     return [n for n in names if n in RESERVED or (n in OPTIONAL and n not in defined)]
 
 
@@ -79,7 +79,7 @@ def arranged(
     """
     if fields is None:
         return list(names)
-    asked = [path.replace("[]", "") for path in fields]
+    requested = [path.replace("[]", "") for path in fields]
 
     def place(name: str) -> int:
         if name in tags:
@@ -87,8 +87,8 @@ def arranged(
         # A field with the name of a built-in column or a tag has an extra underscore.
         plain = name.rstrip("_")
         same = {name, plain} if is_own(plain) or plain in tags else {name}
-        exact = (number for number, path in enumerate(asked) if path in same)
-        near = (number for number, path in enumerate(asked) if _is_part(name, path))
+        exact = (number for number, path in enumerate(requested) if path in same)
+        near = (number for number, path in enumerate(requested) if _is_part(name, path))
         return next(exact, next(near, -1))
 
     return sorted(names, key=place)

@@ -121,9 +121,9 @@ class Connection:
         uri = self._uri
         if uri == NONE:
             self.has_none = True
-            told = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
+            setting = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
             raise WithoutMongoError(
-                f"The store is used without MongoDB ({told}). With --mongo embedded, or --mongo "
+                f"The store is used without MongoDB ({setting}). With --mongo embedded, or --mongo "
                 "URI, a command uses one, and brings its index up to date first."
             )
         from hybridlog_storage.mongo.database import Database

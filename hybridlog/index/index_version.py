@@ -123,15 +123,15 @@ class GuardedIndex:
 
     def _each(self, found: Iterator[bytes]) -> Iterator[bytes]:
         """Verified items: each is yielded once the next item or the end has been received."""
-        kept: bytes | None = None
+        previous: bytes | None = None
         for item in found:
-            if kept is not None:
+            if previous is not None:
                 self._check()
-                yield kept
-            kept = item
+                yield previous
+            previous = item
         self._check()
-        if kept is not None:
-            yield kept
+        if previous is not None:
+            yield previous
 
     def _check(self) -> None:
         """Check that the index was not changed during the query.

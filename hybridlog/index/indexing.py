@@ -210,7 +210,7 @@ class _StatsByChunk:
         for number, count in self._counted(self._surplus):
             found[number].surplus = count
         if self._stamps:
-            self._tell_stamps(found)
+            self._set_stamps(found)
         return iter(found.items())
 
     def _counted(self, rows: list[NDArray[np.intp]]) -> Iterator[tuple[int, int]]:
@@ -219,7 +219,7 @@ class _StatsByChunk:
             counts = np.bincount(self._number[np.concatenate(rows)])
             yield from ((number, count) for number, count in enumerate(counts.tolist()) if count)
 
-    def _tell_stamps(self, found: dict[int, ChannelStats]) -> None:
+    def _set_stamps(self, found: dict[int, ChannelStats]) -> None:
         rows, stamps = np.concatenate(self._stamped), np.concatenate(self._stamps)
         order = np.argsort(rows)
         rows, stamps = rows[order], stamps[order]

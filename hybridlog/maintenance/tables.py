@@ -145,7 +145,7 @@ def make_noted(
     except TimeoutError:
         return False
     if is_made:
-        tables.forget(entry, wanted)
+        tables.look_again_for(entry, wanted)
         made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
         report.tables += [(entry.label, one) for one in made]
     return True
@@ -191,7 +191,7 @@ class TableChecker:
         wanted = missing(self._directory, entry, self._tables).union(self.damage(entry))
         if not wanted or not make(self._directory, entry, wanted):
             return []
-        self._tables.forget(entry, wanted)
+        self._tables.look_again_for(entry, wanted)
         return sorted(wanted - missing(self._directory, entry, self._tables))
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:

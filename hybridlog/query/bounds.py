@@ -81,9 +81,9 @@ def _bounded(root: Node) -> list[Field]:
     ]
 
 
-def _paths(asked: Field) -> list[str]:
+def _paths(target: Field) -> list[str]:
     """The paths of which bounds tell about a field: its own, and those it goes through."""
-    names = [*takewhile(lambda part: isinstance(part, str), asked.parts)]
+    names = [*takewhile(lambda part: isinstance(part, str), target.parts)]
     return [".".join(map(str, names[:end])) for end in range(1, len(names) + 1)]
 
 
@@ -106,19 +106,19 @@ class BoundsFinder:
         """Bounds to be found for some parts with the same topics and types."""
         return Found(self, [one for one in self._fields if self._lacks(one, parts)])
 
-    def _lacks(self, asked: Field, parts: Collection[Part]) -> bool:
-        return any(part.recording.id not in self._known_of(part.topic, asked) for part in parts)
+    def _lacks(self, target: Field, parts: Collection[Part]) -> bool:
+        return any(part.recording.id not in self._known_of(part.topic, target) for part in parts)
 
-    def _known_of(self, topic: str, asked: Field) -> dict[str, Ends]:
-        kind = key_of(topic, asked.path)
+    def _known_of(self, topic: str, target: Field) -> dict[str, Ends]:
+        kind = key_of(topic, target.path)
         if kind not in self._known:
             self._known[kind] = self._catalog.bounds(kind)
         return self._known[kind]
 
-    def note(self, part: Part, asked: Field, ends: Ends) -> None:
+    def note(self, part: Part, target: Field, ends: Ends) -> None:
         """Note what is known of a part's recording."""
-        self._known_of(part.topic, asked)[part.recording.id] = ends
-        self._catalog.note_bounds(key_of(part.topic, asked.path), part.recording, ends)
+        self._known_of(part.topic, target)[part.recording.id] = ends
+        self._catalog.note_bounds(key_of(part.topic, target.path), part.recording, ends)
 
 
 class Found:
@@ -131,7 +131,7 @@ class Found:
 
     def __init__(self, finder: BoundsFinder, fields: Sequence[Field]) -> None:
         self._finder = finder
-        self._ends: dict[Field, dict[Part, Ends]] = {asked: {} for asked in fields}
+        self._ends: dict[Field, dict[Part, Ends]] = {target: {} for target in fields}
 
     def add(self, records: pa.StructArray, spans: Iterable[tuple[Part, int, int]]) -> None:
         """Look at rows.
@@ -146,12 +146,12 @@ class Found:
 
         spans = [*spans]
         edges = np.array([span[1:] for span in spans], np.intp).reshape(-1, 2)
-        for asked in [*self._ends]:
-            found = numbers_at(asked, spans[0][0].field_types, records) if spans else []
+        for target in [*self._ends]:
+            found = numbers_at(target, spans[0][0].field_types, records) if spans else []
             if found is None:
-                del self._ends[asked]
+                del self._ends[target]
                 continue
-            known = self._ends[asked]
+            known = self._ends[target]
             for part, *_ in spans:
                 known.setdefault(part, _NONE)
             for numbers, rows in found:
@@ -162,13 +162,13 @@ class Found:
 
     def note(self, part: Part) -> None:
         """Note the bounds of a part, of which all rows were looked at."""
-        for asked, known in self._ends.items():
+        for target, known in self._ends.items():
             if part in known:
-                self._finder.note(part, asked, known[part])
+                self._finder.note(part, target, known[part])
 
 
-def _is_plain(asked: Field) -> bool:
-    return all(isinstance(part, str) for part in asked.parts) and asked.parts[-1] != "mean"
+def _is_plain(target: Field) -> bool:
+    return all(isinstance(part, str) for part in target.parts) and target.parts[-1] != "mean"
 
 
 def _joined(ends: Ends, numbers: NDArray[Any]) -> Ends:

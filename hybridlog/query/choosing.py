@@ -85,8 +85,8 @@ def choose(session: Session, choice: Choice) -> Chosen:
         for condition in choice.where:
             choosing.by_content(condition)
     except _NothingLeftError as nothing:
-        asked = ", ".join(choosing.conditions)
-        what = f"There is no recording {asked}. " if asked else ""
+        described = ", ".join(choosing.conditions)
+        what = f"There is no recording {described}. " if described else ""
         return Chosen([], f"{what}{nothing}")
     return Chosen(choosing.summaries, "")
 
@@ -141,8 +141,8 @@ class _Choosing:
     def _keep(self, places: Iterable[int], condition: str) -> bool:
         """Keep those at some positions; true if any is left."""
         self.conditions.append(condition)
-        kept = {*places}
-        self.left = [place for place in self.left if place in kept]
+        remaining = {*places}
+        self.left = [place for place in self.left if place in remaining]
         return bool(self.left)
 
     def by_name(self, names: Sequence[str]) -> None:
@@ -251,8 +251,8 @@ class _Choosing:
             ids = tuple(self._snapshot.summaries[place].id for place in there.tolist())
             question = Question(tuple(topics), ids)
             if predicate:
-                asked = self._session.predicate(predicate, tuple(topics), ids)
-                question = Question(tuple(topics), ids, predicate=asked)
+                checked = self._session.predicate(predicate, tuple(topics), ids)
+                question = Question(tuple(topics), ids, predicate=checked)
             found = {self._snapshot.by_id[one] for one in self._having_any(question)}
         if not self._keep(found, f"with a message for which {condition!r} holds"):
             raise _NothingLeftError(hint or f"{len(there)} with {listed(topics)} were asked.")

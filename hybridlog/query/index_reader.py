@@ -136,7 +136,7 @@ class IndexReader:
         queries = self._queries(parts, {}, most=1)
         streams: list[list[Query]] = []
         ends: list[int] = []
-        for query, (begin, end) in sorted(queries, key=lambda asked: asked[1]):
+        for query, (begin, end) in sorted(queries, key=lambda item: item[1]):
             place = next((i for i, last in enumerate(ends) if last <= begin), len(ends))
             if place == len(ends):
                 streams.append([])
@@ -144,11 +144,11 @@ class IndexReader:
             streams[place].append(query)
             ends[place] = end
 
-        def read(asked: Sequence[Query]) -> Iterator[bytes]:
-            for query in asked[::order]:
+        def read(own: Sequence[Query]) -> Iterator[bytes]:
+            for query in own[::order]:
                 yield from self._found(parts, query, order)
 
-        return [read(asked) for asked in streams]
+        return [read(own) for own in streams]
 
     def documents_with(
         self, parts: Sequence[Part], keys: KeyColumns, *, reverse: bool
@@ -172,8 +172,8 @@ class IndexReader:
             names = keys.take(rows).to_keys(place.prefix)
             # Without bounds MongoDB looks at the whole collection.
             bounds = {"$gte": names[0], "$lte": names[-1], "$in": names}
-            asked: Filter = {"_id": bounds, **place.of_topic}
-            yield from self._found(parts, (place.collection, asked), -1 if reverse else 1)
+            by_key: Filter = {"_id": bounds, **place.of_topic}
+            yield from self._found(parts, (place.collection, by_key), -1 if reverse else 1)
             done += len(names)
             size = min(size * 10, _DOCUMENTS)
 

@@ -411,8 +411,8 @@ def clipped(rows: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
     """Intervals (int64[n, 3]) cut to a span, without empty ones."""
     begin = np.maximum(rows[:, 0], span[0])
     end = np.minimum(rows[:, 1], span[1])
-    kept = end > begin
-    return np.stack([begin[kept], end[kept], rows[kept, 2]], axis=1)
+    nonempty = end > begin
+    return np.stack([begin[nonempty], end[nonempty], rows[nonempty, 2]], axis=1)
 
 
 class Holding:

@@ -189,8 +189,8 @@ class MessageAnswers(Steps):
             from hybridlog.tf.in_frame import points_of
 
             self.counters.reset()
-            asked = replace(self.question, frame=frame)
-            return _stacked([one.points for one in points_of(self.session, asked, self.counters)])
+            framed = replace(self.question, frame=frame)
+            return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
         scans = self._scans()
         if scans is not None:
             return scans

@@ -97,8 +97,8 @@ class MessageFilter:
         decoded = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
         assert isinstance(decoded.records, ExpiredFields)
         lacking = decoded.rows[decoded.records.lacking()] if fields else decoded.rows[:0]
-        asked = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
-        found = self._one_by_one(channel, batch, seq, asked)
+        decidable = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
+        found = self._one_by_one(channel, batch, seq, decidable)
         return Matches(found.holds, found.unreadable + len(lacking), len(lacking))
 
     def _one_by_one(

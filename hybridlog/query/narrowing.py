@@ -96,7 +96,7 @@ def _keys_with(
     if sum(counts.values()) > most:
         return None
     if IndexState(database).turn() != turn:
-        session.forget_uncertain()
+        session.clear_uncertain()
         return None
     return uncertain | counts.keys()
 

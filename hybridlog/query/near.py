@@ -48,12 +48,12 @@ def question_about(
     Raises:
         TopicError: no such topic exists in the recordings.
     """
-    asked = question.recordings
-    if asked is None:
+    recordings = question.recordings
+    if recordings is None:
         topics = resolve([topic], session.look(None).topics)
     else:
-        topics = session.resolve_in([topic], asked)
-    found = Question(*session.having(topics, asked))
+        topics = session.resolve_in([topic], recordings)
+    found = Question(*session.having(topics, recordings))
     if question.is_unbounded or not question.is_by_log_time:
         return found
     if {*found.topics} <= {*mark_topics(session)}:

@@ -30,7 +30,7 @@ class Steps:
     """Times from one message to the next; of very many a random share, in bounded memory."""
 
     def __init__(self) -> None:
-        self._kept: list[NDArray[np.int64]] = []
+        self._sampled: list[NDArray[np.int64]] = []
         self._size = 0
         self._share = 1.0
         self._random = np.random.default_rng(0)
@@ -46,19 +46,19 @@ class Steps:
         self._last = times[-1:] if len(times) else self._last
         self._keep(steps, self._share)
         while self._size > 2 * _SAMPLED:
-            steps, self._kept, self._size = np.concatenate(self._kept), [], 0
+            steps, self._sampled, self._size = np.concatenate(self._sampled), [], 0
             self._keep(steps, 0.5)
             self._share /= 2
 
     def _keep(self, steps: NDArray[np.int64], share: float) -> None:
         if share < 1.0:
             steps = steps[self._random.random(len(steps)) < share]
-        self._kept.append(steps)
+        self._sampled.append(steps)
         self._size += len(steps)
 
     def usual_period(self) -> float:
         """As the function of this name."""
-        return usual_period(np.concatenate(self._kept)) if self._kept else 0.0
+        return usual_period(np.concatenate(self._sampled)) if self._sampled else 0.0
 
 
 class Regularity:

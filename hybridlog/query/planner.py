@@ -78,7 +78,7 @@ class Planner:
         self._decidable: dict[Part, Part] = {}  # without what only MongoDB answers
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
-        self._is_of_many = False  # recordings
+        self._has_many_recordings = False  # recordings
         self._scan = PayloadScan(session, counters)
         self._counting = tuple(engine(session, counters) for engine in _COUNTING)
 
@@ -94,7 +94,7 @@ class Planner:
         from hybridlog.query.engines.tables import TablesEngine
 
         predicate, bounds = self.question.predicate, None
-        if predicate is not None and self._is_of_many:
+        if predicate is not None and self._has_many_recordings:
             bounds = BoundsFinder(self.session.catalog, predicate)
         return TablesEngine(self.session, self.counters, bounds=bounds)
 
@@ -142,7 +142,7 @@ class Planner:
         predicate = self.question.predicate
         if predicate is None or predicate.needs_index or len(found) < MIN_RECORDINGS:
             return found
-        self._is_of_many = True
+        self._has_many_recordings = True
         found = within_bounds(self.session, self.question, found)
         if self.session.connected is None or not self.session.field_indexes:
             return found
@@ -265,7 +265,7 @@ class Planner:
                 wanted = [part for part in self._batch if part.needs_index]
             found = self.index.without_index(wanted)
             self._counted.update(found)
-            self._count_unasked(wanted, found)
+            self._count_without_documents(wanted, found)
             self._decidable.update(zip(wanted, found, strict=True))
         return [self._decidable.get(part, part) for part in parts]
 
@@ -401,7 +401,7 @@ class Planner:
         plan.selector = select if selecting else None
         return plan
 
-    def _count_unasked(self, parts: Sequence[Part], decided: Sequence[Part]) -> None:
+    def _count_without_documents(self, parts: Sequence[Part], decided: Sequence[Part]) -> None:
         """Count the messages without documents to ask; engines count those they cannot read."""
         from hybridlog.query.index_reader import TOO_LARGE, WITHOUT_FIELDS
 
@@ -409,8 +409,8 @@ class Planner:
         for part, now in zip(parts, decided, strict=True):
             if part.lacks_fields:
                 groups[now.predicate is not None and now.predicate.asks_fields].append(part)
-        for is_asked, group in groups.items():
-            own = TOO_LARGE if is_asked else WITHOUT_FIELDS
+        for tests_fields, group in groups.items():
+            own = TOO_LARGE if tests_fields else WITHOUT_FIELDS
             self.counters.unreadable += self.index.count(group, own)
 
     def _count_unreadable(self, parts: Sequence[Part]) -> None:

@@ -179,20 +179,20 @@ class Steps:
         query = copy(self)
         for predicate in own:
             query = query.where(predicate)
-        asked: list[Self] = []
+        conditions: list[Self] = []
 
         def windows(condition: Near) -> Intervals:
             question = question_about(self.session, query.question, condition.topic, before, after)
             events = type(self)(self.session, question)
             if condition.predicate:
                 events = events.where(condition.predicate)
-            asked.append(events)
+            conditions.append(events)
             return events.windows(before, after)
 
         whole = everything(self.session, self.question)
         for condition in others:
             query = query.during(intervals_of(condition, windows, whole))
-        return type(self)(self.session, query.question, (*self.conditions, *asked))
+        return type(self)(self.session, query.question, (*self.conditions, *conditions))
 
     def limit(self, count: int) -> Self:
         """At most this many messages.

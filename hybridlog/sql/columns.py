@@ -108,13 +108,13 @@ class ViewColumn:
 
 
 @lru_cache(maxsize=256)
-def _many_nulls(kind: Any) -> Any:
+def _shared_nulls(kind: Any) -> Any:
     return pa.nulls(_SHARED_ROWS, kind)
 
 
 def _nulls(kind: Any, rows: int) -> Any:
     """Nulls, which share their memory."""
-    return _many_nulls(kind).slice(0, rows) if rows <= _SHARED_ROWS else pa.nulls(rows, kind)
+    return _shared_nulls(kind).slice(0, rows) if rows <= _SHARED_ROWS else pa.nulls(rows, kind)
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Params = Sequence[Any] | Mapping[str, Any] | None
 _BATCH_ROWS: Final = 65_536
-_FEW_ROWS: Final = 64
+_FIRST_ROWS: Final = 64
 _TREE: Final = (
     "select json_serialize_sql(?::varchar, skip_null := true, skip_empty := true, "
     "skip_default := true)"
@@ -288,7 +288,7 @@ class SqlAnswer:
         """Messages and topics that it may lack."""
         return self._reading.remarks
 
-    def told(self) -> list[str]:
+    def sentences(self) -> list[str]:
         """Sentences about what the computed answer may lack."""
         from hybridlog.query.answers.lost import completeness_of
 
@@ -338,7 +338,7 @@ class SqlAnswer:
         taken: list[pa.RecordBatch] = []
         room, bytes_taken = rows, 0
         # Few rows at a time: each may be an image.
-        for batch in self._batches(_FEW_ROWS, rows + 1):
+        for batch in self._batches(_FIRST_ROWS, rows + 1):
             if bytes_taken > size:
                 break
             taken.append(batch.slice(0, room))

@@ -260,11 +260,11 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
     stamp, frame = found.stamp, found.frame
     several = question.names_recording or len(session.chosen(question)) > 1
     plain = replace(question, frame=None)
-    asked, hidden = question.fields, set() if several else {"recording"}
-    if asked is not None:
-        added = [one for one in found.columns() if not _is_in(one, asked)]
+    requested, hidden = question.fields, set() if several else {"recording"}
+    if requested is not None:
+        added = [one for one in found.columns() if not _is_in(one, requested)]
         hidden |= {*added}
-        plain = replace(plain, fields=(*asked, *added))
+        plain = replace(plain, fields=(*requested, *added))
     ids = {one.label: one.id for one in session.snapshot().summaries}
     inner = Planner(session, replace(plain, names_recording=True), planner.counters)
     for table in answer.stream(inner):
@@ -385,8 +385,8 @@ def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:
             yield _Pose(word, "", "", is_vector=word == "vector")
 
 
-def _is_in(path: str, asked: Sequence[str]) -> bool:
-    return any(path == one or path.startswith(f"{one}.") for one in asked)
+def _is_in(path: str, requested: Sequence[str]) -> bool:
+    return any(path == one or path.startswith(f"{one}.") for one in requested)
 
 
 def _moved(array: NDArray[Any], pose: Transform) -> NDArray[Any]:

@@ -120,10 +120,10 @@ def episodes(
         for topic, own in times.items():
             is_stale |= reader.is_lost(topic, own, grid)
         runs = [(0, len(grid))] if on_gap == "hold" else _runs(~late)
-        kept = [(low, high) for low, high in runs if high - low >= MIN_FRAMES]
+        long_runs = [(low, high) for low, high in runs if high - low >= MIN_FRAMES]
         if dropped is not None and late.any():
-            dropped[name] += len(grid) - sum(high - low for low, high in kept)
-        for number, (low, high) in enumerate(kept):
+            dropped[name] += len(grid) - sum(high - low for low, high in long_runs)
+        for number, (low, high) in enumerate(long_runs):
             own_grid = grid[low:high]
             found = {
                 feature: [_at(own_grid, read[part]) for part in parts]
@@ -240,10 +240,10 @@ class _Reader:
         import pyarrow as pa
 
         table = self._query(source.topic).fields(*source.paths).to_arrow()
-        kept = [column for column in table.column_names if column in source.paths]
-        if missing := set(source.paths).difference(kept):
+        present = [column for column in table.column_names if column in source.paths]
+        if missing := set(source.paths).difference(present):
             raise UsageError(f"{source.topic} has no field {min(missing)}.")
-        table = table.filter(_is_known(table, kept))
+        table = table.filter(_is_known(table, present))
         columns, names = [], []
         for path in source.paths:
             numbers = _numbers(table[path], source.topic, path)

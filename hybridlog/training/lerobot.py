@@ -101,8 +101,8 @@ def write_lerobot(
     """
     pyav()
     features = features.resolved(query.session)
-    asked = query.with_topic(*features.topics)
-    plan = _plan(asked, features, options)
+    selected = query.with_topic(*features.topics)
+    plan = _plan(selected, features, options)
     root, report = Path(path), LerobotReport(Path(path))
     unfinished = root / _UNFINISHED
     if root.exists() and not unfinished.exists():
@@ -113,7 +113,7 @@ def write_lerobot(
         write_text(unfinished / _PLAN, plan)
     made: list[WrittenEpisode] = []
     dropped: Counter[str] = Counter()
-    for piece in pieces(asked, options.episodes_by):
+    for piece in pieces(selected, options.episodes_by):
         for episode in episodes(piece, features, options.fps, options.on_gap, dropped):
             place = unfinished / f"{len(made):06d}"
             written = WrittenEpisode.read(place)
@@ -236,7 +236,7 @@ class _Assembly:
         import pyarrow.parquet as pq
 
         limit, number, writer = _DATA_MB << 20, -1, None
-        kept: dict[str, list[NDArray[Any]]] = {}
+        chosen: dict[str, list[NDArray[Any]]] = {}
         begin = size = 0
         for place, one in enumerate(self._made):
             values = one.vectors() | self._own_columns(place, one, begin)
@@ -253,7 +253,7 @@ class _Assembly:
             writer.write_table(table)
             size += table.nbytes
             for name, array in values.items():
-                kept.setdefault(name, []).append(array)
+                chosen.setdefault(name, []).append(array)
             self._rows[place] |= {
                 "episode_index": place,
                 "tasks": [one.about["task"]],
@@ -269,7 +269,7 @@ class _Assembly:
             begin += one.length
         assert writer is not None
         writer.close()
-        return {name: np.concatenate(parts) for name, parts in kept.items()}
+        return {name: np.concatenate(parts) for name, parts in chosen.items()}
 
     def _file(self, form: str, number: int, key: str = "") -> Path:
         """The path of a file by its number; its folder is made."""

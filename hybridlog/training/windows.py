@@ -76,25 +76,25 @@ class Windows(OpensAgain, Sequence[dict[str, Any]]):
         features = features.resolved(query.session)
         if taken := _OWN.intersection(features.vectors):
             raise UsageError(f"{min(taken)} is no name for a feature of windows: choose another.")
-        asked = query.with_topic(*features.topics)
-        if running := [one.label for one in asked.summaries() if one.status == "open"]:
+        selected = query.with_topic(*features.topics)
+        if running := [one.label for one in selected.summaries() if one.status == "open"]:
             raise UsageError(
                 f"{listed(running, _MAX_NAMES)} is being recorded, so its windows would change: "
                 "choose recordings that have ended."
             )
-        self._question = asked.question
+        self._question = selected.question
         self._cameras = features.images
         self._length, self._size = length, length + horizon
         self._holds = on_gap == "hold"
         dropped: Counter[str] = Counter()
         found = [
             episode
-            for piece in pieces(asked, episodes_by)
+            for piece in pieces(selected, episodes_by)
             for episode in episodes(piece, features, fps, on_gap, dropped)
         ]
         self._episodes = [one for one in found if len(one.times) >= self._size]
-        kept = sum(len(one.times) for one in self._episodes)
-        self.left_out = dropped.total(), sum(len(one.times) for one in found) - kept
+        used = sum(len(one.times) for one in self._episodes)
+        self.left_out = dropped.total(), sum(len(one.times) for one in found) - used
         self.episodes = tuple(one.name for one in self._episodes)
         counts = [len(one.times) - self._size + 1 for one in self._episodes]
         self._ends = np.cumsum(counts, dtype=np.int64)

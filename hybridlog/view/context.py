@@ -23,7 +23,7 @@ from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.formats.slices import SliceCache
 from hybridlog.query.answers.match_times import next_time
 from hybridlog.record.losses import extent_of
-from hybridlog.view.asked import RequestParams
+from hybridlog.view.params import RequestParams
 from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import HybridlogError, ResourceError, TimeError, TopicError
 from hybridlog_storage.lazy import lazy
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.store import Store
-    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.params import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
 
 
@@ -101,14 +101,14 @@ class Context:
                 self._looked = time.monotonic()
                 self._took = self._looked - begun
 
-    def recording(self, asked: RequestParams) -> RecordingEntry:
+    def recording(self, params: RequestParams) -> RecordingEntry:
         """The recording that the parameter `recording` names by its label or id.
 
         Raises:
             TopicError: There is none.
             UsageError: The parameter is missing.
         """
-        return self.store.entry(asked.text("recording"))
+        return self.store.entry(params.text("recording"))
 
     def query(self, recording: RecordingEntry, *topics: str) -> Query:
         """A query about topics, by their full names, of one recording.
@@ -122,15 +122,15 @@ class Context:
                 raise TopicError(f"{recording.label} has no topic {topic!r}.")
         return self.store.query(topics, [recording.id])
 
-    def topic(self, asked: RequestParams) -> tuple[RecordingEntry, Query]:
+    def topic(self, params: RequestParams) -> tuple[RecordingEntry, Query]:
         """The recording, and a query about its topic that the parameter `topic` names.
 
         Raises:
             TopicError: No such recording or topic exists.
             UsageError: A parameter is missing or out of bounds.
         """
-        recording = self.recording(asked)
-        return recording, self.query(recording, asked.text("topic"))
+        recording = self.recording(params)
+        return recording, self.query(recording, params.text("topic"))
 
 
 def start_of(recording: RecordingEntry) -> int:
@@ -160,14 +160,14 @@ def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -
 
     def answered(request: Request, given_up: threading.Event) -> Response:
         context: Context = request.app.state.context
-        asked = RequestParams(request.query_params, request.headers.get("if-none-match"))
+        params = RequestParams(request.query_params, request.headers.get("if-none-match"))
         try:
             with (
                 until_given_up(given_up),
                 held(turns or context.turns),
                 context.store.at_one_moment(),
             ):
-                found = answer(context, asked)
+                found = answer(context, params)
             return found if isinstance(found, Response) else json_response(found)
         except HybridlogError as error:
             return error_response(error)
@@ -246,7 +246,7 @@ class Current:
         return {"ETag": self.tag, "Cache-Control": "private, no-cache", **known}
 
 
-def current(context: Context, asked: RequestParams) -> Current:
+def current(context: Context, params: RequestParams) -> Current:
     """The message of the parameters `recording`, `topic`, `at` and `seq`.
 
     Of several messages at that time, it is the last one whose arrival number is at most `seq`.
@@ -255,10 +255,10 @@ def current(context: Context, asked: RequestParams) -> Current:
         TopicError: No such recording or topic exists.
         UsageError: A parameter is missing or out of bounds.
     """
-    recording, query = context.topic(asked)
+    recording, query = context.topic(params)
     start = start_of(recording)
-    moment = asked.moment(start)
-    message = _message(query, moment, asked.integer("seq", 0, END, END))
+    moment = params.moment(start)
+    message = _message(query, moment, params.integer("seq", 0, END, END))
     # Of messages with the same time, the last one is current: the next one is later.
     later = moment if message is None else message.log_time_ns + 1
     until = next_time(context.store.session, recording, query.topics[0], later)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.store import Store
-    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
+    from hybridlog.view.params import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
 
 _EVERY_TOPIC: Final = "**"
@@ -136,23 +136,23 @@ def _topic_of(where: str) -> str | None:
     return condition.topic if isinstance(condition, Near) else None
 
 
-def question_of(context: Context, asked: RequestParams) -> PageQuestion:
+def question_of(context: Context, params: RequestParams) -> PageQuestion:
     """The question of a request about one topic.
 
     Args:
         context: The context.
-        asked: Has `recording`, `topic`, `where` and `within`.
+        params: Has `recording`, `topic`, `where` and `within`.
 
     Raises:
         TopicError: There is no such recording or topic.
         UsageError: A parameter is missing or too long.
     """
-    recording = context.recording(asked)
-    topic = asked.text("topic")
+    recording = context.recording(params)
+    topic = params.text("topic")
     context.query(recording, topic)
-    where = asked.text("where", "", longest=MAX_TEXT).strip()
+    where = params.text("where", "", longest=MAX_TEXT).strip()
     return PageQuestion(
-        context.store, recording, (topic,), where, asked.text("within", "", longest=64), None
+        context.store, recording, (topic,), where, params.text("within", "", longest=64), None
     )
 
 

@@ -109,7 +109,7 @@ def make_app(store: Store, rules: Admission) -> Guard:
     return Guard(app, rules, shared=("/mcap/",) if has_guests else ())
 
 
-MAX_STRANGERS: Final = 64
+MAX_UNKNOWN_CLIENTS: Final = 64
 """Connections without a request that has the token; the oldest one makes room for another."""
 
 
@@ -120,7 +120,7 @@ class BoundedConnection(H11Protocol):
 
     Attributes:
         patience_s: Time for a request to arrive, from the connection or the last answer on.
-        is_stranger: True until a request has the token.
+        is_unknown: True until a request has the token.
         since: Time of the event loop at which it was made.
     """
 
@@ -129,7 +129,7 @@ class BoundedConnection(H11Protocol):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._waiting: asyncio.TimerHandle | None = None
-        self.is_stranger = True
+        self.is_unknown = True
         self.since = self.loop.time()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -137,9 +137,9 @@ class BoundedConnection(H11Protocol):
         super().connection_made(transport)
         self._wait()
         known: set[Any] = self.connections
-        strangers = [one for one in known if one.is_stranger]
-        if len(strangers) > MAX_STRANGERS:
-            oldest = min(strangers, key=lambda one: one.since)
+        unknown = [one for one in known if one.is_unknown]
+        if len(unknown) > MAX_UNKNOWN_CLIENTS:
+            oldest = min(unknown, key=lambda one: one.since)
             known.discard(oldest)  # it is lost a little later
             oldest.transport.abort()
 
@@ -155,7 +155,7 @@ class BoundedConnection(H11Protocol):
         if self.cycle is not before:
             self._stop_waiting()
             guard: Any = self.config.app
-            self.is_stranger &= not guard.rules.knows(self.scope["path"])
+            self.is_unknown &= not guard.rules.knows(self.scope["path"])
 
     def on_response_complete(self) -> None:
         """A request is answered."""

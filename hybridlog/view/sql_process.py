@@ -53,7 +53,7 @@ class SqlProcess:
         """
         for _ in range(2):
             with suppress(EOFError, ConnectionError):
-                is_answer, found = self._asked((work, arguments))
+                is_answer, found = self._answer_of((work, arguments))
                 if is_answer:
                     return cast("_T", found)
                 raise found
@@ -62,7 +62,7 @@ class SqlProcess:
             "time, or ask in `hybridlog sql` with more --memory."
         )
 
-    def _asked(self, call: Any) -> Any:
+    def _answer_of(self, call: Any) -> Any:
         ours, theirs = Pipe()
         with ours:
             with theirs, self._lock:

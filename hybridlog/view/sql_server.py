@@ -19,12 +19,12 @@ from hybridlog_storage.stopping import GivenUpError, until_given_up
 class _GivenUp(threading.Event):
     """Is set once the other side has closed the connection."""
 
-    def __init__(self, asked: Connection[Any, Any]) -> None:
+    def __init__(self, caller: Connection[Any, Any]) -> None:
         super().__init__()
-        self._asked = asked
+        self._caller = caller
 
     def is_set(self) -> bool:
-        return self._asked.poll()
+        return self._caller.poll()
 
 
 def serve(handle: int) -> None:
@@ -38,10 +38,10 @@ def serve(handle: int) -> None:
         context = _opened(path, mongo, read_only=read_only)
         with limited_memory(SQL_MEMORY) as most:
             while True:
-                asked = Connection(recv_handle(control))
+                caller = Connection(recv_handle(control))
                 if private_bytes() > most - OWN_MEMORY // 2:
                     break  # free memory may stay reserved: a new process has it all
-                threading.Thread(target=_answer, args=(context, asked)).start()
+                threading.Thread(target=_answer, args=(context, caller)).start()
                 if isinstance(context, HybridlogError):
                     break  # the next process may be able to open it
 
@@ -56,15 +56,15 @@ def _opened(path: str, mongo: str | None, *, read_only: bool) -> Context | Hybri
     return Context(store)
 
 
-def _answer(context: Context | HybridlogError, asked: Connection[Any, Any]) -> None:
-    with asked, suppress(EOFError, ConnectionError, GivenUpError):
-        work, arguments = asked.recv()
+def _answer(context: Context | HybridlogError, caller: Connection[Any, Any]) -> None:
+    with caller, suppress(EOFError, ConnectionError, GivenUpError):
+        work, arguments = caller.recv()
         if isinstance(context, HybridlogError):
-            asked.send((False, context))
+            caller.send((False, context))
             return
         try:
             context.refresh(0.0)
-            with until_given_up(_GivenUp(asked)):
+            with until_given_up(_GivenUp(caller)):
                 answer = True, work(context, *arguments)
         except HybridlogError as error:
             answer = False, error
@@ -73,4 +73,4 @@ def _answer(context: Context | HybridlogError, asked: Connection[Any, Any]) -> N
             if shortage is None:
                 traceback.print_exc()
             answer = False, shortage or RuntimeError(repr(error))
-        asked.send(answer)
+        caller.send(answer)

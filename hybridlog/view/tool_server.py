@@ -118,8 +118,8 @@ class _Answers:
         `/odom: twist.twist.linear.x > 0.8`, then `within` (0.1s) is the greatest distance in
         time. `at_least` (1s) leaves out shorter intervals.
         """
-        asked = tools.Asked(topic, recording, where, within, begin, end)
-        return self._answer(tools.ask, asked, at_least)
+        question = tools.ToolQuestion(topic, recording, where, within, begin, end)
+        return self._answer(tools.ask, question, at_least)
 
     def sql(self, query: Annotated[str, Field(max_length=MAX_TEXT)]) -> CallToolResult:
         """Ask in SQL (DuckDB) on views of topics; only queries, and no files."""
@@ -138,8 +138,8 @@ class _Answers:
         pictures: Annotated[int, Field(ge=0, le=tools.MAX_PICTURES)] = 0,
     ) -> CallToolResult:
         """Fetch a few messages, and at most so many pictures of images and video."""
-        asked = tools.Asked(topic, recording, where, within, begin, end)
-        return self._answer(tools.fetch, asked, fields or [], limit, pictures)
+        question = tools.ToolQuestion(topic, recording, where, within, begin, end)
+        return self._answer(tools.fetch, question, fields or [], limit, pictures)
 
     def plot(
         self,
@@ -150,8 +150,8 @@ class _Answers:
         end: _Time | None = None,
     ) -> CallToolResult:
         """Draw fields of a topic over time as a picture."""
-        asked = tools.Asked(topic, recording, None, None, begin, end)
-        return self._answer(tools.plot, asked, fields)
+        question = tools.ToolQuestion(topic, recording, None, None, begin, end)
+        return self._answer(tools.plot, question, fields)
 
     def _answer(self, work: Callable[..., tools.Answer], *arguments: Any) -> CallToolResult:
         given_up = threading.Event()

@@ -55,7 +55,7 @@ class Answer(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ToolQuestion:
     """The messages of a topic that are asked about.
 
     Attributes:
@@ -131,17 +131,17 @@ def schema(context: Context, topic: str | None, recording: str | None) -> Answer
     return _answer({**values, "fields": fields[:MAX_ROWS]}, "fields", is_cut=len(fields) > MAX_ROWS)
 
 
-def ask(context: Context, asked: Asked, at_least: str | None) -> Answer:
+def ask(context: Context, question: ToolQuestion, at_least: str | None) -> Answer:
     """The number of messages that satisfy a predicate, when it holds, and the first of them."""
-    query = asked.query(context)
+    query = question.query(context)
     count = query.count()
-    values: dict[str, Any] = {"count": count, **_lacks(query, asked.topic, count)}
+    values: dict[str, Any] = {"count": count, **_lacks(query, question.topic, count)}
     with suppress(TimeError):  # the range is outside all recordings
         times = match_times(query.session, query.question, Counters())
         values["first_times"] = [format_time(one) for one in islice(_each(times), 10)]
     rows = []
     is_cut = False
-    if asked.where is not None and len(query.topics) == 1:
+    if question.where is not None and len(query.topics) == 1:
         held = query.intervals(at_least=at_least)
         values["interval_count"] = len(held)
         is_cut = len(held) > MAX_ROWS
@@ -176,23 +176,25 @@ def sql(context: Context, text: str, seconds: float) -> Answer:
                 f"A value has no plain form ({error}): `::varchar` makes it text."
             ) from error
         rows = [*map(list, zip(*values, strict=True))]
-        found = {"columns": table.column_names, "lacks": answer.told(), "rows": rows}
+        found = {"columns": table.column_names, "lacks": answer.sentences(), "rows": rows}
         return _answer(found, "rows", is_cut=is_cut)
     finally:
         connection.close()
 
 
-def fetch(context: Context, asked: Asked, fields: list[str], most: int, pictures: int) -> Answer:
+def fetch(
+    context: Context, question: ToolQuestion, fields: list[str], most: int, pictures: int
+) -> Answer:
     """Some messages with their fields, long arrays as summaries, and pictures of images.
 
     Args:
         context: The store.
-        asked: The messages.
+        question: The messages.
         fields: Paths of the fields wanted; all without.
         most: Greatest number of messages.
         pictures: Greatest number of pictures.
     """
-    query = asked.query(context)
+    query = question.query(context)
     if fields:
         query = query.fields(*fields)
     limited = query.limit(min(most, MAX_MESSAGES))
@@ -217,8 +219,8 @@ def fetch(context: Context, asked: Asked, fields: list[str], most: int, pictures
             except PayloadError as error:
                 problems.append(f"{format_time(message.log_time_ns)}: {error}")
     count = query.count()
-    values = {"count": count, **_lacks(query, asked.topic, count), "not_shown": problems}
-    values["lacks"] = [*dict.fromkeys([*limited.remarks(asked.topic), *values["lacks"]])]
+    values = {"count": count, **_lacks(query, question.topic, count), "not_shown": problems}
+    values["lacks"] = [*dict.fromkeys([*limited.remarks(question.topic), *values["lacks"]])]
     return _answer({**values, "messages": rows}, "messages", tuple(shown), is_cut=count > len(rows))
 
 
@@ -231,17 +233,17 @@ def _picture(message: Any) -> Picture:
     return Picture(found.media_type, found.data)
 
 
-def plot(context: Context, asked: Asked, fields: list[str]) -> Answer:
+def plot(context: Context, question: ToolQuestion, fields: list[str]) -> Answer:
     """Fields over time as a picture."""
     from hybridlog.drawing.figure import figure
     from hybridlog.drawing.lines import lines
 
-    query = asked.query(context)
+    query = question.query(context)
     found = lines(query, fields, pixels=_PLOT[0])
     if not found:
         raise TopicError("There is no message to draw.")
     drawn = figure(found, size=_PLOT, form="png")
-    lacks = _lacks(query, asked.topic, query.counters.messages)
+    lacks = _lacks(query, question.topic, query.counters.messages)
     return _answer(
         {**lacks, "lines": [f"{one.topic} {one.series.field} in {one.recording}" for one in found]},
         "lines",

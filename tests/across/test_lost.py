@@ -189,7 +189,7 @@ def test_python_says_what_the_commands_say(damaged: Damaged) -> None:
         assert whole[0] in run(*command, "-r", "part", store=path).err.splitlines()
     answer = store.sql("select v from n where recording = 'part'")
     answer.to_arrow()
-    assert answer.told() == whole
+    assert answer.sentences() == whole
     # Only what is lost in the range.
     for begin, end, said in (
         ("+0s", "+4s", []),

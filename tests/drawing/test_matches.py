@@ -11,9 +11,9 @@ import pytest
 import hybridlog as hl
 from hybridlog.drawing.match_cache import CachedMatches, MatchCache
 from hybridlog.drawing.matches import (
-    AskedMatches,
     Match,
     Matches,
+    QueriedMatches,
     bands,
     count_before,
     matches_after,
@@ -44,7 +44,7 @@ def kept(query: hl.Query) -> Matches:
     return found
 
 
-@pytest.fixture(params=[AskedMatches, kept], ids=["asked", "kept"])
+@pytest.fixture(params=[QueriedMatches, kept], ids=["asked", "kept"])
 def made(request: pytest.FixtureRequest) -> Made:
     """Makes matches of a query, those that are read and those that are kept in memory."""
     found: Made = request.param
@@ -122,7 +122,7 @@ def test_matches_step_by_step(drive: Drive, made: Made, count: int) -> None:
 
 
 def test_pictures_without_width_are_refused(drive: Drive) -> None:
-    matches = AskedMatches(drive.store.topic("drive"))
+    matches = QueriedMatches(drive.store.topic("drive"))
     for span, pixels in (((BASE, BASE + 1), 0), ((BASE, BASE), 9)):
         with pytest.raises(UsageError, match="at least one pixel"):
             ticks(matches, span, pixels)
@@ -152,6 +152,6 @@ def test_the_last_questions_are_kept(drive: Drive) -> None:
     asked.clear()
     for _ in range(2):  # too many, which is known the second time
         found = matches("ticks != 0 and on == true")
-        assert isinstance(found, AskedMatches)
+        assert isinstance(found, QueriedMatches)
         assert found.count_until(BASE + 10**12) == 2500
     assert len(asked) == 3

@@ -14,7 +14,7 @@ from PIL import Image
 
 from hybridlog.cli.sparkline import bar, densities, sparkline
 from hybridlog.drawing.figure import figure
-from hybridlog.drawing.lines import MOST, Line, lines
+from hybridlog.drawing.lines import MAX_LINES, Line, lines
 from hybridlog.drawing.page import increasing
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts
@@ -49,8 +49,8 @@ def test_lines_are_by_topic_and_recording(drive: Drive) -> None:
     assert query.counters.messages == 5100
     with pytest.raises(TopicError, match="nothing"):
         lines(drive.store.topic("drive"), ["y", "nothing"], pixels=9)
-    with pytest.raises(UsageError, match=f"at most {MOST} lines"):
-        lines(drive.store.topic("drive"), [f"wide[{n}]" for n in range(MOST + 1)], pixels=9)
+    with pytest.raises(UsageError, match=f"at most {MAX_LINES} lines"):
+        lines(drive.store.topic("drive"), [f"wide[{n}]" for n in range(MAX_LINES + 1)], pixels=9)
     with pytest.raises(UsageError, match=r"Name a field, such as linear\.x"):
         lines(drive.store.topic("drive"), [], pixels=9)
 

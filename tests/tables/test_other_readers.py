@@ -285,7 +285,9 @@ def test_reduced_messages_have_null_fields(store: hl.Store) -> None:
     answer = store.sql("select i8 from a")
     assert [value is None for (value,) in answer.rows()] == [False, True]
     assert answer.remarks.absent == {("/a", "reduced"): 1}
-    assert "/a: 1 message has no fields: its payload was dropped under pressure." in answer.told()
+    assert (
+        "/a: 1 message has no fields: its payload was dropped under pressure." in answer.sentences()
+    )
 
 
 def test_compacted_and_dropped_recordings_stay(many: hl.Store) -> None:

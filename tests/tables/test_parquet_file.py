@@ -173,7 +173,7 @@ def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
         numbers = np.random.default_rng(number).random(len(rows))
         table = pa.table({"x": numbers, "t": rows, "seq": rows})
         in_front = kept is not None and len(kept.data) * 1.3 < kept.offset
-        writer = ParquetFileWriter(path, table, depth=1, kept=kept, in_front=in_front)
+        writer = ParquetFileWriter(path, table, depth=1, reused=kept, in_front=in_front)
         writer.write(table)
         section = Section("id", 0, {}, {"/a": TopicCounts(table.num_rows)})
         writer.close([section])
@@ -183,7 +183,7 @@ def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
             assert pq.ParquetFile(path, metadata=metadata).read().equals(old)
         reader = ParquetFileReader(path)
         reader.check()
-        kept, before = reader.kept(), (pq.read_metadata(path), table)
+        kept, before = reader.reusable(), (pq.read_metadata(path), table)
         sizes.append(reader.size_bytes / len(kept.data))
         path.unlink()
     assert max(sizes) < 3.5

@@ -28,7 +28,7 @@ from tests.view.test_ask import asked_for
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.params import RequestParams
     from hybridlog.view.question import PageQuestion
 
 S = 10**9

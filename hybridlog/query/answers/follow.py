@@ -166,12 +166,12 @@ def _checked(question: Question) -> Question:
     """The question without an end; refuses what is only known when a recording has ended."""
     begin, stop = question.bounds or (None, None)
     word = str(stop).strip().lower()
-    for is_asked, problem in (
+    for is_used, problem in (
         (question.reverse, "has no last message to begin with"),
         (question.during is not None, "has no intervals to follow: they are those of one moment"),
         (question.predicate and question.predicate.needs_index, "is not in MongoDB yet"),
         (word.startswith("-"), f"has no end to count {stop} from"),
     ):
-        if is_asked:
+        if is_used:
             raise UsageError(f"What is still recorded {problem}.")
     return replace(question, bounds=(begin, None)) if word == "end" else question

@@ -84,7 +84,7 @@ class IntervalQueries:
         )
         spans = RangeResolver(self._session, self._question).spans()
         by_recording = plain.times_in({summary.id: summary for summary, _ in spans})
-        asked = Intervals.of(
+        whole = Intervals.of(
             (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
         )
         # What was lost before the range may have changed the state at its beginning.
@@ -92,7 +92,7 @@ class IntervalQueries:
         lost = lost_times(self._session, everywhere).until_next(by_recording)
         known = plain.states(max_gap).without(lost)
         if state == "unknown":
-            return asked.without(known).counted(by_recording)
+            return whole.without(known).counted(by_recording)
         held = self.states(max_gap)
         found = held.common(known) if state == "held" else known.without(held)
         return found.counted(by_recording)
@@ -308,15 +308,15 @@ def _steps(
         first = rows[0] if carried is None else carried[0]
         found = [objects_differ(a, b, paths, tolerance) for a, b in pairwise([first, *rows])]
         return np.array(found, np.bool_), rows[-1:]
-    together: pa.StructArray = rows
+    joined: pa.StructArray = rows
     if carried is not None:
         tables = [pa.Table.from_struct_array(part) for part in (carried, rows)]
         joined_table = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
-        together = joined_table.to_struct_array().combine_chunks()
-    if isinstance(together, pa.ChunkedArray):
-        together = pa.concat_arrays(together.chunks)
-    numbers = np.arange(1, len(together))
-    differs = rows_differ(together, numbers, numbers - 1, tolerance)
+        joined = joined_table.to_struct_array().combine_chunks()
+    if isinstance(joined, pa.ChunkedArray):
+        joined = pa.concat_arrays(joined.chunks)
+    numbers = np.arange(1, len(joined))
+    differs = rows_differ(joined, numbers, numbers - 1, tolerance)
     if carried is None:
         differs = np.concatenate([[False], differs])
     return differs, rows[-1:]

@@ -132,7 +132,7 @@ class _LatchedScan:
         if not own:
             return
         times, numbers = np.array(cuts, np.int64).T
-        plan = ScanPlan(own, [_together(scans)], counters=self._counters)
+        plan = ScanPlan(own, [_merged_scan(scans)], counters=self._counters)
         whole = np.array([not channel.is_reduced for channel in own], np.bool_)
         for run in ChunkScan(plan, self._session.segment).runs():
             of, time = run.batch.channel, run.batch.log_time
@@ -178,7 +178,7 @@ class _LatchedScan:
         return RecordingScan(self._recording, indexes, bounds, chunks)
 
 
-def _together(scans: Sequence[RecordingScan]) -> RecordingScan:
+def _merged_scan(scans: Sequence[RecordingScan]) -> RecordingScan:
     """One scan of everything, which reads each chunk once."""
     chunks: dict[tuple[int, int], Chunk] = {}
     for chunk in (chunk for scan in scans for chunk in scan.chunks):

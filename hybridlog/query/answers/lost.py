@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
-_MOST_JOURNALS = 100  # that are read for a reason
+_MAX_JOURNALS = 100  # that are read for a reason
 _INTERVAL_S = 1.0  # flush interval of recorders that do not say it
 
 
@@ -58,15 +58,15 @@ def completeness_of(
         others: Questions that the answer depends on. What they have lost counts as an unknown
             number.
     """
-    asked = [(question, counters), *others]
-    ledgers = [_rows_of(session, one) for one, _ in asked]
+    answered = [(question, counters), *others]
+    ledgers = [_rows_of(session, one) for one, _ in answered]
     lost = [row for row in ledgers[0] if row["cause"] not in NOT_LOST]
     given = 0 if counters is None else counters.messages
     is_full = question.limit is not None and given >= question.limit and not question.reverse
-    unwritten, late = (0, []) if is_full else _unwritten(session, [one for one, _ in asked])
+    unwritten, late = (0, []) if is_full else _unwritten(session, [one for one, _ in answered])
     sentences: list[str] = []
     unindexed = 0
-    for one, cost in asked:
+    for one, cost in answered:
         lacks = _unindexed(session, one, cost)
         unindexed += lacks
         late += [not_indexed(lacks)] if lacks else []
@@ -94,8 +94,8 @@ def completeness_of(
         rows=tuple(lost),
         unwritten=unwritten,
         unindexed=unindexed,
-        untransformed=sum(n for _, cost in asked if cost for _, n in cost.no_transform),
-        untested=sum(cost.without_arrays for _, cost in asked if cost),
+        untransformed=sum(n for _, cost in answered if cost for _, n in cost.no_transform),
+        untested=sum(cost.without_arrays for _, cost in answered if cost),
         late=tuple(dict.fromkeys(late)),
         sentences=tuple(dict.fromkeys(sentences)),
     )
@@ -116,7 +116,7 @@ def why_expired(directory: StoreDirectory, labels: Sequence[str]) -> str:
     if directory.is_remote:
         return deleted
     either = f"{deleted}, or {NOT_COPIED}"
-    if len(labels) > _MOST_JOURNALS:
+    if len(labels) > _MAX_JOURNALS:
         return either
     waiting = set()
     for label in labels:
@@ -171,22 +171,22 @@ def _losses_in(
         entry = doubtful.get(summary.id)
         if entry is None:
             continue
-        asked = _asked(bounds if question.clock == "log" else None, windows)
+        chosen = _chosen_windows(bounds if question.clock == "log" else None, windows)
         for row in _ledger(entry):
             if row["count"] == 0:
                 continue
             if row.get("topic") is not None and row["topic"] not in question.topics:
                 continue
             span = _span_of(entry, row)
-            if span is None or bool(((asked[:, 0] <= span[1]) & (span[0] < asked[:, 1])).any()):
+            if span is None or bool(((chosen[:, 0] <= span[1]) & (span[0] < chosen[:, 1])).any()):
                 yield entry, row
 
 
-def _asked(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    asked = np.array([[BEGIN, END]], np.int64) if windows is None else windows
+def _chosen_windows(bounds: Span | None, windows: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    chosen = np.array([[BEGIN, END]], np.int64) if windows is None else windows
     if bounds is not None:
-        asked = np.clip(asked, *bounds)
-    return asked[asked[:, 1] > asked[:, 0]]
+        chosen = np.clip(chosen, *bounds)
+    return chosen[chosen[:, 1] > chosen[:, 0]]
 
 
 def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
@@ -223,7 +223,7 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
                     known.setdefault(topic, question is questions[0])
     missing: int | None = 0
     sentences: list[str] = []
-    for place, asked in topics.items():
+    for place, owners in topics.items():
         one = snapshot.summaries[place]
         late = _taken(session, one)
         if late is None:
@@ -231,8 +231,8 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
             sentences.append(not_written(one.label, None, flush_interval_ns(one)))
             continue
         if missing is not None:
-            missing += sum(late.get(topic, 0) for topic, is_own in asked.items() if is_own)
-        messages = sum(late.get(topic, 0) for topic in asked)
+            missing += sum(late.get(topic, 0) for topic, is_own in owners.items() if is_own)
+        messages = sum(late.get(topic, 0) for topic in owners)
         if messages:
             sentences.append(not_written(one.label, messages, flush_interval_ns(one)))
     return missing, sentences

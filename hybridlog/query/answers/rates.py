@@ -193,23 +193,23 @@ class _Times:
 
     def __init__(self, read: Callable[[], Iterator[NDArray[np.int64]]]) -> None:
         self._read = read
-        self._kept: list[NDArray[np.int64]] | None = None
+        self._cached: list[NDArray[np.int64]] | None = None
 
     def __iter__(self) -> Iterator[NDArray[np.int64]]:
         """int64 arrays, ns, ascending, none of them empty."""
-        if self._kept is not None:
-            yield from self._kept
+        if self._cached is not None:
+            yield from self._cached
             return
-        kept: list[NDArray[np.int64]] = []
+        cached: list[NDArray[np.int64]] = []
         count = 0
         for times in self._read():
             count += len(times)
             if count <= _MAX_SECOND_LOOK:
-                kept.append(times)
+                cached.append(times)
             else:
-                kept.clear()
+                cached.clear()
             yield times
-        self._kept = kept if count <= _MAX_SECOND_LOOK else None
+        self._cached = cached if count <= _MAX_SECOND_LOOK else None
 
 
 def _longer(

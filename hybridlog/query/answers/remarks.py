@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.session import Session
 
-_MOST = 100  # recordings looked at
+_MAX_RECORDINGS = 100  # recordings looked at
 _MAX_NAMES = 5  # names in a remark
 _APART_NS = 86_400 * 10**9  # header stamps and log times this far apart have other epochs
 
@@ -64,7 +64,7 @@ def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]
     """The channels of the question with messages, of its first recordings."""
     summaries = session.look(question.recordings).summaries
     wanted = set(question.topics)
-    for place in session.chosen(question)[:_MOST].tolist():
+    for place in session.chosen(question)[:_MAX_RECORDINGS].tolist():
         for channel in session.channels(session.entry_of(summaries[place])):
             if channel.channel.topic in wanted and channel.stats.messages:
                 yield channel
@@ -72,17 +72,17 @@ def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]
 
 def _about_stamps(session: Session, question: Question) -> Iterator[str]:
     """Header stamps of another epoch than the log times, and messages without a stamp."""
-    is_told = False
+    is_noted = False
     missing = 0
     for channel in _channels(session, question):
         stats = channel.stats
         if channel.recording.is_decoded and channel.is_typed:
             missing += stats.messages - stats.stamped
         first, last = stats.first_stamp, stats.last_stamp
-        if is_told or first is None or last is None or stats.first is None or stats.last is None:
+        if is_noted or first is None or last is None or stats.first is None or stats.last is None:
             continue
         if first < stats.first - _APART_NS or last > stats.last + _APART_NS:
-            is_told = True
+            is_noted = True
             yield (
                 f"Header stamps of {channel.channel.topic} are from {format_time(first)} to "
                 f"{format_time(last)}, its log times from {format_time(stats.first)} to "
@@ -97,12 +97,12 @@ def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> 
     """Topics of whose messages the predicate asks for a field that they do not have."""
     if question.predicate is None or question.predicate.is_opaque:
         return
-    asked = dict.fromkeys(
+    paths = dict.fromkeys(
         condition.field.names
         for condition in question.predicate.conditions()
         if not isinstance(condition, Exists) and not is_meta(condition.field.path)
     )
-    if not asked:
+    if not paths:
         return
     by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
     for channel in Planner(session, question, Counters()).examples:
@@ -113,7 +113,7 @@ def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> 
         known: Collection[str] | None = field_types(tuple(channels))
         if known is None and is_empty:
             known = _fields_in_tables(session, question, topic)
-        for path in asked if known is not None else ():
+        for path in paths if known is not None else ():
             if not any(_is_near(path, name.replace("[]", "")) for name in known or ()):
                 near = difflib.get_close_matches(path, known or (), n=_MAX_NAMES, cutoff=0.5)
                 hint = f"; did you mean {', '.join(near)}?" if near else "."
@@ -132,7 +132,7 @@ def _fields_in_tables(session: Session, question: Question, topic: str) -> set[s
     found: set[str] = set()
     for place in places:
         table = session.table(session.entry_of(summaries[place]), topic)
-        if table is None or len(places) > _MOST:
+        if table is None or len(places) > _MAX_RECORDINGS:
             return None
         found.update(_names_in(table.fields(None), ""))
     return found
@@ -169,7 +169,7 @@ def _topics_beside(session: Session, question: Question) -> Iterator[str]:
     wanted = set(question.topics)
     spans: dict[str, list[Span]] = defaultdict(list)
     inside: set[str] = set()
-    for summary, bounds, _ in islice(RangeResolver(session, question).resolve(), _MOST):
+    for summary, bounds, _ in islice(RangeResolver(session, question).resolve(), _MAX_RECORDINGS):
         for channel in session.channels(session.entry_of(summary)):
             topic, stats = channel.channel.topic, channel.stats
             if topic not in wanted or stats.first is None or stats.last is None:
@@ -195,7 +195,7 @@ def _others(session: Session, question: Question) -> Iterator[str]:
         return
     labels = [
         each.summary.label
-        for each in islice(ranges, _MOST)
+        for each in islice(ranges, _MAX_RECORDINGS)
         if each.summary.id not in (question.recordings or ())
     ]
     if labels:

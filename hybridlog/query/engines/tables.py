@@ -79,7 +79,7 @@ class TablesEngine:
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the stored bytes of the columns; None without a table that can tell."""
-        table = self._believed(part, need, fields)
+        table = self._valid_table(part, need, fields)
         if table is None:
             return None
         own = ("ref",) if need is Need.SELECTION else ()
@@ -91,7 +91,7 @@ class TablesEngine:
         size = table.size(wanted, own, _root(part))
         return _OPEN_S + self._byte_s * size * max(part.share, 0.01)
 
-    def _believed(
+    def _valid_table(
         self, part: Part, need: Need, fields: Collection[str] | None
     ) -> TopicTable | None:
         """The table of a part, if it can answer."""
@@ -139,7 +139,7 @@ class TablesEngine:
         """
         self._count_by_file(parts)
         found = [*map(self.check, parts)]
-        self._tell_unreadable(parts)
+        self._count_unreadable(parts)
         return sum(found)
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
@@ -153,17 +153,17 @@ class TablesEngine:
             table = self._table_of(part)
             if table is not None and len(table.files) == 1:
                 by_file[table.files[0].number].append((part, table))
-        for together in by_file.values():
-            if len(together) > 1:
+        for group in by_file.values():
+            if len(group) > 1:
                 with suppress(UndecidedError, StoreError):  # then part by part
-                    self._count_in_file(together)
+                    self._count_in_file(group)
 
-    def _count_in_file(self, together: Sequence[tuple[Part, TopicTable]]) -> None:
-        part, table = together[0]
+    def _count_in_file(self, group: Sequence[tuple[Part, TopicTable]]) -> None:
+        part, table = group[0]
         types = part.field_types
         whole = self._session.tables.whole(table.files[0])
         matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
-        alike = [(part, table) for part, table in together if part.field_types == types]
+        alike = [(part, table) for part, table in group if part.field_types == types]
         bounds = None if self._bounds is None else self._bounds.of([part for part, _ in alike])
         own = [(part, one) for part, table in alike for one in table.parts]
         for rows, holds in self._rows(part, whole=whole):
@@ -200,7 +200,7 @@ class TablesEngine:
                 bounds.note(part)
         return self._counts[part].matched
 
-    def _tell_unreadable(self, parts: Sequence[Part]) -> None:
+    def _count_unreadable(self, parts: Sequence[Part]) -> None:
         """Count the unreadable messages of parts that are answered, once."""
         for part in parts:
             if part not in self._counted:
@@ -212,7 +212,7 @@ class TablesEngine:
         for part in parts:
             if part.predicate is not None:
                 self.check(part)
-                self._tell_unreadable([part])
+                self._count_unreadable([part])
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """The outcome for each row, in order."""
@@ -301,8 +301,8 @@ class TablesEngine:
         from hybridlog.query.predicate.to_mask import to_mask
 
         records: Any = rows.records
-        asked = predicate.fields()
-        if any(map(is_meta, asked)):
+        tested = predicate.fields()
+        if any(map(is_meta, tested)):
             pub = rows.own.get("pub")
             records = meta_array(records, part.channels[0], rows.t, rows.seq, pub)
         found = to_mask(predicate, part.field_types, records)
@@ -331,15 +331,15 @@ class ArraysEngine(TablesEngine):
             self._arrays[key] = self._session.arrays(part.recording, part.topic)
         return self._arrays[key]
 
-    def _believed(
+    def _valid_table(
         self, part: Part, need: Need, fields: Collection[str] | None
     ) -> TopicTable | None:
         """The columns of a part, if they hold all of its messages and all fields asked for."""
-        asked = part.predicate.fields() if part.predicate is not None else ()
-        if part.field_types is None or any(map(is_meta, asked)):
+        tested = part.predicate.fields() if part.predicate is not None else ()
+        if part.field_types is None or any(map(is_meta, tested)):
             return None
         table = self._arrays_of(part)
-        if table is None or super()._believed(part, need, fields) is None:
+        if table is None or super()._valid_table(part, need, fields) is None:
             return None
         if table.rows != part.messages:
             return None

@@ -262,10 +262,10 @@ class _Reader:
             compile_regex(pattern)
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
-        asked = _field(name)
-        if asked is None:
+        target = _field(name)
+        if target is None:
             raise _refused(path, "a pattern needs a field of a message")
-        return Match(asked, pattern, negated=False)
+        return Match(target, pattern, negated=False)
 
     def _expression(self, value: object, path: _Path, depth: int) -> object:
         """An aggregation expression."""
@@ -400,25 +400,25 @@ def _comparison(name: str, operator: str, operand: object) -> Node | None:
     MongoDB's equality with null also finds missing fields, and MongoDB orders values that
     have no order in the language.
     """
-    asked = _field(name)
-    if asked is None:
+    target = _field(name)
+    if target is None:
         return None
     if isinstance(operand, int) and not isinstance(operand, bool):
         operand = int(operand)  # also converts an Int64 of BSON
     if operator in {"$in", "$nin"} and isinstance(operand, list):
         values = tuple(value for value in operand if _is_value(value))
-        member = Member(asked, values, negated=False) if len(values) == len(operand) else None
+        member = Member(target, values, negated=False) if len(values) == len(operand) else None
         return member if operator == "$in" or member is None else Not(member)
     if operator == "$exists" and isinstance(operand, bool):
-        return Exists(asked, present=operand)
+        return Exists(target, present=operand)
     if not _is_value(operand):
         return None
     if operator in {"$eq", "$ne"}:
-        same = Compare(asked, "==", operand)
+        same = Compare(target, "==", operand)
         return same if operator == "$eq" else Not(same)
     order = _ORDERS.get(operator)
     is_ordered = not isinstance(operand, bool) and not is_nan(operand)
-    return Compare(asked, order, operand) if order is not None and is_ordered else None
+    return Compare(target, order, operand) if order is not None and is_ordered else None
 
 
 def _is_value(operand: object) -> TypeGuard[Value]:

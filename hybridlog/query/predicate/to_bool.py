@@ -157,7 +157,7 @@ class _Hidden:
 
 _UNKNOWN = _Hidden(None, None, surely=False, elements=False, numeric=False, booleans=None)
 """Result for a name in the summary of an element: nothing, if that is an array."""
-_SOME = dataclasses.replace(_UNKNOWN, surely=True)
+_OF_SOME_ELEMENTS = dataclasses.replace(_UNKNOWN, surely=True)
 """A statistic of some elements of an array that is present only as a summary."""
 
 
@@ -173,9 +173,9 @@ class _Reader:
     types: FieldTypes
     summarised: bool
 
-    def leaves(self, message: Message, asked: Field) -> list[object]:
+    def leaves(self, message: Message, target: Field) -> list[object]:
         """Everything at a path: values, whole arrays, statistics of arrays, hidden elements."""
-        parts = asked.parts
+        parts = target.parts
         stat = self.types.statistic(parts)
         if stat is None:
             return list(self._reach(message, parts, ()))
@@ -208,7 +208,7 @@ class _Reader:
                 yield statistic(stat, array)
         elif isinstance(array, _Hidden):
             # What is known of all elements says nothing of the statistics of some.
-            yield _SOME if isinstance(parts[-1], Slice) else array
+            yield _OF_SOME_ELEMENTS if isinstance(parts[-1], Slice) else array
         elif isinstance(array, Mapping) and stat in array:
             yield array[stat]
 
@@ -375,8 +375,8 @@ def _node(node: Node, reader: _Reader) -> Decision:
             return partial(_any, [_node(item, reader) for item in items])
         case Opaque():
             raise WhereError(f"only MongoDB can answer {node.to_filter()}")
-        case Exists(asked, present):
-            exists = partial(_exists, reader, asked)
+        case Exists(target, present):
+            exists = partial(_exists, reader, target)
             return exists if present else partial(_negated, exists)
         case Compare(order="!=") | Member(negated=True) | Match(negated=True):
             positive = partial(_negated, partial(_holds, reader, node.field, _test_of(node)))
@@ -410,8 +410,8 @@ def _any(tests: Sequence[Decision], message: Message) -> Truth:
     return None if unknown else False
 
 
-def _exists(reader: _Reader, asked: Field, message: Message) -> Truth:
-    found = reader.leaves(message, asked)
+def _exists(reader: _Reader, target: Field, message: Message) -> Truth:
+    found = reader.leaves(message, target)
     if any(not isinstance(leaf, _Hidden) or leaf.surely for leaf in found):
         return True
     return None if found else False
@@ -421,10 +421,10 @@ _Leaf: TypeAlias = Callable[[object, bool], Truth]
 """Tests a value; the second argument is True for an element of an array."""
 
 
-def _holds(reader: _Reader, asked: Field, test: _Leaf, message: Message) -> Truth:
+def _holds(reader: _Reader, target: Field, test: _Leaf, message: Message) -> Truth:
     """True if a test holds for any value at a path."""
     unknown = False
-    for leaf in reader.leaves(message, asked):
+    for leaf in reader.leaves(message, target):
         is_list = isinstance(leaf, list)
         for value in reader.elements(leaf) if isinstance(leaf, list) else (leaf,):
             found = test(value, is_list)

@@ -105,12 +105,12 @@ def to_mask(
 
 
 def numbers_at(
-    asked: Field, types: FieldTypes | Mapping[str, str] | None, records: pa.StructArray
+    target: Field, types: FieldTypes | Mapping[str, str] | None, records: pa.StructArray
 ) -> list[tuple[NDArray[Any], Rows]] | None:
     """The numbers that conditions on a field compare.
 
     Args:
-        asked: The field.
+        target: The field.
         types: As for `to_mask`.
         records: As for `to_mask`.
 
@@ -119,7 +119,7 @@ def numbers_at(
     """
     found = []
     try:
-        for leaves in _Columns(FieldTypes.of(types), records).leaves(asked):
+        for leaves in _Columns(FieldTypes.of(types), records).leaves(target):
             for each in _elements(leaves):
                 values = _as_integers(each.values)
                 is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
@@ -201,8 +201,8 @@ class _Columns:
                 return self._joined(np.logical_or, items, start=False)
             case Not(item):
                 return _not(self.node(item))
-            case Exists(asked, present):
-                found = self._exists(asked)
+            case Exists(target, present):
+                found = self._exists(target)
                 return found if present else _not(found)
             case Opaque():
                 raise _UnfitError
@@ -228,9 +228,9 @@ class _Columns:
         exists, other = self._exists(node.field), _not(found)
         return _Pair(exists.possible & other.possible, exists.certain & other.certain)
 
-    def _exists(self, asked: Field) -> _Pair:
+    def _exists(self, target: Field) -> _Pair:
         possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
-        for leaves in self.leaves(asked):
+        for leaves in self.leaves(target):
             possible[leaves.rows] = True
             if leaves.is_hidden:
                 continue
@@ -252,13 +252,13 @@ class _Columns:
 
     # Paths.
 
-    def leaves(self, asked: Field) -> list[_Leaves]:
+    def leaves(self, target: Field) -> list[_Leaves]:
         """The values at a path.
 
         Raises:
             _UnfitError: the columns cannot decide.
         """
-        parts = asked.parts
+        parts = target.parts
         top = self._records.type
         if top.get_field_index(str(parts[0])) < 0:
             raise _UnfitError

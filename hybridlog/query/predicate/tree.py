@@ -194,15 +194,15 @@ class Predicate:
 
     def __and__(self, other: Predicate) -> Predicate:
         """Both predicates hold."""
-        asked = [each for each in (self, other) if each]
-        if len(asked) < 2:
-            return asked[0] if asked else self
+        target = [each for each in (self, other) if each]
+        if len(target) < 2:
+            return target[0] if target else self
         items = [
             item
-            for each in asked
+            for each in target
             for item in (each.root.items if isinstance(each.root, And) else (each.root,))
         ]
-        return Predicate(And(tuple(items)), " and ".join(f"({each.text})" for each in asked))
+        return Predicate(And(tuple(items)), " and ".join(f"({each.text})" for each in target))
 
     def __repr__(self) -> str:
         return f"<Predicate {spelled(self.root)}>"
@@ -248,8 +248,8 @@ def needs_index(node: Node) -> bool:
     )
 
 
-def _is_of_index(asked: Field) -> bool:
-    name = asked.path.split(".")
+def _is_of_index(target: Field) -> bool:
+    name = target.path.split(".")
     return name[0] == "_meta" and (len(name) < 2 or name[1] in _ONLY_INDEXED)
 
 

@@ -83,16 +83,16 @@ class FieldTypes:
             return types
         return _listed(None if types is None else tuple(types.items()))
 
-    def is_open(self, asked: Field) -> bool:
+    def is_open(self, target: Field) -> bool:
         """True if each message decides the type at a path."""
-        name = asked.names
-        if str(asked.parts[0]) == "_meta":
+        name = target.names
+        if str(target.parts[0]) == "_meta":
             return False
         return not self.known or not (
             name in self.types
             or name in self.inner
             or name in self.arrays
-            or self.statistic(asked.parts) is not None
+            or self.statistic(target.parts) is not None
         )
 
     def statistic(self, parts: Parts) -> Stat | None:
@@ -172,31 +172,31 @@ class _Checker:
             case _:
                 pass
 
-    def _kind(self, asked: Field) -> Kind:
+    def _kind(self, target: Field) -> Kind:
         types = self._types
-        path = asked.names
-        if asked.parts[0] == "_id":
-            raise self._fail(asked, "_id is no field; use _meta.t, _meta.rec and _meta.seq")
-        if asked.parts[0] != "_meta" and not types.known:
+        path = target.names
+        if target.parts[0] == "_id":
+            raise self._fail(target, "_id is no field; use _meta.t, _meta.rec and _meta.seq")
+        if target.parts[0] != "_meta" and not types.known:
             return "other"
         if path in types.types:
             return types.kind(path)
-        if types.statistic(asked.parts) is not None:
+        if types.statistic(target.parts) is not None:
             return "number"
         if path in types.inner or path in types.arrays:
             return "other"
-        raise self._unknown(asked, path)
+        raise self._unknown(target, path)
 
-    def _check_leaf(self, asked: Field) -> None:
+    def _check_leaf(self, target: Field) -> None:
         """Refuse a comparison with a message, which has fields and no value of its own."""
-        path = asked.names
+        path = target.names
         if path not in self._types.inner:
             return
         below = [name for name in self._types.types if name.startswith(f"{path}.")]
         leaves = [name for name in below if name not in self._types.inner]
         names = listed(leaves, _MAX_NAMES)
         raise self._fail(
-            asked, f"{path} is a message, not a value; ask for one of its fields: {names}"
+            target, f"{path} is a message, not a value; ask for one of its fields: {names}"
         )
 
     def _check_value(self, kind: Kind, value: Value, position: int) -> None:
@@ -225,7 +225,7 @@ class _Checker:
             f"the field is a {kind}, the value is a {given}{hints.get(kind, '')}",
         )
 
-    def _unknown(self, asked: Field, path: str) -> WhereError:
+    def _unknown(self, target: Field, path: str) -> WhereError:
         known = sorted(set(self._types.types) - ({} if path.startswith("_meta") else _META).keys())
         lowered = {name.lower(): name for name in known}
         near = [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
@@ -236,7 +236,7 @@ class _Checker:
         shown = list(dict.fromkeys(near or known))
         names = listed(shown, _MAX_NAMES)
         hint = f"; did you mean {names}?" if near else f"; there are {names}" if shown else ""
-        return self._fail(asked, f"there is no field {path}{hint}")
+        return self._fail(target, f"there is no field {path}{hint}")
 
-    def _fail(self, asked: Field, message: str) -> WhereError:
-        return error_at(self._text, asked.position, message)
+    def _fail(self, target: Field, message: str) -> WhereError:
+        return error_at(self._text, target.position, message)

@@ -97,9 +97,9 @@ class PlayedLog:
         self.end = int(times[:, 1].max()) - 1
         whole = replace(query.question, bounds=None, during=None, clock="log")
         self._whole = Query(query.session, whole, query.conditions)
-        asked = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
+        params = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
         during = query.question.during
-        self._during = asked if during is None else during.common(asked)
+        self._during = params if during is None else during.common(params)
         self.covered = Covered(times[:, 0], times[:, 1])
         self._ids: dict[tuple[str, int], int] = {}
         self._latching: set[str] = set()

@@ -184,7 +184,7 @@ class PlaybackServer:
         self._clock = PlaybackClock(self._log.begin, self._options.speed)
         self._sent = self._log.begin - 1  # log time until which everything is sent
         self._next: int | None = None  # log time of the next message that is read
-        self._told = 0.0  # when clients were told the time
+        self._clock_sent_s = 0.0  # when clients were told the time
         self._has_begun = self._options.is_paused
         self._has_ended = False
         self._read(())
@@ -412,8 +412,8 @@ class PlaybackServer:
             self._next = await self._next_time()
         last = self._log.end if self._next is None else self._next - 1
         self._sent = max(self._sent, min(self._clock.position, last))
-        if self._sent > before and time.monotonic() - self._told > _TICK_S:
-            self._told = time.monotonic()
+        if self._sent > before and time.monotonic() - self._clock_sent_s > _TICK_S:
+            self._clock_sent_s = time.monotonic()
             await self._broadcast(time_now(self._sent))
         await self._go_on()
 

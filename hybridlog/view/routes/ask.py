@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 
 from hybridlog.drawing.matches import (
-    AskedMatches,
     Match,
+    QueriedMatches,
     bands,
     count_before,
     matches_after,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from hybridlog.drawing.matches import Matches
     from hybridlog.sql.topic_view import Remarks
-    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.params import RequestParams
     from hybridlog.view.question import PageQuestion
     from hybridlog_storage.catalog import RecordingEntry
 
@@ -51,9 +51,9 @@ SQL_COLUMNS: Final = 200
 _MAX_CANDIDATES: Final = 50
 
 
-def ask(context: Context, asked: RequestParams) -> dict[str, Any]:
+def ask(context: Context, params: RequestParams) -> dict[str, Any]:
     """The number of messages that satisfy a predicate, with losses and remarks."""
-    question = question_of(context, asked)
+    question = question_of(context, params)
     query = question.query()
     count = query.count()
     found = query.completeness()
@@ -66,14 +66,14 @@ def ask(context: Context, asked: RequestParams) -> dict[str, Any]:
     }
 
 
-def matches(context: Context, asked: RequestParams) -> dict[str, Any]:
+def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
-    question = question_of(context, asked)
+    question = question_of(context, params)
     start = start_of(question.recording)
-    span, pixels = asked.span(start), asked.pixels()
-    asked_for = _matches(context, question)
-    found = ticks(asked_for, span, pixels)
-    held = bands(asked_for, span, pixels)
+    span, pixels = params.span(start), params.pixels()
+    found_matches = _matches(context, question)
+    found = ticks(found_matches, span, pixels)
+    held = bands(found_matches, span, pixels)
     return {
         "begin": span[0] - start,
         "width": found.width,
@@ -84,38 +84,38 @@ def matches(context: Context, asked: RequestParams) -> dict[str, Any]:
     }
 
 
-def match_list(context: Context, asked: RequestParams) -> dict[str, Any]:
+def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
-    question = question_of(context, asked)
+    question = question_of(context, params)
     start = start_of(question.recording)
-    place = Match(asked.moment(start), asked.integer("seq", -1, END, -1))
-    count = asked.integer("count", 1, MAX_LISTED, MAX_LISTED)
+    place = Match(params.moment(start), params.integer("seq", -1, END, -1))
+    count = params.integer("count", 1, MAX_LISTED, MAX_LISTED)
     find = {"later": matches_after, "earlier": matches_before}
-    asked_for = _matches(context, question)
-    found = find[asked.word("direction", find, "later")](asked_for, place, count)
+    found_matches = _matches(context, question)
+    found = find[params.word("direction", find, "later")](found_matches, place, count)
     return {
         "rows": [[str(one.time - start), one.seq] for one in found],
-        "before": count_before(asked_for, found[0]) if found else None,
+        "before": count_before(found_matches, found[0]) if found else None,
     }
 
 
 def _matches(context: Context, question: PageQuestion) -> Matches:
     recording = question.recording
     if recording.status == "open":
-        return AskedMatches(question.query())
-    asked = question.topics, question.where, question.within
-    key = recording.id, recording.status, frozenset(recording.digests.items()), asked
+        return QueriedMatches(question.query())
+    params = question.topics, question.where, question.within
+    key = recording.id, recording.status, frozenset(recording.digests.items()), params
     return context.matches.matches(key, question.query)
 
 
-def completion(context: Context, asked: RequestParams) -> dict[str, Any]:
+def completion(context: Context, params: RequestParams) -> dict[str, Any]:
     """Candidates for completing a predicate or SQL at a place."""
-    text = asked.text("text", "", longest=MAX_TEXT)
-    place = min(asked.integer("place", 0, MAX_TEXT), len(text))
-    if asked.word("language", ("predicate", "sql"), "predicate") == "sql":
+    text = params.text("text", "", longest=MAX_TEXT)
+    place = min(params.integer("place", 0, MAX_TEXT), len(text))
+    if params.word("language", ("predicate", "sql"), "predicate") == "sql":
         return context.sql.ask(sql_completion, text, place)
-    recording = context.recording(asked)
-    own = asked.text("topic")
+    recording = context.recording(params)
+    own = params.text("topic")
     topics = {channel.topic for channel in recording.channels}
 
     def fields(topic: str | None) -> Mapping[str, str] | None:
@@ -148,9 +148,9 @@ def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
     return {"begin": place - len(word), "candidates": offered}
 
 
-def sql(context: Context, asked: RequestParams) -> dict[str, Any]:
+def sql(context: Context, params: RequestParams) -> dict[str, Any]:
     """The first rows of a query in SQL."""
-    text = asked.text("text", longest=MAX_TEXT)
+    text = params.text("text", longest=MAX_TEXT)
     return context.sql.ask(sql_answer, text, SQL_SECONDS)
 
 
@@ -169,7 +169,7 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
         )
         return found | {
             "more": is_cut,
-            "remarks": answer.told(),
+            "remarks": answer.sentences(),
             "python": program(context.store, body),
         }
     finally:
@@ -214,9 +214,9 @@ def _messages_in(
     bounds = np.array([(*span_of(*pair), 0) for pair in ends], np.int64).reshape(-1, 3)
     own = {channel.topic for channel in entry.channels}
     query = context.store.query(sorted(own & {*topics} or own), [entry.id])
-    asked = query.during(Intervals.of([(entry.id, bounds)]))
+    params = query.during(Intervals.of([(entry.id, bounds)]))
     by_topic: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-    for found in match_times(asked.session, asked.question, asked.counters):
+    for found in match_times(params.session, params.question, params.counters):
         by_topic[found.topic].append(found.log_time)
     first, last = np.array(ends, np.int64).reshape(-1, 2).T
     least, greatest = np.full(len(spans), END), np.full(len(spans), BEGIN)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from starlette.responses import Response
 
     from hybridlog.query.query import Query
-    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.params import RequestParams
     from hybridlog_storage.messages import Buffer
 
 MAX_TOPICS: Final = 200
@@ -31,9 +31,9 @@ Pieces: TypeAlias = "Generator[bytes, None, None]"
 _streams = asyncio.Semaphore(MAX_STREAMS)
 
 
-def command(context: Context, asked: RequestParams) -> dict[str, Any]:
+def command(context: Context, params: RequestParams) -> dict[str, Any]:
     """The command line that writes a part of a recording, and how many messages it has."""
-    question = _question(context, asked)
+    question = _question(context, params)
     query = question.query()
     count = query.count()
     found = query.completeness()
@@ -46,9 +46,9 @@ def command(context: Context, asked: RequestParams) -> dict[str, Any]:
     }
 
 
-def file(context: Context, asked: RequestParams) -> Response:
+def file(context: Context, params: RequestParams) -> Response:
     """A part of a recording as an MCAP file."""
-    question = _question(context, asked)
+    question = _question(context, params)
     return mcap_response(question.query(), question.file_name())
 
 
@@ -92,17 +92,17 @@ async def _sent(pieces: Pieces) -> AsyncIterator[bytes]:
         pieces.close()
 
 
-def _question(context: Context, asked: RequestParams) -> PageQuestion:
-    recording = context.recording(asked)
-    topics = tuple(dict.fromkeys(asked.texts("topic", most=MAX_TOPICS)))
+def _question(context: Context, params: RequestParams) -> PageQuestion:
+    recording = context.recording(params)
+    topics = tuple(dict.fromkeys(params.texts("topic", most=MAX_TOPICS)))
     context.query(recording, *topics)
     span = None
-    if asked.has("begin") or asked.has("end"):
-        span = asked.span(start_of(recording))
-    where = asked.text("where", "", longest=MAX_TEXT).strip()
-    within = asked.text("within", "", longest=64)
+    if params.has("begin") or params.has("end"):
+        span = params.span(start_of(recording))
+    where = params.text("where", "", longest=MAX_TEXT).strip()
+    within = params.text("within", "", longest=64)
     question = PageQuestion(context.store, recording, topics, where, within, span)
-    return question.around(asked.text("around", longest=64)) if asked.has("around") else question
+    return question.around(params.text("around", longest=64)) if params.has("around") else question
 
 
 class _Pieces:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel
-    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.params import RequestParams
     from hybridlog_storage.messages import Schema
 
 MAX_RECORDINGS: Final = 100
@@ -34,25 +34,25 @@ _MAX_PREDICATES: Final = 16
 _MEDIA_TYPE: Final = "application/octet-stream"
 
 
-def slice_file(context: Context, asked: RequestParams) -> Response:
+def slice_file(context: Context, params: RequestParams) -> Response:
     """A selection as an MCAP file; ranges of it can be asked for."""
-    query = _query(context, asked)
+    query = _query(context, params)
     path = context.slices.get(query, _name(context, query), write_mcap)
     # The name has the digest of the question and of the state of its recordings.
     etag = path.stem.rpartition("-")[2]
     return FileResponse(path, headers={"ETag": f'"{etag}"'}, media_type=_MEDIA_TYPE)
 
 
-def manifest(context: Context, asked: RequestParams) -> dict[str, Any]:
+def manifest(context: Context, params: RequestParams) -> dict[str, Any]:
     """The manifest of a remote data loader: topics, times and data URL of a selection."""
-    query = _query(context, asked)
+    query = _query(context, params)
     spans = query.spans().values()
     if not spans:
         raise TimeError("This selection has no messages.")
     schemas: dict[Schema, int] = {}
     topics = [_topic(channel, schemas) for channel in query.channels() if not channel.is_reduced]
     source = {
-        "url": f"data?{urlencode(_parameters(asked))}",
+        "url": f"data?{urlencode(_parameters(params))}",
         "id": fingerprint(query),
         "topics": [dict(topic) for topic in dict.fromkeys(topics)],
         "schemas": [_schema(schema, number) for schema, number in schemas.items()],
@@ -62,43 +62,43 @@ def manifest(context: Context, asked: RequestParams) -> dict[str, Any]:
     return {"name": _name(context, query), "sources": [source]}
 
 
-def data(context: Context, asked: RequestParams) -> Response:
+def data(context: Context, params: RequestParams) -> Response:
     """A selection as an MCAP file that is read from its beginning to its end."""
-    return mcap_response(_query(context, asked), "slice.mcap")
+    return mcap_response(_query(context, params), "slice.mcap")
 
 
-def _query(context: Context, asked: RequestParams) -> Query:
+def _query(context: Context, params: RequestParams) -> Query:
     """The query of the parameters, which mean what the options of the command line mean."""
     context.refresh()
-    names = asked.texts("recording", most=MAX_RECORDINGS)
+    names = params.texts("recording", most=MAX_RECORDINGS)
     if not names:
         raise UsageError("The parameter recording is missing.")
     chosen = context.store.choose(Choice.of(names)).check()
-    topics = asked.texts("topic", most=MAX_TOPICS)
+    topics = params.texts("topic", most=MAX_TOPICS)
     query = chosen.topic(*topics) if topics else chosen.all_topics()
-    if asked.has("begin") or asked.has("end"):
-        query = query.between(_time(asked, "begin", "start"), _time(asked, "end", "end"))
-    for predicate in asked.texts("where", most=_MAX_PREDICATES, longest=MAX_TEXT):
+    if params.has("begin") or params.has("end"):
+        query = query.between(_time(params, "begin", "start"), _time(params, "end", "end"))
+    for predicate in params.texts("where", most=_MAX_PREDICATES, longest=MAX_TEXT):
         query = query.where(predicate)
     return query
 
 
-def _time(asked: RequestParams, name: str, default: str) -> str:
+def _time(params: RequestParams, name: str, default: str) -> str:
     """A time as on the command line; the plus of `+10s` is a space in a URL."""
-    text = asked.text(name, default, longest=64)
+    text = params.text(name, default, longest=64)
     return f"+{text[1:]}" if text.startswith(" ") else text
 
 
-def _parameters(asked: RequestParams) -> list[tuple[str, str]]:
+def _parameters(params: RequestParams) -> list[tuple[str, str]]:
     """The parameters, for another URL."""
     several = {"recording": MAX_RECORDINGS, "topic": MAX_TOPICS, "where": _MAX_PREDICATES}
     found = [
         (name, value)
         for name, most in several.items()
-        for value in asked.texts(name, most=most, longest=MAX_TEXT)
+        for value in params.texts(name, most=most, longest=MAX_TEXT)
     ]
     times = (("begin", "start"), ("end", "end"))
-    return found + [(name, _time(asked, name, default)) for name, default in times]
+    return found + [(name, _time(params, name, default)) for name, default in times]
 
 
 def _name(context: Context, query: Query) -> str:

@@ -14,23 +14,23 @@ from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
-    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
+    from hybridlog.view.params import RequestParams
 
 
 _PATH: Final = re.compile(r"(\d{1,9}(\.\d{1,9}){0,99})?", re.ASCII)
 _MAX_BEGIN: Final = 1 << 40
 
 
-def message(context: Context, asked: RequestParams) -> dict[str, Any]:
+def message(context: Context, params: RequestParams) -> dict[str, Any]:
     """The message, or the part of it at a path, from an element or character on."""
-    place = asked.text("path", "")
+    place = params.text("path", "")
     if not _PATH.fullmatch(place):
         raise UsageError("path is a list of numbers with dots between them.")
     path = [int(number) for number in place.split(".")] if place else []
-    begin = asked.integer("begin", 0, _MAX_BEGIN, 0)
-    count = asked.integer("count", 1, MAX_SHOWN, 1) if asked.has("count") else None
-    found = current(context, asked)
+    begin = params.integer("begin", 0, _MAX_BEGIN, 0)
+    count = params.integer("count", 1, MAX_SHOWN, 1) if params.has("count") else None
+    found = current(context, params)
     shown = found.message
     answer: dict[str, Any] = {"time": found.time, "until": found.until}
     if shown is None:
@@ -62,16 +62,16 @@ _MAX_SEQ: Final = 1 << 62
 _MAX_FILTER: Final = 200
 
 
-def log(context: Context, asked: RequestParams) -> dict[str, Any]:
+def log(context: Context, params: RequestParams) -> dict[str, Any]:
     """Lines before and after a time; with `seq`, before and after the line of that number."""
-    before = asked.integer("before", 0, _MAX_LINES, 0)
-    after = asked.integer("after", 0, _MAX_LINES, 0)
-    recording, query = context.topic(asked)
+    before = params.integer("before", 0, _MAX_LINES, 0)
+    after = params.integer("after", 0, _MAX_LINES, 0)
+    recording, query = context.topic(params)
     start = start_of(recording)
-    lines = _log(query, asked)
-    time = asked.moment(start)
+    lines = _log(query, params)
+    time = params.moment(start)
     # A line at the time itself is before the cursor, as it is current there.
-    seq = asked.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
+    seq = params.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
     found = lines.before(time, seq, before)
     later = lines.after(time, seq, after)
     return {
@@ -81,15 +81,15 @@ def log(context: Context, asked: RequestParams) -> dict[str, Any]:
     }
 
 
-def log_count(context: Context, asked: RequestParams) -> dict[str, Any]:
+def log_count(context: Context, params: RequestParams) -> dict[str, Any]:
     """Number of lines that pass the filters."""
-    _, query = context.topic(asked)
-    return {"count": _log(query, asked).count()}
+    _, query = context.topic(params)
+    return {"count": _log(query, params).count()}
 
 
-def _log(query: Query, asked: RequestParams) -> Log:
-    level = asked.word("level", ("", *LEVELS), "")
-    text = asked.text("text", "", longest=_MAX_FILTER)
+def _log(query: Query, params: RequestParams) -> Log:
+    level = params.word("level", ("", *LEVELS), "")
+    text = params.text("text", "", longest=_MAX_FILTER)
     schemas = (channel.channel.schema for channel in query.channels())
     type_name = next((schema.name for schema in schemas if schema is not None), "")
     return Log(query, kind_of(type_name), level, text)

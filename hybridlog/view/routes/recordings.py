@@ -14,7 +14,7 @@ from hybridlog.schema.states import encoding_of, told_channels
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
-    from hybridlog.view.asked import RequestParams
+    from hybridlog.view.params import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
@@ -40,15 +40,15 @@ _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
 """Keys to order recordings by."""
 
 
-def recordings(context: Context, asked: RequestParams) -> dict[str, Any]:
+def recordings(context: Context, params: RequestParams) -> dict[str, Any]:
     """A part of the recordings that satisfy some conditions, in some order."""
     context.refresh()
-    first = asked.integer("first", 0, 1 << 31, 0)
-    count = asked.integer("count", 1, _MAX_ROWS, _MAX_ROWS)
-    key = _KEYS[asked.word("order", _KEYS, "start")]
-    is_ascending = asked.word("direction", ("up", "down"), "down") == "up"
+    first = params.integer("first", 0, 1 << 31, 0)
+    count = params.integer("count", 1, _MAX_ROWS, _MAX_ROWS)
+    key = _KEYS[params.word("order", _KEYS, "start")]
+    is_ascending = params.word("direction", ("up", "down"), "down") == "up"
     store = context.store
-    summaries = store.choose(_choice(asked)).summaries
+    summaries = store.choose(_choice(params)).summaries
     ordered = sorted(summaries, key=key, reverse=not is_ascending)
     shown = ordered[first : first + count]
     return {
@@ -62,9 +62,9 @@ def recordings(context: Context, asked: RequestParams) -> dict[str, Any]:
     }
 
 
-def recording(context: Context, asked: RequestParams) -> dict[str, Any]:
+def recording(context: Context, params: RequestParams) -> dict[str, Any]:
     """One recording: its topics, marks, losses and times."""
-    entry = context.recording(asked)
+    entry = context.recording(params)
     start = start_of(entry)
     begin, end = extent(entry)
     return {
@@ -86,15 +86,15 @@ def recording(context: Context, asked: RequestParams) -> dict[str, Any]:
     }
 
 
-def _choice(asked: RequestParams) -> Choice:
-    begin, end = asked.text("begin", ""), asked.text("end", "")
+def _choice(params: RequestParams) -> Choice:
+    begin, end = params.text("begin", ""), params.text("end", "")
     return Choice.of(
-        _globs(asked.text("name", "")),
-        tag=asked.texts("tag", most=_MAX_CONDITIONS),
-        has=asked.texts("topic", most=_MAX_CONDITIONS),
-        type=asked.texts("type", most=_MAX_CONDITIONS),
+        _globs(params.text("name", "")),
+        tag=params.texts("tag", most=_MAX_CONDITIONS),
+        has=params.texts("topic", most=_MAX_CONDITIONS),
+        type=params.texts("type", most=_MAX_CONDITIONS),
         during=(begin or None, end or None) if begin or end else None,
-        where=asked.texts("where", most=_MAX_CONDITIONS),
+        where=params.texts("where", most=_MAX_CONDITIONS),
     )
 
 

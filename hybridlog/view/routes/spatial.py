@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from starlette.responses import Response
 
-    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
+    from hybridlog.view.params import RequestParams
 
 
-def image(context: Context, asked: RequestParams) -> Response:
+def image(context: Context, params: RequestParams) -> Response:
     """The picture as a file; as JSON, why there is none. Headers say when it is current."""
-    found = current(context, asked)
+    found = current(context, params)
     if found.message is None:
         answer: Response = json_response({})
-    elif asked.tag == found.tag:
+    elif params.tag == found.tag:
         answer = Response(status_code=304)
     else:
         try:
@@ -40,15 +40,15 @@ def image(context: Context, asked: RequestParams) -> Response:
     return answer
 
 
-def points_at(context: Context, asked: RequestParams) -> Response:
+def points_at(context: Context, params: RequestParams) -> Response:
     """The points of the message that is current at a time.
 
     Parameters: `recording`, `topic`, `at`; `value`, the name of the values to colour by;
     `limit`, the greatest number of points.
     """
-    limit = asked.integer("limit", 1, MAX_POINTS, MAX_POINTS)
-    value = asked.text("value", "")
-    shown = current(context, asked)
+    limit = params.integer("limit", 1, MAX_POINTS, MAX_POINTS)
+    value = params.text("value", "")
+    shown = current(context, params)
     header: dict[str, Any] = {"time": shown.time, "until": shown.until}
     if shown.message is None:
         return packed_response(header, {})
@@ -74,18 +74,18 @@ def points_at(context: Context, asked: RequestParams) -> Response:
     return packed_response(header, {"xyz": found.xyz, **values})
 
 
-def track_of(context: Context, asked: RequestParams) -> Response:
+def track_of(context: Context, params: RequestParams) -> Response:
     """The track of a topic in metres, of a receiver from its first fix, and the times.
 
     Parameters: `recording`, `topic`, `pixels`; `begin` and `end` for a part of the time. A time
     is the sum of `times` and `rests`: a float64 is too coarse far from the start.
     """
-    recording, query = context.topic(asked)
+    recording, query = context.topic(params)
     start = start_of(recording)
     span = None
-    if asked.has("begin") or asked.has("end"):
-        span = asked.span(start)
-    found = track(query, pixels=asked.pixels(), span=span)
+    if params.has("begin") or params.has("end"):
+        span = params.span(start)
+    found = track(query, pixels=params.pixels(), span=span)
     header = {
         "grid": None if found.grid is None else asdict(found.grid),
         "is_geographic": found.is_geographic,
@@ -103,16 +103,16 @@ def track_of(context: Context, asked: RequestParams) -> Response:
     return packed_response(header, arrays)
 
 
-def fix_at(context: Context, asked: RequestParams) -> dict[str, Any]:
+def fix_at(context: Context, params: RequestParams) -> dict[str, Any]:
     """The position of the message that is current at a time.
 
     Parameters: `recording`, `topic`, `at`.
     """
-    shown = current(context, asked)
+    shown = current(context, params)
     answer: dict[str, Any] = {"time": shown.time, "until": shown.until}
     if shown.message is None:
         return answer
-    _, query = context.topic(asked)
+    _, query = context.topic(params)
     position = position_of(query.field_types()) or Position("", is_geographic=True)
     if position.is_geographic:
         found = asdict(fix_of(shown.message, position.prefix))

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hybridlog.view.asked import RequestParams
     from hybridlog.view.context import Context
+    from hybridlog.view.params import RequestParams
 
 
 MAX_LANES: Final = 64
@@ -41,7 +41,7 @@ MAX_FIELDS: Final = 16
 _GREATEST_EXACT: Final = 1 << 53
 
 
-def timeline(context: Context, asked: RequestParams) -> Response:
+def timeline(context: Context, params: RequestParams) -> Response:
     """Messages of some topics by bin, as bytes.
 
     Parameters are `recording`, `begin` and `end` (ns since its start), `pixels` (most bins that
@@ -58,13 +58,13 @@ def timeline(context: Context, asked: RequestParams) -> Response:
     and their number `bins`, and `lanes`: `size`, `gaps`, `exact` (false for estimates) and
     `period`, the usual time from one message to the next, 0 if unknown. Times are ns.
     """
-    recording = context.recording(asked)
-    topics = asked.texts("topic", most=MAX_LANES)
-    pixels = asked.pixels()
+    recording = context.recording(params)
+    topics = params.texts("topic", most=MAX_LANES)
+    pixels = params.pixels()
     if len(topics) * pixels > MAX_BINS:
         raise UsageError(f"At most {MAX_BINS // max(len(topics), 1)} pixels for as many topics.")
     start = start_of(recording)
-    span = asked.span(start)
+    span = params.span(start)
     found = context.densities.density(recording, span, pixels, topics)
     periods = context.densities.periods(recording, span, topics)
     lanes, body = [], []
@@ -88,15 +88,15 @@ def timeline(context: Context, asked: RequestParams) -> Response:
     return Response(content, media_type="application/octet-stream")
 
 
-def marks(context: Context, asked: RequestParams) -> dict[str, Any]:
+def marks(context: Context, params: RequestParams) -> dict[str, Any]:
     """The first marks in a range, and how many more there are."""
-    recording = context.recording(asked)
+    recording = context.recording(params)
     start = start_of(recording)
     known = {channel.topic for channel in recording.channels}
     topics = [one for one in mark_topics(context.store.session, [recording.id]) if one in known]
     if not topics:
         return {"marks": [], "more": 0}
-    begin, end = asked.span(start)
+    begin, end = params.span(start)
     first, last = recording.span or (start, start)
     if begin > last or end <= first:
         return {"marks": [], "more": 0}  # a query refuses such a range
@@ -128,19 +128,19 @@ def _filled(content: bytes) -> bytes:
     return content + bytes(-len(content) % _ALIGNED)
 
 
-def fields(context: Context, asked: RequestParams) -> dict[str, Any]:
+def fields(context: Context, params: RequestParams) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
-    _, query = context.topic(asked)
+    _, query = context.topic(params)
     found = fields_of(query.field_types(), iter(query.limit(SAMPLE)))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 
-def series(context: Context, asked: RequestParams) -> dict[str, Any]:
+def series(context: Context, params: RequestParams) -> dict[str, Any]:
     """Least and greatest values by pixel, or each value if there are few."""
-    recording, query = context.topic(asked)
+    recording, query = context.topic(params)
     start = start_of(recording)
-    wanted = asked.texts("field", most=MAX_FIELDS)
-    found = read_series(query, wanted, pixels=asked.pixels(), span=asked.span(start))
+    wanted = params.texts("field", most=MAX_FIELDS)
+    found = read_series(query, wanted, pixels=params.pixels(), span=params.span(start))
     if len(found) > MAX_FIELDS:
         raise UsageError(f"These are {len(found)} fields, at most {MAX_FIELDS} fit in a plot.")
     return {
