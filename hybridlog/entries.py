@@ -1,4 +1,4 @@
-"""Makes catalog entries of recordings from their journals and segments.
+"""Makes catalog entries of recordings from their journals and segments, and puts them there.
 
 Recording, recovery, rebuilding and opening use the same functions, so their entries are
 equal. Files that differ from the journal are not used. Content that the journal lists and
@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -30,8 +30,8 @@ from hybridlog_storage.catalog import (
     channel_totals,
 )
 from hybridlog_storage.disk.directory import PAYLOADS
-from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.journal import PayloadFile
+from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, StoreError
+from hybridlog_storage.journal import Journal, PayloadFile
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE
@@ -39,14 +39,12 @@ from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSumm
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.journal import JournalState, SealedSegment
-    from hybridlog_storage.segments.chunk_table import ChunkTable
 
-    Stamps = Callable[[RecordingEntry, int, ChunkTable], NDArray[Any] | None]
-    Reason = Callable[[int, Channel], str | None]
+
+_TRIES = 10  # to read a recording while its directory is renamed
 
 
 def new_id() -> str:
@@ -243,9 +241,9 @@ def _difference(
 def _is_listed(inventory: Inventory, state: JournalState, number: int) -> bool:
     """True if the journal lists a valid segment as its file is now, and what that needs."""
     files = (inventory.summaries[number].compacted or {}).get("files", ())
-    is_thinned = inventory.stored.get(number) in (None, *state.thinned.get(number, ()))
+    is_listed_size = inventory.stored.get(number) in (None, *state.thinned.get(number, ()))
     known = state.payloads.keys() | state.deleted
-    return number in state.sealed and is_thinned and {f.file for f in files} <= known
+    return number in state.sealed and is_listed_size and {f.file for f in files} <= known
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -258,26 +256,24 @@ def read_summary(path: Path, number: int) -> SegmentSummary:
         return reader.summary()
 
 
-def describe(
-    inventory: Inventory,
-    *,
-    is_open: bool,
-    reason: Reason,
-    stamps: Stamps,
-    damage: Mapping[tuple[int, int], str],
-) -> Described:
+def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -> Described:
     """Make the complete entry of a recording.
 
     Args:
+        catalog: Has the decoding results of its segments, and its unreadable chunks.
         inventory: Content of its directory.
         is_open: Whether a process is writing it.
-        reason: Returns why a channel's fields are not indexed, None if they are.
-        stamps: Returns the decoding results of a segment, None if unknown.
-        damage: Known unreadable chunks, by segment and number.
 
     Raises:
         SegmentError: Neither journal nor segments say what recording it is.
     """
+    from hybridlog.schema.codecs import codec_for
+
+    if not inventory.id:
+        raise SegmentError(
+            f"Recording {inventory.label!r} has neither a journal nor a segment that can be "
+            "read. Restore the files, or remove the directory."
+        )
     entry = _base(inventory)
     channels: dict[int, Channel] = {}
     lost: list[dict[str, Any]] = []
@@ -295,7 +291,7 @@ def describe(
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_crash(inventory)
     ours += _losses_of_columns(inventory)
-    ours += _losses_of_chunks(inventory, damage)
+    ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
     entry.status = _status(inventory, end, is_open=is_open, has_losses=bool(ours))
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
@@ -307,10 +303,10 @@ def describe(
         if len(summary.table.chunks)
     ]
     entry.channels = [
-        channel_entry(channel_id, channel, reason(channel_id, channel))
+        channel_entry(channel_id, channel, codec_for(channel).reason)
         for channel_id, channel in sorted(channels.items())
     ]
-    _fill_stats(entry, inventory, stamps)
+    _fill_stats(entry, inventory, catalog)
     return Described(
         entry,
         summary_of(entry, inventory.listing.look),
@@ -318,6 +314,55 @@ def describe(
         inventory.listing.print,
         channels,
     )
+
+
+def describe_now(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+) -> Described:
+    """Read a recording from its files.
+
+    Raises:
+        SegmentError: The recording cannot be identified.
+        StoreError: Its files change all the time.
+    """
+    for _ in range(_TRIES):
+        inventory = take_inventory(directory, label)
+        # Of a directory that is renamed meanwhile, files would be missing.
+        if directory.listing(label).print == inventory.listing.print:
+            return describe(catalog, inventory, is_open=is_open)
+    raise StoreError(f"The files of recording {label!r} change while they are read. Ask again.")
+
+
+def put_entry(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+) -> RecordingEntry:
+    """Read a recording's files and update its catalog row.
+
+    Raises:
+        SegmentError: The recording cannot be identified.
+    """
+    described = describe_now(directory, catalog, label, is_open=is_open)
+    if directory.is_writable or catalog.is_in_memory:
+        catalog.put(described)
+    return described.entry
+
+
+def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
+    """Read the files of a recording again, after one of them was not what its entry says.
+
+    Raises:
+        StoreError: They cannot be read, or have changed.
+    """
+    is_open = directory.is_recorded(entry.label)
+    catalog.keep(describe_now(directory, catalog, entry.label, is_open=is_open))
+    for number, _, _ in entry.spans:
+        try:
+            catalog.table(entry, number)
+        except CatalogError as error:
+            raise StoreError(
+                f"The files of recording {entry.label!r} have changed since the store was "
+                "opened. Open it again."
+            ) from error
 
 
 def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
@@ -499,12 +544,12 @@ def _loss(
     }
 
 
-def _fill_stats(entry: RecordingEntry, inventory: Inventory, stamps: Stamps) -> None:
+def _fill_stats(entry: RecordingEntry, inventory: Inventory, catalog: Catalog) -> None:
     silent = {c.id for c in entry.channels if not c.has_publish_time}
     totals: dict[int, ChannelStats] = {}
     entry.is_decoded = True
     for number, summary in inventory.summaries.items():
-        found = stamps(entry, number, summary.table)
+        found = catalog.stamps(entry, number, summary.table)
         entry.is_decoded &= found is not None or not len(summary.table.chunks)
         for channel_id, stats in channel_totals(summary.table, found, silent).items():
             totals.setdefault(channel_id, ChannelStats()).add(stats)
@@ -609,6 +654,17 @@ def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
     )
     written = sealed.at if isinstance(sealed, journal.SealedSegment) else 0
     return {**line, "at": written} if written else line
+
+
+def announce_removal(directory: StoreDirectory, label: str) -> None:
+    """Announce the removal of a recording in its journal.
+
+    On a full disk the line may not fit; then the directory's hidden name announces it.
+    """
+    path = directory.recording(label)
+    if directory.listing(label).journal:
+        with suppress(DiskFullError):
+            Journal(path).append(journal.event(journal.REMOVING, by=os.getpid()))
 
 
 def text(name: str) -> str:

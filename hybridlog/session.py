@@ -22,16 +22,9 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 import numpy as np
 
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment
-from hybridlog.entries import channels_of, summary_of, take_inventory
+from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
 from hybridlog.index.connection import Connection
-from hybridlog.maintenance.opening import (
-    catch_up,
-    current_entry,
-    look_at_all,
-    mend,
-    open_catalog,
-    read_again,
-)
+from hybridlog.maintenance.opening import catch_up, current_entry, look_at_all, mend, open_catalog
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
@@ -1219,7 +1212,7 @@ class Session:
         from hybridlog.maintenance.tables import make_noted
 
         repairs = self.repairs
-        self.catalog.write_kept()
+        self.catalog.write_pending()
         self.catalog.drop_damaged()
         mended = mend(self.directory, self.catalog, repairs, until)
         if mended:
@@ -1311,7 +1304,7 @@ class Session:
             from hybridlog.columns.recordings_file import write_recordings_file
 
             with suppress(OSError, HybridlogError):
-                self.catalog.write_kept()
+                self.catalog.write_pending()
                 present = self.snapshot().by_label.keys() & {*self.directory.names()}
                 write_recordings_file(self.catalog, present)
                 self.catalog.has_changed = False
@@ -1344,7 +1337,7 @@ class Session:
         if "tables" in vars(self):
             self.tables.invalidate()
         self.disconnect()
-        self.catalog.write_kept()
+        self.catalog.write_pending()
         is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
         if self.catalog.has_changed or is_missing:
             self.write_recordings_file()

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
-    from hybridlog.maintenance.keep import Kept
+    from hybridlog.maintenance.keep import KeepReport
     from hybridlog.maintenance.places import DirectoryPlace, Place
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
@@ -163,7 +163,7 @@ def open_store(
         directory.check_writable()
         if is_new and is_uri(own):
             with suppress(StoreError):  # without a home directory, each command must name it again
-                consent.remember(directory.settings.store_id, own)
+                consent.trust(directory.settings.store_id, own)
     else:
         directory = StoreDirectory(where, read_only=read_only)
     store = Store(directory, mongo=wanted, progress=progress, cache_mb=cache, recover=recover)
@@ -1249,7 +1249,7 @@ class Store:
         *,
         dry_run: bool = False,
         progress: Progress | None = None,
-    ) -> Kept:
+    ) -> KeepReport:
         """Delete what rules of retention do not let stay: payloads, then what is left of them.
 
         Args:
@@ -1265,8 +1265,8 @@ class Store:
             UsageError: A rule is malformed.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
-        from hybridlog.maintenance.keep import Keeper, Kept
-        from hybridlog.maintenance.opening import put_entry
+        from hybridlog.entries import put_entry
+        from hybridlog.maintenance.keep import Keeper, KeepReport
         from hybridlog.maintenance.retention import Rules
 
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
@@ -1274,7 +1274,7 @@ class Store:
         put = partial(put_entry, self.directory, self.catalog)
         keeper = Keeper(self.directory, self.remove, changed=put if is_remote else lambda _: None)
         if dry_run:
-            return Kept(keeper.plan(wanted))
+            return KeepReport(keeper.plan(wanted))
         self.directory.check_changes()
         try:
             return keeper.keep(wanted, progress)

@@ -328,7 +328,7 @@ FORMAT_2 = [
         "hybridlog/maintenance/edit.py",
         (
             "documents-of-a-removed-recording-stay",
-            "    forget(database, entry.key, indexed)\n",
+            "    remove_documents(database, entry.key, indexed)\n",
             "",
             STEPS,
         ),
@@ -458,7 +458,7 @@ FORMAT_2 = [
             "if False:",
             RECOVERY,
         ),
-        ("a-recovery-is-not-announced", "        tell(found)\n", "", SEGMENTS),
+        ("a-recovery-is-not-announced", "        on_sealed(found)\n", "", SEGMENTS),
     ),
     *_of(
         "storage/hybridlog_storage/segments/segment_file.py",
@@ -666,7 +666,7 @@ MAINTENANCE = [
         ),
         (
             "a-stripped-segment-is-listed-like-the-whole-one",
-            "return number in state.sealed and is_thinned and",
+            "return number in state.sealed and is_listed_size and",
             "return number in state.sealed and",
             f"{DROPPED}::test_an_older_journal_in_a_store_that_cannot_be_written",
         ),

@@ -39,19 +39,19 @@ def test_a_server_has_to_be_agreed_to(state: Path) -> None:
     assert "hybridlog index trust --store some/store" in str(caught.value)
     assert "--mongo URI" in str(caught.value)
     assert "me@" not in str(caught.value)
-    consent.remember("a", URI)
+    consent.trust("a", URI)
     assert consent.trusted_uri(settings) == URI
     for other in (StoreSettings("b", URI), StoreSettings("a", URI.replace("lab", "evil"))):
         with pytest.raises(DatabaseError):
             consent.trusted_uri(other)
-    assert consent.forget("a")
-    assert not consent.forget("a")
+    assert consent.revoke("a")
+    assert not consent.revoke("a")
     with pytest.raises(DatabaseError):
         consent.trusted_uri(settings)
 
 
 def test_what_is_agreed_to_is_kept_private_and_without_a_password(state: Path) -> None:
-    consent.remember("a", URI.replace("me@", "me:hunter2@"))
+    consent.trust("a", URI.replace("me@", "me:hunter2@"))
     assert consent.is_trusted("a", URI)
     file = state / "trusted.json"
     assert "hunter2" not in file.read_text()
@@ -61,20 +61,20 @@ def test_what_is_agreed_to_is_kept_private_and_without_a_password(state: Path) -
 
 
 def test_several_stores_and_several_servers() -> None:
-    consent.remember("a", URI)
-    consent.remember("a", "mongodb://other/")
-    consent.remember("a", URI)
-    consent.remember("b", URI)
+    consent.trust("a", URI)
+    consent.trust("a", "mongodb://other/")
+    consent.trust("a", URI)
+    consent.trust("b", URI)
     assert consent.is_trusted("a", URI)
     assert consent.is_trusted("a", "mongodb://other/")
-    assert consent.forget("a")
+    assert consent.revoke("a")
     assert not consent.is_trusted("a", URI)
     assert consent.is_trusted("b", URI)
 
 
 def test_nothing_is_lost_when_many_agree_at_once() -> None:
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda n: consent.remember(f"s{n}", URI), range(40)))
+        list(pool.map(lambda n: consent.trust(f"s{n}", URI), range(40)))
     assert all(consent.is_trusted(f"s{n}", URI) for n in range(40))
 
 
@@ -86,12 +86,12 @@ def test_a_damaged_file_trusts_nothing(state: Path, content: bytes) -> None:
     state.mkdir(parents=True)
     (state / "trusted.json").write_bytes(content)
     assert not consent.is_trusted("a", URI)
-    consent.remember("a", URI)
+    consent.trust("a", URI)
     assert consent.is_trusted("a", URI)
 
 
 def test_a_file_that_others_may_write_trusts_nothing(state: Path) -> None:
-    consent.remember("a", URI)
+    consent.trust("a", URI)
     file = state / "trusted.json"
     for mode in (0o620, 0o602):
         file.chmod(mode)
@@ -108,7 +108,7 @@ def test_where_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     for name in ("", "relative/path"):
         monkeypatch.setenv("XDG_STATE_HOME", name)
         assert consent.state_directory() == tmp_path / "home/.local/state/hybridlog"
-    consent.remember("a", URI)
+    consent.trust("a", URI)
     assert json.loads((tmp_path / "home/.local/state/hybridlog/trusted.json").read_text()) == {
         "stores": {"a": [URI]}
     }
@@ -118,7 +118,7 @@ def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     with pytest.raises(StoreError, match="trusted"):
-        consent.remember("a", URI)
+        consent.trust("a", URI)
     assert not consent.is_trusted("a", URI)
 
 

@@ -19,6 +19,7 @@ import hybridlog as hl
 from hybridlog.cli.open_store import opened_store as opened_by_command
 from hybridlog.entries import (
     Inventory,
+    describe_now,
     journal_from_segments,
     new_id,
     read_summary,
@@ -28,7 +29,7 @@ from hybridlog.entries import (
     take_inventory,
     text,
 )
-from hybridlog.maintenance.opening import current_entry, describe_now, look_at_all
+from hybridlog.maintenance.opening import current_entry, look_at_all
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage import catalog, journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry

@@ -236,7 +236,7 @@ def test_a_trusted_file_of_somebody_else_counts_for_nothing(place: Path) -> None
     ann = User(place, 12345)
     script = (
         "import sys; from hybridlog.index import consent\n"
-        "consent.remember('a', 'mongodb://h/x')\n"
+        "consent.trust('a', 'mongodb://h/x')\n"
         "print(consent.is_trusted('a', 'mongodb://h/x'))"
     )
     assert ann.python("-c", script).lines == ["True"]

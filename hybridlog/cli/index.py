@@ -241,12 +241,12 @@ def trust(given: _Trust) -> None:
 
     settings = read_settings(store_path(given.store))
     if given.forget:
-        found = consent.forget(settings.store_id)
+        found = consent.revoke(settings.store_id)
         output.say("forgotten" if found else "nothing was trusted")
     elif not is_uri(settings.mongo):
         output.say("the store names no MongoDB: there is nothing to trust")
     else:
-        consent.remember(settings.store_id, settings.mongo)
+        consent.trust(settings.store_id, settings.mongo)
         output.say(f"trusted {settings.mongo}")
 
 

@@ -207,7 +207,7 @@ def _as_dict(
     videos: Mapping[str, VideoSummary],
 ) -> dict[str, Any]:
     from hybridlog.entries import summary_of
-    from hybridlog.schema.states import told_channels
+    from hybridlog.schema.states import shown_channels
 
     return {
         **recording_dict(summary_of(entry)),
@@ -236,7 +236,7 @@ def _as_dict(
                 "metadata": c.metadata,
                 "video": asdict(videos[c.topic]) if c.topic in videos else None,
             }
-            for c in told_channels(entry.channels)
+            for c in shown_channels(entry.channels)
         ],
     }
 
@@ -319,9 +319,9 @@ def _print_recording(
     ]
     if not narrow:
         columns.insert(4, ("payload", "right"))
-    from hybridlog.schema.states import told_channels
+    from hybridlog.schema.states import shown_channels
 
-    channels = sorted(told_channels(entry.channels), key=lambda c: c.topic)
+    channels = sorted(shown_channels(entry.channels), key=lambda c: c.topic)
 
     def rows_with(*, short: bool) -> list[list[str]]:
         known = entry.is_decoded

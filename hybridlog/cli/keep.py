@@ -19,7 +19,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.keep import Kept
+    from hybridlog.maintenance.keep import KeepReport
     from hybridlog.maintenance.retention import Rules, Step
     from hybridlog.store import Store
 
@@ -248,7 +248,7 @@ def _useless(store: Store, rules: Rules) -> Iterator[str]:
             yield f"No topic matches {rule.pattern}, so its rule deletes nothing."
 
 
-def _lines(found: Kept, *, dry_run: bool) -> Iterator[str]:
+def _lines(found: KeepReport, *, dry_run: bool) -> Iterator[str]:
     plan = found.plan
     yield from (_told(step) for step in plan.steps)
     pinned = f", {output.size(plan.pinned_bytes)} pinned" if plan.pinned_bytes else ""

@@ -52,7 +52,7 @@ MAX_SHARED_BYTES: Final = 4 << 20
 """Size from which a shared file gets no more recordings."""
 _SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{6,}}){re.escape(SUFFIX)}", re.ASCII)
 _MAX_LIST_BYTES: Final = 256 << 20
-_SETTLED_NS: Final = 100_000_000  # a time of change that is older tells of every later change
+_STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 _log = logging.getLogger(__name__)
 _Piece = tuple[Section, Any]
 """Rows of a recording, and what they are."""
@@ -441,8 +441,8 @@ class Listing:
         except OSError as error:
             raise unreadable(error, self._path) from error
         # A change within the same tick of the clock would have the same time.
-        is_settled = time.time_ns() - now[1] > _SETTLED_NS
-        self._read_at = now if is_settled else None
+        is_stable = time.time_ns() - now[1] > _STABLE_NS
+        self._read_at = now if is_stable else None
         return True
 
 

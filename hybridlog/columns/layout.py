@@ -154,7 +154,7 @@ def topics_of(entry: RecordingEntry) -> set[str]:
     return {c.topic for c in entry.channels if c.stats.messages}
 
 
-def thinned_name(segment: str) -> str:
+def replacement_name(segment: str) -> str:
     """Name of a segment without moved chunks until it takes the place of the whole one."""
     return f"{segment}.thinned"
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
-THINNED: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
+REPLACEMENT: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 """Name of a segment that is about to replace the whole one."""
 _REBUILT_BYTES: Final = 32 << 20  # messages in memory: neighbouring chunks share a row group
 
@@ -97,7 +97,7 @@ def replace_segments(
     done = []
     try:
         for name in names:
-            found = THINNED.fullmatch(name)
+            found = REPLACEMENT.fullmatch(name)
             if found is None:
                 continue
             number = int(found["number"])

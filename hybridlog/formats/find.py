@@ -188,8 +188,8 @@ class Watch:
             names: Names of the files beside it.
             is_closed: Whether a later part exists, or metadata lists it.
         """
-        has_settled = now - file.changed >= self._settle_ns
-        if not has_settled and file not in self._seen:
+        is_unchanged = now - file.changed >= self._settle_ns
+        if not is_unchanged and file not in self._seen:
             return False
         if is_closed or _has_end(file):
             return True
@@ -197,7 +197,7 @@ class Watch:
         if (kind is None or kind.has_end) and not file.path.name.endswith(".zstd"):
             return False
         beside = {f"{file.path.name}{suffix}" for suffix in ("-wal", "-journal")}
-        return has_settled and not beside & names
+        return is_unchanged and not beside & names
 
 
 def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:

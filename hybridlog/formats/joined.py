@@ -94,18 +94,18 @@ class JoinedSource(Source):
         self.damage.extend(damage)
         self._numbers: dict[tuple[object, ...], int] = {}
         self._inner: Source | None = None
-        self._kept: Source | None = None
+        self._open_part: Source | None = None
         if len(self._parts) == 1:
             # With one file, its error is raised at once.
-            self._kept = self._open(self._parts[0])
-            self.profile = self._kept.profile or profile
-            self.kind = kind or self._kept.kind
-            self.message_count = self._kept.message_count
-            self.time_range = self._kept.time_range
+            self._open_part = self._open(self._parts[0])
+            self.profile = self._open_part.profile or profile
+            self.kind = kind or self._open_part.kind
+            self.message_count = self._open_part.message_count
+            self.time_range = self._open_part.time_range
 
     def look(self) -> None:
         """Add up the statements of each uncompressed file about itself."""
-        if self._kept is not None or any(part.packed for part in self._parts):
+        if self._open_part is not None or any(part.packed for part in self._parts):
             return
         counts: list[int | None] = []
         ranges: list[tuple[int, int]] = []
@@ -129,10 +129,10 @@ class JoinedSource(Source):
 
     def close(self) -> None:
         """Close the open file."""
-        for source in (self._inner, self._kept):
+        for source in (self._inner, self._open_part):
             if source is not None:
                 source.close()
-        self._inner = self._kept = None
+        self._inner = self._open_part = None
 
     def batches(self) -> Iterator[Batch]:
         """Yield the messages of each file in turn."""
@@ -140,7 +140,7 @@ class JoinedSource(Source):
         first: SourceError | None = None
         for part, size in zip(self._parts, self._sizes(), strict=True):
             try:
-                inner = self._inner = self._kept or self._open(part)
+                inner = self._inner = self._open_part or self._open(part)
             except SourceError as error:
                 failed += 1
                 first = first or error
@@ -149,7 +149,7 @@ class JoinedSource(Source):
             else:
                 self.profile = self.profile or inner.profile
                 with inner:
-                    self._kept = None
+                    self._open_part = None
                     yield from self._read(part, inner, done, size)
                 self._inner = None
             done += size

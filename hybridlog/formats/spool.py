@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 _PIECE = 1 << 20
-_SPARE = 64 << 20
+_MIN_FREE_BYTES = 64 << 20
 # Frames that need more memory than this are refused (as zstd's `--long=27`).
 _MAX_WINDOW = 1 << 27
 
@@ -103,7 +103,7 @@ def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | 
         fill: Writes at most the given number of bytes to it, and returns a problem or None.
     """
     folder = Path(tempfile.gettempdir())
-    room = shutil.disk_usage(folder).free - _SPARE
+    room = shutil.disk_usage(folder).free - _MIN_FREE_BYTES
     if size > room:
         raise _no_room(path, folder)
     spooled = Spooled(folder / f"hybridlog-{secrets.token_hex(8)}", None)

@@ -60,7 +60,7 @@ def is_trusted(store_id: str, uri: str) -> bool:
     return without_password(uri) in _trusted().get(store_id, ())
 
 
-def remember(store_id: str, uri: str) -> None:
+def trust(store_id: str, uri: str) -> None:
     """Agree that a store uses a server.
 
     Args:
@@ -76,7 +76,7 @@ def remember(store_id: str, uri: str) -> None:
             uris.append(clean)
 
 
-def forget(store_id: str) -> bool:
+def revoke(store_id: str) -> bool:
     """Revoke the agreement to all servers of a store.
 
     Returns:

@@ -106,8 +106,8 @@ class SimulatedTime(Sink):
             self._latest = (received, now)
             self._ticks.append(self._latest)
             self._jumps += now < before
-            is_told = now < before and self._jumps <= _MAX_JUMPS
-        if is_told:
+            is_reported = now < before and self._jumps <= _MAX_JUMPS
+        if is_reported:
             self._recorder.say(
                 f"{CLOCK} went back by {(before - now) / 1e9:.3f} s, to {now / 1e9:.3f} s; log "
                 "times go back with it"

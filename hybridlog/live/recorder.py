@@ -216,7 +216,7 @@ class Recorder:
         self._clock = clock or MachineClock()
         self._sources = sources
         self._options = options
-        self._tell = say
+        self._say = say
         self._store_path = store.directory.path
         self._recorded: dict[Channel, _RecordedChannel] = {}
         self._recorded_by_content: dict[tuple[object, ...], _RecordedChannel] = {}
@@ -261,7 +261,7 @@ class Recorder:
                 options.budget_bytes,
                 lambda reason: self._begin(store, {"trigger": reason}),
                 lambda reason: self.mark(reason, {"trigger": reason}),
-                self._tell,
+                self._say,
                 clock=self._clock,
             )
         try:
@@ -363,7 +363,7 @@ class Recorder:
         if self._silence is not None:
             if self._watching.is_alive():
                 self._watching.join()
-            self._tell_silences(self._silence, ended_at, is_end=True)
+            self._report_silences(self._silence, ended_at, is_end=True)
         if self._simulated is not None:
             self._simulated.close()
         self._control.close()
@@ -486,13 +486,13 @@ class Recorder:
         """The thread that tells silences."""
         assert self._silence is not None
         while not self._over.wait(self._silence.interval_s):
-            self._tell_silences(self._silence, self._now())
+            self._report_silences(self._silence, self._now())
 
-    def _tell_silences(self, watch: SilenceWatch, now: int, *, is_end: bool = False) -> None:
+    def _report_silences(self, watch: SilenceWatch, now: int, *, is_end: bool = False) -> None:
         begun, ended = watch.look(now, is_end=is_end)
         for one in begun:
             self._breaches += 1
-            self._tell(f"{one.text} ({RULE} of the contract)")
+            self._say(f"{one.text} ({RULE} of the contract)")
             if problem := self._commands.run(one):
                 self.say(problem)
         for one in ended:
@@ -586,7 +586,7 @@ class Recorder:
                 return
             if size > SMALL_BYTES:
                 # Its fields may fit where its payload does not.
-                self._keep_fields(recorded, payload, received, sent, number)
+                self._store_fields(recorded, payload, received, sent, number)
             else:
                 self._lose_for_room(recorded, received)
         except HybridlogError as error:
@@ -634,7 +634,7 @@ class Recorder:
             if text in self._said or len(self._said) >= _MAX_REPORTS:
                 return
             self._said.add(text)
-        self._tell(text)
+        self._say(text)
 
     def ended(self, reason: str = "") -> None:
         """See `Sink.ended`."""
@@ -765,7 +765,7 @@ class Recorder:
         recorded.thinned += 1
         return recorded.thinned % PAYLOAD_STRIDE == 1
 
-    def _keep_fields(
+    def _store_fields(
         self,
         recorded: _RecordedChannel,
         payload: bytes,
@@ -860,7 +860,7 @@ class Recorder:
 
     def _note_clock(self, text: str, tags: Mapping[str, str], at: int) -> None:
         """Report that the clock of this machine was set, or is to be, at a log time, ns."""
-        self._tell(f"{text}; log times are those of the clock")
+        self._say(f"{text}; log times are those of the clock")
         self._clock_marks.append((text, {"cause": CLOCK_SET, **tags}, at))
 
     def _mark_clock(self) -> None:

@@ -80,7 +80,7 @@ class FairSemaphore:
 
 
 _LARGE = 1 << 17  # bytes from which a payload is copied into its chunk at once
-_MAX_LAID = 8 << 20  # bytes of one batch: after it, writers that wait for room are notified
+_MAX_BATCH_BYTES = 8 << 20  # bytes of one batch: after it, writers that wait for room are notified
 _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has a fixed cost
 _TICK_S = 0.1  # interval of the writing thread when little comes
 _MIN_BATCH = 10  # messages per chunk: fewer cost less one by one than as a batch
@@ -232,7 +232,7 @@ class LiveRecording:
                     pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
                     index_interval_s=_index_interval_s(options.flush_interval_s),
                     next_chunk_size=self._reservation.next_chunk_size,
-                    cpu_slots=threading.BoundedSemaphore(_spare_processors()),
+                    cpu_slots=threading.BoundedSemaphore(_idle_processors()),
                     on_written=self._make_room,
                 ),
             )
@@ -513,10 +513,10 @@ class LiveRecording:
         """Unwritten bytes: those not in chunks yet, and those of waiting chunks."""
         return self._taken_bytes + self._closed_beyond()
 
-    def _make_room(self, laid: int = 0) -> None:
+    def _make_room(self, appended: int = 0) -> None:
         """Update the unwritten bytes: a chunk was closed or written, or bytes were copied."""
         with self._lock:
-            self._taken_bytes -= laid
+            self._taken_bytes -= appended
             self._beyond = self._closed_beyond()
             self._room.notify()
 
@@ -628,7 +628,7 @@ class LiveRecording:
             inbox, size = self._inbox, self._inbox_bytes
             self._inbox, self._inbox_bytes = deque(), 0
         if inbox:
-            for group in [inbox] if size <= _MAX_LAID else _groups(inbox):
+            for group in [inbox] if size <= _MAX_BATCH_BYTES else _groups(inbox):
                 self._make_room(self._append_batch(group))
 
     def _append_batch(self, group: Sequence[_Message]) -> int:
@@ -657,7 +657,7 @@ class LiveRecording:
         )
 
 
-def _spare_processors() -> int:
+def _idle_processors() -> int:
     """Processors for background work: one is left for incoming messages if possible."""
     return min(PACKERS + 1, max(processors() - 1, 1))
 
@@ -713,7 +713,7 @@ def _groups(inbox: deque[_Message]) -> Iterator[Sequence[_Message]]:
     while inbox:
         group = [inbox.popleft()]
         size = len(group[0].payload)
-        while inbox and size < _MAX_LAID:
+        while inbox and size < _MAX_BATCH_BYTES:
             group.append(inbox.popleft())
             size += len(group[-1].payload)
         yield group

@@ -116,16 +116,16 @@ def rehearse(
         entry = session.entry_of(one.summary)
         count += 1
         stored += sum(channel.stats.payload_bytes for channel in entry.channels)
-        asked = list(planner.parts_in(one.summary, one.bounds, None))
+        within = list(planner.parts_in(one.summary, one.bounds, None))
         found = [np.empty(0, np.int64)]
-        for part in planner.batch_hint([part for part in asked if part.topic in able]):
+        for part in planner.batch_hint([part for part in within if part.topic in able]):
             found += [o.log_time[o.holds] for o in planner.outcomes(part)]
         times = np.sort(np.concatenate(found))
         fired += len(times)
         spans = snapshot_spans(times, before_ns, after_ns)
         if not len(spans):
             continue
-        messages, size = _kept(session, counters, asked, spans)
+        messages, size = _would_store(session, counters, within, spans)
         payload += int(size.sum())
         parts.append((entry.id, np.column_stack([spans, messages])))
     remarks += completeness_of(session, everything).sentences
@@ -186,7 +186,7 @@ def _begin(since: TimeLike) -> int:
     return parse_time(since, start=None, end=None)
 
 
-def _kept(
+def _would_store(
     session: Session, counters: Counters, parts: list[Part], spans: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Messages and payload bytes of snapshots of one recording; int64[k] each."""

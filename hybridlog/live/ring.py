@@ -113,7 +113,7 @@ class Ring:
         latched: dict[Hashable, _Latched] = {}
         for message in (m for each in self._latched.values() for m in each.messages):
             _latch(latched, message)
-        kept = [m for m in self._messages if m.steady >= begin]
+        recent = [m for m in self._messages if m.steady >= begin]
         for message in self._messages:
             if message.steady < begin:
                 _latch(latched, message)
@@ -121,10 +121,10 @@ class Ring:
             (m for each in latched.values() for m in each.messages if m.steady < begin),
             key=attrgetter("steady"),
         )
-        at = begin + next((m.set_by for m in (*kept[:1], *front[-1:])), 0)
+        at = begin + next((m.set_by for m in (*recent[:1], *front[-1:])), 0)
         return [
             *(m._replace(log_time=at, publish_time=m.publish_time or m.log_time) for m in front),
-            *kept,
+            *recent,
         ]
 
     def latest(self, topic: str, begin: int, limit: int) -> list[BufferedMessage]:

@@ -55,7 +55,7 @@ class SilenceWatch:
         self._last: dict[str, int] = {}
         self._begin: int | None = None
         self._now = 0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._over: list[Silence] = []
         self._lock = threading.Lock()
         shortest = min(self._limits.values(), default=0) / 1e9
@@ -97,18 +97,18 @@ class SilenceWatch:
             ]
         begun = []
         for one in over:
-            if one.topic in self._told:
-                self._told.remove(one.topic)
+            if one.topic in self._reported:
+                self._reported.remove(one.topic)
             else:
                 begun.append(one)
-        begun += [one for one in lasting if one.topic not in self._told]
-        self._told.update(one.topic for one in lasting)
+        begun += [one for one in lasting if one.topic not in self._reported]
+        self._reported.update(one.topic for one in lasting)
         return begun, over + lasting if is_end else over
 
     @property
     def silent(self) -> Sequence[str]:
         """Topics that are silent, as of the last look."""
-        return sorted(self._told)
+        return sorted(self._reported)
 
 
 class Commands:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _MAX_ROWS = 10_000  # of the ledger, while there is no snapshot to write them into
 _MAX_WATCHED = 1000  # messages whose field `numbers` reads
-_MAX_TOLD = 100  # lines about triggers
+_MAX_WARNINGS = 100  # lines about triggers
 _RING_SHARE = 0.5  # of a recording's budget; the rest is for messages that come meanwhile
 
 
@@ -73,13 +73,13 @@ class Trigger:
         if not topic:
             raise UsageError(f"--trigger wants TOPIC: PREDICATE, not {text!r}.")
         fits = matcher([topic])
-        asked = parse(predicate) if predicate else None
-        for path in [] if asked is None else asked.fields():
+        condition = parse(predicate) if predicate else None
+        for path in [] if condition is None else condition.fields():
             if path.split(".", 1)[0] in {"_id", "_meta"}:
                 raise WhereError(
                     f"a trigger sees messages before they are stored: {path} does not exist yet"
                 )
-        return cls(text, fits, asked)
+        return cls(text, fits, condition)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +156,8 @@ class Snapshots:
         self._reasons: set[str] = set()
         self._unmet = dict.fromkeys(trigger.text for trigger in options.triggers)
         self._settle_s = settle_s
-        self._settled_at: float | None = None
-        self._told: set[str] = set()
+        self._complete_at: float | None = None
+        self._warned: set[str] = set()
         self._ring = Ring(round(options.ring_s * 1e9), budget_bytes)
         self._start = start
         self._say = say
@@ -251,7 +251,7 @@ class Snapshots:
         Args:
             topics: Full names of the topics so far; triggers that match none are told.
         """
-        self._tell_unmet(topics)
+        self._warn_unmet(topics)
         with self._lock:
             now = self._clock.steady(self._clock.now())
             if self._active is not None and now >= self._until:
@@ -370,26 +370,26 @@ class Snapshots:
             try:
                 check(trigger.predicate, types)
             except WhereError as error:
-                self._tell_once(
+                self._warn_once(
                     f"trigger {trigger.text!r} can never fire on {channel.topic}: {error}"
                 )
             else:
                 names = frozenset(path.split(".", 1)[0] for path in trigger.predicate.fields())
                 yield _Watch(trigger.text, to_bool(trigger.predicate, types), names)
 
-    def _tell_unmet(self, topics: Collection[str]) -> None:
+    def _warn_unmet(self, topics: Collection[str]) -> None:
         for trigger in self._options.triggers:
             if any(map(trigger.fits, topics)):
                 self._unmet.pop(trigger.text, None)
-        if topics and self._settled_at is None:
-            self._settled_at = time.monotonic() + self._settle_s
-        if self._settled_at is not None and time.monotonic() >= self._settled_at:
+        if topics and self._complete_at is None:
+            self._complete_at = time.monotonic() + self._settle_s
+        if self._complete_at is not None and time.monotonic() >= self._complete_at:
             for text in [*self._unmet]:
-                self._tell_once(f"no topic matches the trigger {text!r} so far")
+                self._warn_once(f"no topic matches the trigger {text!r} so far")
 
-    def _tell_once(self, text: str) -> None:
-        if text not in self._told and len(self._told) < _MAX_TOLD:
-            self._told.add(text)
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned and len(self._warned) < _MAX_WARNINGS:
+            self._warned.add(text)
             self._say(text)
 
     def _write_out(self, reason: str, at: int) -> None:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import IN_TYPE, SHARED, SUFFIX
-from hybridlog.entries import take_inventory
-from hybridlog.maintenance.opening import describe_inventory, open_catalog
+from hybridlog.entries import describe, take_inventory
+from hybridlog.maintenance.opening import open_catalog
 from hybridlog.maintenance.places import (
     Begun,
     Copied,
@@ -202,7 +202,7 @@ class BucketPlace:
         inventory = take_inventory(self._target, label)
         if inventory.misfits or not inventory.is_proven:
             raise StoreError(f"What was copied of recording {label!r} does not fit together.")
-        self._own.put(describe_inventory(self._own, inventory))
+        self._own.put(describe(self._own, inventory))
 
     def hold(self) -> bool:
         """True: what a list names is not deleted, and the list after it is another state."""

@@ -20,9 +20,8 @@ import numpy as np
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of, topic_folder
 from hybridlog.columns.payload_files import RecordingPayloads, walk
-from hybridlog.entries import take_inventory
+from hybridlog.entries import put_entry, take_inventory
 from hybridlog.maintenance import thinning
-from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import CompactedTopic, reporter
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
@@ -67,7 +66,7 @@ class _Topic:
     def rows_of(self, chunk: StoredChunk) -> NDArray[np.intp]:
         return np.flatnonzero(np.isin(chunk.batch.channel, list(self.channels)))
 
-    def keep(self, messages: int, reason: str) -> None:
+    def exclude(self, messages: int, reason: str) -> None:
         self.report.kept += messages
         self.report.reason = reason
 
@@ -219,7 +218,7 @@ class _Compaction:
             )
         for summary, place, chunk in self._chunks(chosen, self._report):
             if isinstance(chunk, SegmentError):
-                _keep_damaged(chosen, summary.table, place.number)
+                _exclude_damaged(chosen, summary.table, place.number)
                 continue
             for topic in chosen:
                 rows = topic.rows_of(chunk)
@@ -235,7 +234,7 @@ class _Compaction:
         has_publish_time = {n: channel.has_publish_time for n, channel in topic.channels.items()}
         piece = topic.columns.piece(chunk, rows, has_publish_time)
         if piece is None:
-            topic.keep(len(rows), "a message of the chunk does not fit its definition")
+            topic.exclude(len(rows), "a message of the chunk does not fit its definition")
             return
         assert topic.writer is not None
         topic.writer.add(piece, chunk.segment, chunk.number, digest)
@@ -272,7 +271,7 @@ class _Compaction:
     def _refuse(self, topic: _Topic, problem: str) -> None:
         """Remove the files of a topic that did not come back exactly."""
         report = topic.report
-        topic.keep(report.messages, problem)
+        topic.exclude(report.messages, problem)
         report.messages = report.payload_bytes = report.column_bytes = 0
         for file in topic.files:
             files.unlink(self.path / PAYLOAD_PARTS / file.file, depth=IN_PAYLOADS)
@@ -308,13 +307,13 @@ class _Compaction:
                 yield segment.summary, place, chunk
 
 
-def _keep_damaged(topics: Sequence[_Topic], table: ChunkTable, number: int) -> None:
+def _exclude_damaged(topics: Sequence[_Topic], table: ChunkTable, number: int) -> None:
     """Count the messages of a chunk that cannot be read."""
     bounds = table.part_bounds()
     for part in table.parts[bounds[number] : bounds[number + 1]]:
         for topic in topics:
             if int(part["channel"]) in topic.channels:
-                topic.keep(int(part["messages"]), "a chunk is damaged; run `hybridlog verify`")
+                topic.exclude(int(part["messages"]), "a chunk is damaged; run `hybridlog verify`")
 
 
 def _difference(

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from hybridlog.entries import (
+    announce_removal,
+    put_entry,
     recording_metadata,
     sealed_event,
     take_inventory,
 )
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.index import decode_again, forget
-from hybridlog.maintenance.opening import announce_removal, finish_renaming, put_entry, remove_marks
+from hybridlog.maintenance.index import decode_again, remove_documents
+from hybridlog.maintenance.opening import finish_renaming, remove_marks
 from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog.record.marks import mark_channel, mark_payload
@@ -315,7 +317,7 @@ def _clear(database: Database, entry: RecordingEntry) -> None:
     indexed = state.one(entry.key)
     if indexed is not None:
         state.put(entry, "removing", turn=indexed.turn + 1)
-    forget(database, entry.key, indexed)
+    remove_documents(database, entry.key, indexed)
 
 
 def remove_copy(directory: StoreDirectory, label: str, recording: str) -> None:
@@ -328,4 +330,4 @@ def remove_copy(directory: StoreDirectory, label: str, recording: str) -> None:
     with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
         if now != label or directory.labels_of(recording) == [label]:
             raise TopicError(f"{label!r} is no longer a copy of another recording.")
-        directory.sweep(directory.hide(label))
+        directory.remove(label)

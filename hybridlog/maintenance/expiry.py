@@ -348,5 +348,5 @@ def _key_of(channel: Channel) -> _Key:
 
 def _checksums(batch: Batch) -> list[int]:
     """Checksums of what an expiry keeps of messages besides their fields."""
-    kept = (batch.log_time, batch.publish_time, batch.sequence, *batch.places)
-    return [crc32(np.ascontiguousarray(column).tobytes()) for column in kept]
+    columns = (batch.log_time, batch.publish_time, batch.sequence, *batch.places)
+    return [crc32(np.ascontiguousarray(column).tobytes()) for column in columns]

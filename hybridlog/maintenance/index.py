@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import walk
 from hybridlog.columns.table_writer import TableWriter
-from hybridlog.entries import take_inventory
+from hybridlog.entries import put_entry, take_inventory
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.opening import put_entry
 from hybridlog.maintenance.report import Progress, RepairReport, reporter
 from hybridlog_storage.catalog import decoded_rows, stamps_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -94,13 +93,13 @@ def bring_up_to_date(
         behind = snapshot.summaries
     if wanted is not None:
         behind = [one for one in behind if one.id in wanted]
-    has_strangers = wanted is None and (is_other or tables.are_left(directory, snapshot))
-    if not behind and not has_strangers:
+    has_orphans = wanted is None and (is_other or tables.are_left(directory, snapshot))
+    if not behind and not has_orphans:
         return False
-    if is_other or has_strangers:
-        known = state.of(None if has_strangers else [one.key for one in behind])
+    if is_other or has_orphans:
+        known = state.of(None if has_orphans else [one.key for one in behind])
     has_changed = False
-    settled = []
+    current = []
     for summary in behind:
         entry = entry_of(summary)
         indexed = known.get(entry.key)
@@ -110,15 +109,15 @@ def bring_up_to_date(
             entry = put_entry(directory, catalog, entry.label)
             if entry.id != summary.id:  # another recording has the label now
                 continue
-        if is_whole and _is_settled(indexed, entry):
-            settled.append(entry.id)
+        if is_whole and _is_current(indexed, entry):
+            current.append(entry.id)
         elif directory.is_writable:  # else the segments answer, without an index
             _bring_one(directory, catalog, database, entry, report=report, progress=progress)
-    if settled:
-        catalog.put_indexed(settled, index)
-    if has_strangers:
-        _remove_strangers(directory, database, known, report)
-    return has_changed or bool(report.indexed) or bool(settled)
+    if current:
+        catalog.put_indexed(current, index)
+    if has_orphans:
+        _remove_orphans(directory, database, known, report)
+    return has_changed or bool(report.indexed) or bool(current)
 
 
 def _bring_one(
@@ -150,7 +149,7 @@ def _restore_damage(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -
     return True
 
 
-def _is_settled(indexed: Indexed | None, entry: RecordingEntry) -> bool:
+def _is_current(indexed: Indexed | None, entry: RecordingEntry) -> bool:
     """True if a completely indexed recording needs no further work."""
     return indexed is not None and indexed.mirrors(entry) and entry.is_decoded
 
@@ -179,7 +178,7 @@ def _bring_up(
     return None
 
 
-def _remove_strangers(
+def _remove_orphans(
     directory: StoreDirectory,
     database: Database,
     known: Mapping[str, Indexed],
@@ -195,10 +194,10 @@ def _remove_strangers(
         return
     for key, indexed in known.items():
         if key not in present:
-            forget(database, key, indexed)
+            remove_documents(database, key, indexed)
             report.removed.append(indexed.id or key)
     if directory.is_writable:
-        tables.remove_strangers(directory, present)
+        tables.remove_orphans(directory, present)
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:
@@ -217,7 +216,7 @@ def ids_present(directory: StoreDirectory) -> set[str] | None:
     return None
 
 
-def forget(database: Database, key: str, indexed: Indexed | None) -> None:
+def remove_documents(database: Database, key: str, indexed: Indexed | None) -> None:
     """Remove all documents of a recording, and its mirror last.
 
     Args:
@@ -512,22 +511,22 @@ def remove_rest(
     places = _places(database, known.values())
     expected = {entry.key: _documents(entry, places) for entry in known.values()}
     again: set[str] = set()
-    strangers: list[object] = []
+    orphans: list[object] = []
     collections = state.document_collections()
     counted = database.count_by(collections, "_meta.rec")
     for collection, counts in zip(collections, counted, strict=True):
         for key, count in counts:
             entry = known.get(key) if isinstance(key, str) else None
             if entry is None:
-                strangers.append(key)
+                orphans.append(key)
                 continue
             # Fewer, too: a document of no recording may have had the key of one.
             missing = expected[entry.key][collection] - count
             if missing < 0 or (missing > 0 and not catalog.damage(entry.id)):
                 again.add(entry.key)
     # Listed after the index: a recording that has begun meanwhile has a directory by now.
-    present = ids_present(directory) if strangers else None
-    for key in strangers:
+    present = ids_present(directory) if orphans else None
+    for key in orphans:
         if present is not None and not (isinstance(key, str) and key in present):
             state.clear(key)
     for key in sorted(again):

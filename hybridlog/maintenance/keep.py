@@ -28,7 +28,7 @@ from hybridlog.maintenance.retention import (
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.losses import extent_of
 from hybridlog_storage import journal
-from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_settled
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_stable
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -68,7 +68,7 @@ class Own:
 
 
 @dataclass(slots=True)
-class Kept:
+class KeepReport:
     """The result of a pass.
 
     Attributes:
@@ -120,14 +120,14 @@ class Keeper:
         used, free = disk_bytes(path), shutil.disk_usage(path).free
         return plan(self._held(now), rules, used=used, free=free, now=now)
 
-    def keep(self, rules: Rules, progress: Progress | None = None) -> Kept:
+    def keep(self, rules: Rules, progress: Progress | None = None) -> KeepReport:
         """Let go what has to go.
 
         Raises:
             HeldError: Another process makes a pass.
         """
         with self._alone():
-            found = Kept(self.plan(rules))
+            found = KeepReport(self.plan(rules))
             planned = found.plan
             for _ in range(_MAX_ROUNDS):
                 if not planned.steps:
@@ -148,7 +148,7 @@ class Keeper:
         rules: Rules,
         reason: str,
         progress: Progress | None = None,
-    ) -> Kept:
+    ) -> KeepReport:
         """Let payloads of a recording go, but for what pins and rules keep.
 
         Args:
@@ -162,7 +162,7 @@ class Keeper:
             HeldError: Another process makes a pass.
         """
         with self._alone():
-            found, now = Kept(self.plan(Rules())), time.time_ns()
+            found, now = KeepReport(self.plan(Rules())), time.time_ns()
             for held in self._held(now):
                 if held.id == recording and not rules.is_never(held.tags):
                     going = [s for s in held.segments if s.number in digests and not s.pinned]
@@ -193,7 +193,7 @@ class Keeper:
             if before != look or held is None:
                 with suppress(StoreError):
                     held = self._read(label, now)
-                if held is not None and is_settled(look):
+                if held is not None and is_stable(look):
                     self._known[label] = look, held
             if held is None or (held.id, _WHOLE) in self._failed:
                 continue
@@ -211,7 +211,7 @@ class Keeper:
             return None
         return held_of(label, state, now)
 
-    def _do(self, step: Step, found: Kept, progress: Progress | None) -> None:
+    def _do(self, step: Step, found: KeepReport, progress: Progress | None) -> None:
         try:
             if not step.segments:
                 self._remove(step.id)
@@ -349,7 +349,7 @@ class RetentionThread:
             self._thread.join()
 
     def _run(self) -> None:
-        looked = kept = -_AGES_S
+        looked = last_pass = -_AGES_S
         segments = 0
         while not self._over.wait(_TICK_S):
             now, sealed = time.monotonic(), self._own.sealed() if self._own is not None else 0
@@ -360,16 +360,16 @@ class RetentionThread:
                     self._rules = Rules.of(read_settings(self._directory.path).retention)
                     free = shutil.disk_usage(self._directory.path).free
                     is_low = free < (self._rules.min_free or 0)
-                is_due = sealed != segments or is_low or now - kept >= _AGES_S
+                is_due = sealed != segments or is_low or now - last_pass >= _AGES_S
                 if is_due and not self._rules.is_empty:
-                    segments, kept = sealed, now
-                    self._keep()
+                    segments, last_pass = sealed, now
+                    self._make_pass()
             except HeldError:
                 segments = -1  # another process makes room: see later what is left
             except (HybridlogError, OSError) as error:
                 self._say(f"making room failed: {error}")
 
-    def _keep(self) -> None:
+    def _make_pass(self) -> None:
         done = self._keeper.keep(self._rules)
         warnings = [] if self._has_warned else done.plan.warnings
         self._has_warned = bool(done.plan.warnings)

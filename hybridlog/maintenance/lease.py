@@ -107,4 +107,4 @@ def become_another(path: Path, mongo: str | None) -> None:
     changed = replace(settings, store_id=secrets.token_hex(16), mongo=own)
     write_settings(path, changed)
     if is_uri(own):
-        consent.remember(changed.store_id, own)
+        consent.trust(changed.store_id, own)

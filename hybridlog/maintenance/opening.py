@@ -6,7 +6,6 @@ are not opened.
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections.abc import Collection, Mapping
@@ -17,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.entries import (
-    describe,
+    announce_removal,
+    describe_now,
     journal_from_segments,
     sealed_event,
     take_inventory,
@@ -29,10 +29,8 @@ from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK, REMOVED
 from hybridlog_storage.errors import (
-    CatalogError,
     DiskFullError,
     HeldError,
-    SegmentError,
     StoreError,
     TopicError,
 )
@@ -308,10 +306,13 @@ def _refresh(
     if mends and not catalog.is_in_memory:
         try:
             with directory.writing(label):
-                if is_empty and directory.is_beginning(label):
+                is_new = is_empty and directory.is_beginning(label)
+                now = "" if is_new else recover(directory, label, report)
+                if not now:
                     return None
-                now = recover(directory, label, report)
-                return put_described(directory, catalog, now) if now else None
+                described = describe_now(directory, catalog, now)
+                catalog.put(described)
+                return described
         except HeldError:
             if not directory.id_of(label):
                 return None  # a process is about to begin it
@@ -420,7 +421,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
     listing = directory.listing(label)
     state = journal.read(path) if listing.journal else None
     if state is not None and state.removing:
-        remove_files(directory, label)
+        directory.remove(label)
         report.removed.append(label)
         return ""
     if state is not None and state.torn:
@@ -436,7 +437,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
     is_empty = not inventory.summaries and not (state is not None and state.sealed)
     if is_empty and not inventory.listing.sealed and (state is None or state.end is None):
         announce_removal(directory, label)
-        remove_files(directory, label)
+        directory.remove(label)
         report.recovered[label] = recovered
         return ""
     if recovered:
@@ -464,7 +465,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
-    patterns = (_LEFT_OVER, _MOVING, payload_files.THINNED)
+    patterns = (_LEFT_OVER, _MOVING, payload_files.REPLACEMENT)
     return name == PAYLOAD_PARTS or any(pattern.fullmatch(name) for pattern in patterns)
 
 
@@ -601,99 +602,3 @@ def remove_marks(path: Path, state: JournalState) -> None:
 def _end_of(inventory: Inventory) -> dict[str, Any]:
     """The `end` of a recording whose journal has no `ended` line."""
     return dict(inventory.end or {"status": "recovered", "cut_bytes": 0, "damage": []})
-
-
-def announce_removal(directory: StoreDirectory, label: str) -> None:
-    """Announce the removal of a recording in its journal.
-
-    On a full disk the line may not fit; then the directory's hidden name announces it.
-    """
-    path = directory.recording(label)
-    if directory.listing(label).journal:
-        with suppress(DiskFullError):
-            Journal(path).append(journal.event(journal.REMOVING, by=os.getpid()))
-
-
-def remove_files(directory: StoreDirectory, label: str) -> None:
-    """Hide a recording's directory, then delete its files."""
-    directory.sweep(directory.hide(label))
-
-
-def put_entry(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
-) -> RecordingEntry:
-    """Read a recording's files and update its catalog row.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-    """
-    return put_described(directory, catalog, label, is_open=is_open).entry
-
-
-def put_described(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
-) -> Described:
-    """As `put_entry`, and return all that was read."""
-    described = describe_now(directory, catalog, label, is_open=is_open)
-    if directory.is_writable or catalog.is_in_memory:
-        catalog.put(described)
-    return described
-
-
-def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Read the files of a recording again, after one of them was not what its entry says.
-
-    Raises:
-        StoreError: They cannot be read, or have changed.
-    """
-    is_open = directory.is_recorded(entry.label)
-    catalog.keep(describe_now(directory, catalog, entry.label, is_open=is_open))
-    for number, _, _ in entry.spans:
-        try:
-            catalog.table(entry, number)
-        except CatalogError as error:
-            raise StoreError(
-                f"The files of recording {entry.label!r} have changed since the store was "
-                "opened. Open it again."
-            ) from error
-
-
-def describe_now(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
-) -> Described:
-    """Read a recording from its files.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-        StoreError: Its files change all the time.
-    """
-    for _ in range(_TRIES):
-        inventory = take_inventory(directory, label)
-        # Of a directory that is renamed meanwhile, files would be missing.
-        if directory.listing(label).print == inventory.listing.print:
-            return describe_inventory(catalog, inventory, is_open=is_open)
-    raise StoreError(f"The files of recording {label!r} change while they are read. Ask again.")
-
-
-def describe_inventory(
-    catalog: Catalog, inventory: Inventory, *, is_open: bool = False
-) -> Described:
-    """Make the catalog row of a recording from its inventory.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-    """
-    from hybridlog.index.indexing import ChunkIndexer
-
-    if not inventory.id:
-        raise SegmentError(
-            f"Recording {inventory.label!r} has neither a journal nor a segment that can be "
-            "read. Restore the files, or remove the directory."
-        )
-    return describe(
-        inventory,
-        is_open=is_open,
-        reason=ChunkIndexer(inventory.id).reason,
-        stamps=catalog.stamps,
-        damage=catalog.damage(inventory.id),
-    )

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import open_segment
-from hybridlog.entries import journal_from_segments, take_inventory, unlisted_lines
+from hybridlog.entries import journal_from_segments, put_entry, take_inventory, unlisted_lines
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import catch_up, rebuild
-from hybridlog.maintenance.opening import finish_moves, moving_name, put_entry
+from hybridlog.maintenance.opening import finish_moves, moving_name
 from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, PAYLOADS

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from hybridlog.columns.layout import type_prefix
-from hybridlog.maintenance.opening import read_again
+from hybridlog.entries import read_again
 from hybridlog_storage.errors import CatalogError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 

@@ -151,7 +151,9 @@ def make_noted(
     return True
 
 
-def _sharing(directory: StoreDirectory, entry: RecordingEntry, asked: Collection[str]) -> set[str]:
+def _sharing(
+    directory: StoreDirectory, entry: RecordingEntry, wanted_topics: Collection[str]
+) -> set[str]:
     """Topics that share chunks with some topics, or with another one of them."""
     topics = {channel.id: channel.topic for channel in entry.channels}
     numbers = [number for number, _, _ in entry.spans]
@@ -160,7 +162,7 @@ def _sharing(directory: StoreDirectory, entry: RecordingEntry, asked: Collection
         for segment in walk(directory.recording(entry.label), numbers)
         for place in segment.summary.chunks
     }
-    found, before = {*asked}, 0
+    found, before = {*wanted_topics}, 0
     while len(found) > before:
         before = len(found)
         found.update(*(some for some in together if not found.isdisjoint(some)))
@@ -274,7 +276,7 @@ def are_left(directory: StoreDirectory, snapshot: Snapshot) -> bool:
     return not unfinished(directory) <= snapshot.by_id.keys()
 
 
-def remove_strangers(directory: StoreDirectory, present: Collection[str]) -> None:
+def remove_orphans(directory: StoreDirectory, present: Collection[str]) -> None:
     """Remove tables of removed recordings.
 
     Args:

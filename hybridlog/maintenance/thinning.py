@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.columns import payload_files
-from hybridlog.columns.layout import thinned_name
+from hybridlog.columns.layout import replacement_name
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment, walk
 from hybridlog.entries import take_inventory
 from hybridlog.maintenance.report import CompactedTopic, reporter
@@ -195,7 +195,7 @@ def replace_chunks(
         DiskFullError: There is no room.
     """
     name = sealed_name(reader.number)
-    target = path / thinned_name(name)
+    target = path / replacement_name(name)
     sealed = state.sealed.get(reader.number)
     about = {
         "digest": summary.whole_digest,

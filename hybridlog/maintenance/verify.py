@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 
 from hybridlog.columns import column_file
 from hybridlog.columns.payload_files import RecordingPayloads, walk
-from hybridlog.entries import take_inventory
+from hybridlog.entries import describe, take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.opening import describe_inventory
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
 from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
@@ -168,18 +167,18 @@ class _Index:
             return found
         first, last = entry.span
         places = [*self.places.of({channel.topic for channel in entry.channels}).values()]
-        asked = [
+        chosen = [
             (place.collection, {**place.documents(first, last + 1), "_meta.rec": entry.key})
             for place in places
         ]
-        for place, count in zip(places, self.database.count_each(asked), strict=True):
+        for place, count in zip(places, self.database.count_each(chosen), strict=True):
             found[place.collection] += count
         return found
 
     def counted_again(self, entry: RecordingEntry, collections: Iterable[str]) -> Counter[str]:
         """The numbers as they are now, at any time; reads the whole collections."""
-        asked = {"_meta.rec": entry.key}
-        return Counter({c: self.database.count(c, asked) for c in collections})
+        chosen = {"_meta.rec": entry.key}
+        return Counter({c: self.database.count(c, chosen) for c in collections})
 
 
 class _Check:
@@ -248,12 +247,12 @@ class _Check:
         if self._label in repairs.copies or not inventory.id:
             return
         is_open = holder is not None and holder.is_recording
-        entry = describe_inventory(self._catalog, inventory, is_open=is_open).entry
+        entry = describe(self._catalog, inventory, is_open=is_open).entry
         until = time.monotonic() + _NOTING_S
         while is_open and not self._is_noted(entry, is_open=True) and time.monotonic() < until:
             time.sleep(_NOTING_S / 100)
             inventory = take_inventory(self._directory, self._label)
-            entry = describe_inventory(self._catalog, inventory, is_open=True).entry
+            entry = describe(self._catalog, inventory, is_open=True).entry
         if inventory.is_proven or not self._directory.is_remote:  # where no row is noted
             self._row(entry, is_open=is_open)
         self._result.without_documents += entry.messages - entry.documents
@@ -461,8 +460,8 @@ def _compare(
         A problem or None.
     """
     first, end = int(chunk.batch.log_time.min()), int(chunk.batch.log_time.max()) + 1
-    asked = {"_meta.ref.chunk": chunk.number, "_meta.ref.seg": chunk.segment}
-    filters = [(place.collection, {**place.documents(first, end), **asked}) for place in places]
+    chosen = {"_meta.ref.chunk": chunk.number, "_meta.ref.seg": chunk.segment}
+    filters = [(place.collection, {**place.documents(first, end), **chosen}) for place in places]
     have = {
         document
         for raw in database.find_each(filters)

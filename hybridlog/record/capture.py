@@ -17,10 +17,16 @@ from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.columns.table_writer import TableWriter
-from hybridlog.entries import new_id, recording_metadata, sealed_event, text
+from hybridlog.entries import (
+    announce_removal,
+    new_id,
+    put_entry,
+    recording_metadata,
+    sealed_event,
+    text,
+)
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
-from hybridlog.maintenance.opening import announce_removal, put_entry, remove_files
 from hybridlog.maintenance.retention import Rules
 from hybridlog.wording import parse_size
 from hybridlog_storage import journal
@@ -252,7 +258,7 @@ class Capture:
         self.index.abandon()
         self._tables.discard()
         with suppress(HybridlogError):
-            remove_files(self._directory, label)
+            self._directory.remove(label)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.
@@ -305,7 +311,7 @@ class Capture:
             if database is not None:
                 IndexState(database).put(entry, "open", turn=self._turn)
         except BaseException:
-            self._directory.sweep(self._directory.hide(label))
+            self._directory.remove(label)
             raise
         return entry
 

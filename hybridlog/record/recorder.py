@@ -205,8 +205,8 @@ class _Copy:
             safe_point()
             self._copy_extras()
             read += len(batch)
-            kept = self._choice.of(batch, source.channels)
-            writer.append(kept, self._completed.of(kept))
+            chosen = self._choice.of(batch, source.channels)
+            writer.append(chosen, self._completed.of(chosen))
             if progress is not None:
                 progress(source.bytes_read, writer.totals.messages)
         for batch in self.front.batches() if self.front is not None else ():

@@ -16,7 +16,7 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.record.losses import Cause, joined
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelEntry, ChannelStats, channel_entry, channel_totals
-from hybridlog_storage.disk.directory import is_settled
+from hybridlog_storage.disk.directory import is_stable
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX
@@ -80,7 +80,7 @@ class RunningRecording:
         if is_same and not is_new and before == self._unreadable:
             return False
         # What is created within a tick of the file system's clock leaves the look as it is.
-        self._state = state if is_settled(look) else ("", False)
+        self._state = state if is_stable(look) else ("", False)
         self.entry = None if self._sealed is None else self._with_flushed(self._sealed)
         self.topics = set() if self.entry is None else topic_types(self.entry)
         return True

@@ -514,7 +514,7 @@ def _lacks(value: Any, kind: pa.DataType, but: Collection[str] = (), path: str =
     return is_list(kind) and any(_lacks(one, kind.value_type) for one in value or ())
 
 
-def kept_statistic(
+def stored_statistic(
     documents: Sequence[Any], kind: pa.DataType, path: Sequence[str], what: str
 ) -> Array | None:
     """One number of the summary of an array in documents; None if there is none.
@@ -532,5 +532,5 @@ def kept_statistic(
     made = statistic(lists, what)
     if made is None or not made.null_count:
         return made
-    kept = [one.get(what) if isinstance(one, dict) else None for one in documents]
-    return pc.coalesce(made, pa.array(kept, made.type))
+    stored = [one.get(what) if isinstance(one, dict) else None for one in documents]
+    return pc.coalesce(made, pa.array(stored, made.type))

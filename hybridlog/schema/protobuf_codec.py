@@ -213,16 +213,16 @@ def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
 def _drop_imports(file: FileDescriptorProto, known: AbstractSet[str]) -> None:
     """Removes the imports of a file that are not known."""
     names = list(file.dependency)
-    kept = [n for n, name in enumerate(names) if name in known]
-    if len(kept) == len(names):
+    there = [n for n, name in enumerate(names) if name in known]
+    if len(there) == len(names):
         return
-    moved = {old: new for new, old in enumerate(kept)}
+    moved = {old: new for new, old in enumerate(there)}
     for field in (file.public_dependency, file.weak_dependency):
         left = [moved[n] for n in field if n in moved]
         del field[:]
         field.extend(left)
     del file.dependency[:]
-    file.dependency.extend(names[n] for n in kept)
+    file.dependency.extend(names[n] for n in there)
 
 
 def _standard_file(name: str) -> FileDescriptorProto:

@@ -187,12 +187,12 @@ def without_lossy(decoded: Decoded) -> tuple[Decoded, int]:
     records = decoded.records
     if not isinstance(records, ExpiredFields):
         return decoded, 0
-    keep = ~records.lacking()
-    if keep.all():
+    is_complete = ~records.lacking()
+    if is_complete.all():
         return decoded, 0
-    values = [one for one, there in zip(records.values, keep.tolist(), strict=True) if there]
-    left = replace(decoded, rows=decoded.rows[keep], records=replace(records, values=values))
-    return left, int((~keep).sum())
+    values = [one for one, there in zip(records.values, is_complete.tolist(), strict=True) if there]
+    left = replace(decoded, rows=decoded.rows[is_complete], records=replace(records, values=values))
+    return left, int((~is_complete).sum())
 
 
 class ExpiredCodec(ReducedCodec):
@@ -296,11 +296,11 @@ class ExpiredFields(Objects):
             path: Dotted path of the array.
             what: `n`, `min`, `max` or `mean`.
         """
-        from hybridlog.schema.arrow_types import kept_statistic
+        from hybridlog.schema.arrow_types import stored_statistic
 
         assert self.empty is not None
         kind = self.empty.arrow().type
-        return kept_statistic(self.plain(whole=True), kind, path.split("."), what)
+        return stored_statistic(self.plain(whole=True), kind, path.split("."), what)
 
     def _wanted_of(self, fields: dict[str, object]) -> list[object]:
         """The wanted values of a message."""

@@ -58,7 +58,7 @@ def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:
     return encoding if state_of(encoding) is State.WHOLE else metadata.get(ORIGINAL_ENCODING, "")
 
 
-def told_channels(channels: Iterable[ChannelEntry]) -> list[ChannelEntry]:
+def shown_channels(channels: Iterable[ChannelEntry]) -> list[ChannelEntry]:
     """The channels of a recording that people are told: not those that are empty by expiry."""
     known = {channel.id: channel for channel in channels}
     return [

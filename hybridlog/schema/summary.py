@@ -186,13 +186,13 @@ def _floats(
     elements: NDArray[Any], offset: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> Summary:
     finite = np.isfinite(elements)
-    kept = counts
+    present = counts
     if not finite.all():
         seen = np.concatenate(([0], np.cumsum(finite, dtype=np.int64)))
         offset = seen[offset]
-        kept = np.diff(offset)
+        present = np.diff(offset)
         elements = elements[finite]
-    has = kept > 0
+    has = present > 0
     low, high, mean = (np.zeros(len(counts), np.float64) for _ in range(3))
     if has.any():
         begin = offset[:-1][has]
@@ -201,11 +201,11 @@ def _floats(
         low[has] = np.minimum.reduceat(elements, begin) + elements.dtype.type(0)
         high[has] = np.maximum.reduceat(elements, begin) + elements.dtype.type(0)
         wide = elements.astype(np.float64, copy=False)
-        mean[has] = np.add.reduceat(wide, begin) / kept[has] + 0.0
+        mean[has] = np.add.reduceat(wide, begin) / present[has] + 0.0
         if not np.isfinite(mean).all():
             total = Totals(len(begin))
             total.add(wide, begin, np.arange(len(begin)))
-            mean[has] = np.where(np.isfinite(mean[has]), mean[has], total.means(kept[has]))
+            mean[has] = np.where(np.isfinite(mean[has]), mean[has], total.means(present[has]))
     return Summary(counts, low, high, mean, has)
 
 

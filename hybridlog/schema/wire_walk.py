@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 # Rows below which walking over elements is faster one row at a time.
-_FEW_ROWS = 12
+_MIN_VECTOR_ROWS = 12
 
 
 class _Cursor:
@@ -375,7 +375,7 @@ class Walker:
         starts = np.empty(int(offset[-1]), np.int64)
         active = np.flatnonzero(each)
         index = 0
-        while len(active) >= _FEW_ROWS:
+        while len(active) >= _MIN_VECTOR_ROWS:
             here = at[active]
             starts[offset[active] + index] = here
             inner = _Cursor(here, cursor.end[active], cursor.origin[active], 0, self._least_known())

@@ -26,7 +26,7 @@ SLAB = 8 << 20
 """Bytes allocated from the system at a time; buffers up to this size are cut from them."""
 
 _LEAST = 1 << 18  # smaller buffers come from malloc
-_SPARE_BYTES = 64 << 20
+_MAX_IDLE_BYTES = 64 << 20
 _HUGE_PAGE = 2 << 20
 _FILLED = 8 << 20  # bytes of a new buffer; larger content is copied by a thread that can wait
 _PRIVATE = getattr(mmap, "MAP_PRIVATE", 0) | getattr(mmap, "MAP_ANONYMOUS", 0)
@@ -46,7 +46,7 @@ class Buffers:
         # already holds the lock.
         self._returned: deque[tuple[_Slab, int]] = deque()
         self._whole: dict[int, list[_Slab]] = {}  # slabs without taken buffers, by slab size
-        self._most_whole = _SPARE_BYTES
+        self._most_whole = _MAX_IDLE_BYTES
         # Slabs with both taken and free buffers, by buffer size.
         self._cut: dict[int, dict[_Slab, None]] = {}
         self._given: Counter[int] = Counter()  # bytes allocated from the system, by slab size,
@@ -131,7 +131,7 @@ class Buffers:
             got = slab.given - before
             with self._lock:
                 self._given[kind] += got
-                self._keep(slab)
+                self._store(slab)
                 # Other threads may also allocate, or return spare memory.
                 missing = min(missing - got, total - self._given[kind])
 
@@ -139,7 +139,7 @@ class Buffers:
         """Return surplus spare memory to the system."""
         with self._lock:
             self._sort_in()
-            self._most_whole = _SPARE_BYTES
+            self._most_whole = _MAX_IDLE_BYTES
             for slab in [slab for whole in self._whole.values() for slab in whole]:
                 if self._whole_bytes > self._most_whole:
                     self._given[slab.size] -= self._unkeep(slab).given
@@ -149,8 +149,8 @@ class Buffers:
         if not slab.cut:
             slab.cut_into(size)
         cut = self._cut.setdefault(size, {})
-        start = slab.spare.pop()
-        if slab.spare:
+        start = slab.free_starts.pop()
+        if slab.free_starts:
             cut[slab] = None
         else:
             cut.pop(slab, None)
@@ -188,15 +188,15 @@ class Buffers:
         while self._returned:
             slab, start = self._returned.popleft()
             self._taken[slab.size] -= slab.cut
-            slab.spare.append(start)
+            slab.free_starts.append(start)
             cut = self._cut[slab.cut]
-            if slab.is_all_spare():
+            if slab.is_unused():
                 cut.pop(slab, None)
-                self._keep(slab)
+                self._store(slab)
             else:
                 cut[slab] = None
 
-    def _keep(self, slab: _Slab) -> None:
+    def _store(self, slab: _Slab) -> None:
         """Store a free slab as spare, or return it to the system. Needs the lock."""
         slab.cut = 0
         if self._whole_bytes + slab.size > self._most_whole:
@@ -220,22 +220,22 @@ class _Slab:
         self.size = size
         self.given = 0  # bytes from its start that are allocated
         self.cut = 0  # bytes of a buffer; 0 while the slab is free
-        self.spare: list[int] = []  # starts of the free buffers, the next one last
+        self.free_starts: list[int] = []  # starts of the free buffers, the next one last
 
     def cut_into(self, size: int) -> None:
         self.cut = size
-        self.spare = list(range(self.size - size, -1, -size))
+        self.free_starts = list(range(self.size - size, -1, -size))
 
-    def is_all_spare(self) -> bool:
-        return len(self.spare) * self.cut == self.size
+    def is_unused(self) -> bool:
+        return len(self.free_starts) * self.cut == self.size
 
     def is_new(self, size: int) -> bool:
         """True if the next buffer needs memory that is not allocated yet."""
-        return self.given < (self.spare[-1] if self.cut else 0) + size
+        return self.given < (self.free_starts[-1] if self.cut else 0) + size
 
     def price(self, size: int) -> tuple[bool, int]:
         """Cost of cutting the next buffer from this slab; lower is better."""
-        return self.is_new(size), len(self.spare) if self.cut else self.size
+        return self.is_new(size), len(self.free_starts) if self.cut else self.size
 
     def give(self, end: int, most: int) -> Iterator[NDArray[np.uint8]]:
         """Unallocated memory up to `end`, in pieces of one page fault each.

@@ -587,7 +587,7 @@ class Catalog:
         self._by_fingerprint: dict[str, list[str]] | None = None
         self._odd: set[str] = set()  # names of files that are not ours, or left over
         self._damaged: set[int] = set()  # numbers of parts
-        self._kept: dict[str, Described] = {}  # by recording; written when this is closed
+        self._pending: dict[str, Described] = {}  # by recording; written when this is closed
         # Bounds and the content that they are of, by kind and recording.
         self._noted: dict[str, dict[str, tuple[str, Ends]]] = defaultdict(dict)
         self._tables = Cache(_MAX_TABLES)
@@ -613,9 +613,9 @@ class Catalog:
     def close(self) -> None:
         """Write what was kept and noted, drop the rest, and remove what is damaged."""
         with self._lock:
-            self.write_kept()
-            self._keep_noted()
-            self._forget()
+            self.write_pending()
+            self._store_noted()
+            self._invalidate()
             self.drop_damaged()
 
     def _check_folder(self) -> None:
@@ -825,17 +825,17 @@ class Catalog:
             self.put(described)
             return
         with self._lock:
-            self._forget(described.entry.id)
+            self._invalidate(described.entry.id)
             self._by_fingerprint = None
-            self._kept[described.entry.id] = described
+            self._pending[described.entry.id] = described
 
-    def write_kept(self) -> None:
+    def write_pending(self) -> None:
         """Write what was kept, as far as that is possible."""
         with self._lock:
             with suppress(StoreError, ResourceError):
-                for described in [*self._kept.values()]:
+                for described in [*self._pending.values()]:
                     self.put(described)
-            self._kept.clear()
+            self._pending.clear()
 
     def put(self, described: Described) -> None:
         """Insert or replace a recording."""
@@ -854,8 +854,8 @@ class Catalog:
             row[SUMMARY] = f"- {described.summary.to_json()}"
 
         with self._lock:
-            self._kept.pop(entry.id, None)
-            self._forget(entry.id)
+            self._pending.pop(entry.id, None)
+            self._invalidate(entry.id)
         self._put_schemas({c.schema for c in described.channels.values() if c.schema is not None})
         self._change(entry.id, change, topics_to_json(described.topics))
 
@@ -908,8 +908,8 @@ class Catalog:
             row.clear()
 
         with self._lock:
-            self._kept.pop(recording, None)
-            self._forget(recording)
+            self._pending.pop(recording, None)
+            self._invalidate(recording)
         self._change(recording, clear)
 
     def put_stamps(
@@ -927,7 +927,7 @@ class Catalog:
             for number, digest, rows in stamps
         }
         with self._lock:
-            self._forget(recording)
+            self._invalidate(recording)
         self._change(recording, lambda row: row.update(texts))
 
     def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
@@ -943,8 +943,8 @@ class Catalog:
         """
         with self._lock:
             self.was_damaged |= not self.is_in_memory
-            self._kept.clear()
-            self._forget()
+            self._pending.clear()
+            self._invalidate()
             with self._changing():
                 self._remove_recordings_file()
                 for name in self._folder.versions():
@@ -1001,14 +1001,15 @@ class Catalog:
             self._follow()
             wanted = {*self._places} if recordings is None else self._places.keys() & {*recordings}
             found = [
-                self._parts[self._places[one]].summaries[one] for one in wanted - self._kept.keys()
+                self._parts[self._places[one]].summaries[one]
+                for one in wanted - self._pending.keys()
             ]
-            kept = [
+            pending = [
                 one.summary
-                for recording, one in self._kept.items()
+                for recording, one in self._pending.items()
                 if recordings is None or recording in recordings
             ]
-        return [summary for summary in found if summary is not None] + kept
+        return [summary for summary in found if summary is not None] + pending
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
         """A set of topics and their types, by its hash.
@@ -1017,7 +1018,7 @@ class Catalog:
             CatalogError: The catalog has lost it.
         """
         with self._lock:
-            for one in self._kept.values():
+            for one in self._pending.values():
                 if one.summary.topics == digest:
                     return topics_from_json(topics_to_json(one.topics))
             key = TOPICS, digest
@@ -1043,9 +1044,9 @@ class Catalog:
 
     def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
         """State of the files and entry of a recording; None if it is missing or damaged."""
-        kept = self._kept.get(recording)
-        if kept is not None:
-            return kept.files, kept.entry
+        pending = self._pending.get(recording)
+        if pending is not None:
+            return pending.files, pending.entry
         row = self._row(recording)
         with suppress(KeyError, TypeError, ValueError):
             looks, document = json.loads(row[ENTRY])
@@ -1122,7 +1123,7 @@ class Catalog:
             for recording in recordings:
                 noted.pop(recording, None)
 
-    def _keep_noted(self) -> None:
+    def _store_noted(self) -> None:
         """Write bounds that were noted, of as many recordings as takes a second."""
         noted, self._noted = self._noted, defaultdict(dict)
         recordings = {recording for own in noted.values() for recording in own}
@@ -1168,7 +1169,7 @@ class Catalog:
                 if schema_hash(schema) == digest:
                     found[digest] = schema
         if len(found) < len(hashes):
-            for one in [*self._kept.values()]:
+            for one in [*self._pending.values()]:
                 own = (channel.schema for channel in one.channels.values())
                 known = {schema_hash(schema): schema for schema in own if schema is not None}
                 found |= {digest: known[digest] for digest in known.keys() & {*hashes}}
@@ -1240,7 +1241,7 @@ class Catalog:
         silent = {c.id for c in entry.channels if not c.has_publish_time}
         return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
 
-    def _forget(self, recording: str | None = None) -> None:
+    def _invalidate(self, recording: str | None = None) -> None:
         if recording is None:
             self._noted.clear()
             self._tables.drop("table")

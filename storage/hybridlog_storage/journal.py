@@ -306,7 +306,7 @@ class JournalState:
     def _compact(self, line: Event) -> None:
         found = payload_files(line.get("files", ()))
         values = line.get("segments", ())
-        segments = [_values(value, _THINNED) for value in values]
+        segments = [_values(value, _REPLACED) for value in values]
         expired = [(one["segment"], {*map(_text, one.get("topics", ()))}) for one in values]
         deleted = {_text(path) for path in line.get("deleted", ())}
         self.payloads.update({file.file: file for file in found})
@@ -576,8 +576,8 @@ _key: Final = partial(_text, like=r"[^\0]*")
 _label: Final = partial(_text, like=rf"(?!\.){_name}")  # hidden ones are of interrupted work
 _time: Final = partial(_number, within=range(-(1 << 62), 1 << 63))
 _segment: Final = partial(_number, within=range(10**9))
-_THINNED: Final[Mapping[str, _Check]] = {"segment": _segment, "bytes": _number, "digest": _text}
-_SEALED: Final[Mapping[str, _Check]] = {"file": partial(_text, like=_name), **_THINNED}
+_REPLACED: Final[Mapping[str, _Check]] = {"segment": _segment, "bytes": _number, "digest": _text}
+_SEALED: Final[Mapping[str, _Check]] = {"file": partial(_text, like=_name), **_REPLACED}
 _CHANNEL: Final[Mapping[str, _Check]] = {
     "id": partial(_number, within=range(1 << 16)),
     "topic": _text,

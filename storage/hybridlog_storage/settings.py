@@ -222,10 +222,10 @@ def without_password(uri: str) -> str:
     user, colon, _ = parts.user.partition(":")
     mark = ";" if ";" in parts.options else "&"
     options = parts.options.split(mark)
-    kept = [option for option in options if not _is_secret(option)]
-    if not colon and len(kept) == len(options):
+    public = [option for option in options if not _is_secret(option)]
+    if not colon and len(public) == len(options):
         return uri
-    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, mark.join(kept)))
+    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, mark.join(public)))
 
 
 def with_password(uri: str) -> str:

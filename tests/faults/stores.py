@@ -18,9 +18,8 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog.columns.folders import recordings_of
 from hybridlog.columns.layout import PARTS
-from hybridlog.entries import take_inventory
+from hybridlog.entries import describe_now, take_inventory
 from hybridlog.maintenance.lease import place_of
-from hybridlog.maintenance.opening import describe_now
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.catalog_parts import ENTRY, PartContent

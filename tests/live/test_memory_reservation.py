@@ -69,7 +69,7 @@ def test_as_much_as_comes_while_a_disk_stands_still_but_no_more_than_half_the_bu
         assert pool._given == {SLAB: BUDGET // 2}
         comes(reservation, 1000 * BUDGET, looks=10)
         assert pool._given == {SLAB: BUDGET // 2}
-    assert pool._whole_bytes <= pool_module._SPARE_BYTES
+    assert pool._whole_bytes <= pool_module._MAX_IDLE_BYTES
 
 
 @pytest.mark.parametrize(

@@ -298,7 +298,7 @@ def test_what_is_laid_down_together_keeps_its_order(
         batches.append(batch.payload_bytes)
         append(self, batch, channels)
 
-    monkeypatch.setattr(live, "_MAX_LAID", 9_000_000)
+    monkeypatch.setattr(live, "_MAX_BATCH_BYTES", 9_000_000)
     monkeypatch.setattr(RecordingWriter, "append", counted)
     payloads = [text(b"%5d" % n + bytes(sizes[n % 7])) for n in range(210)]
     with store.start("talk") as recording, recording._laying:

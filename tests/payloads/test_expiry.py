@@ -15,9 +15,9 @@ import bson
 import pytest
 
 import hybridlog as hl
+from hybridlog.entries import put_entry
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
-from hybridlog.maintenance.opening import put_entry
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError

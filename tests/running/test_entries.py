@@ -6,15 +6,15 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.entries import describe, take_inventory
-from hybridlog.index.indexing import ChunkIndexer
-from hybridlog.maintenance.opening import put_entry
+from hybridlog.entries import describe, put_entry, take_inventory
+from hybridlog.maintenance.opening import open_catalog
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.maintenance.verify import verify
 from hybridlog.record.losses import Cause
@@ -151,8 +151,8 @@ def test_an_entry_from_before_its_messages_were_decoded_is_no_problem(running: R
     with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
         catalog, directory = reader.session.catalog, reader.directory
         inventory = take_inventory(directory, "live")
-        reason = ChunkIndexer(inventory.id).reason
-        found = describe(inventory, is_open=True, reason=reason, stamps=lambda *_: None, damage={})
+        with closing(open_catalog(directory, in_memory=True)) as empty:
+            found = describe(empty, inventory, is_open=True)
         catalog.put(found)
         assert not found.entry.is_decoded
         tables = [(n, one.digest, one.table) for n, one in inventory.summaries.items()]

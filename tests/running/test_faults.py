@@ -37,7 +37,7 @@ def copied(running: Running, tmp_path: Path) -> Path:
     return copy_of(running, tmp_path / "copy")
 
 
-def is_told(store: hl.Store) -> bool:
+def is_reported(store: hl.Store) -> bool:
     """Whether the store says that a part of a segment is damaged."""
     losses = store.entry(LABEL).end.get("losses", ())
     return any(row["cause"] == "segment" and row["count"] is None for row in losses)
@@ -47,7 +47,7 @@ def outcome(store: Path, known: Known) -> str:
     """What comes of asking: `right`, `error`, `told` or `silent`."""
     found = set()
     with as_running(store) as opened:
-        told = is_told(opened)
+        told = is_reported(opened)
         for topic in known.counts:
             wanted = known.of(topic)
             for ask, right in (
@@ -150,7 +150,7 @@ def test_a_torn_end_is_no_damage(running: Running, copied: Path) -> None:
             assert (segment.damaged, segment.stopped) == ([], None), cut
         with as_running(copied) as store:
             entry = store.entry(LABEL)
-            assert not is_told(store), cut
+            assert not is_reported(store), cut
             assert entry.messages >= before
             before = entry.messages
             there = Known(known.sent, entry.messages_by_topic())

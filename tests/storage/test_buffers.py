@@ -67,9 +67,9 @@ def test_preparing_ends_when_somebody_settles_meanwhile(made: list[int]) -> None
             return False
 
     pool = Buffers()
-    pool.prepare(SIZE, 2 * module._SPARE_BYTES, enough=Enough())
-    assert len(made) == 2 * module._SPARE_BYTES // SLAB
-    assert pool._given == {SLAB: module._SPARE_BYTES}
+    pool.prepare(SIZE, 2 * module._MAX_IDLE_BYTES, enough=Enough())
+    assert len(made) == 2 * module._MAX_IDLE_BYTES // SLAB
+    assert pool._given == {SLAB: module._MAX_IDLE_BYTES}
 
 
 def test_what_is_begun_is_prepared_first_and_taken_last(made: list[int]) -> None:
@@ -138,7 +138,7 @@ def test_buffers_beyond_a_slab_have_their_own(made: list[int]) -> None:
 
 def test_no_more_is_kept_than_the_bound(made: list[int]) -> None:
     pool = Buffers()
-    most = module._SPARE_BYTES // SLAB
+    most = module._MAX_IDLE_BYTES // SLAB
     held = [pool.take(SIZE) for _ in range((most + 3) * SLAB // SIZE)]
     del held
     assert pool._given == {SLAB: most * SLAB}
@@ -150,7 +150,7 @@ def test_no_more_is_kept_than_the_bound(made: list[int]) -> None:
 
 def test_what_was_prepared_is_kept_until_things_settle(made: list[int]) -> None:
     pool = Buffers()
-    usual = module._SPARE_BYTES // SLAB
+    usual = module._MAX_IDLE_BYTES // SLAB
     pool.prepare(SIZE, (usual + 5) * SLAB)
     assert len(made) == usual + 5
     held = [pool.take(SLAB) for _ in range(usual + 5)]
@@ -171,7 +171,7 @@ def test_what_was_prepared_is_kept_until_things_settle(made: list[int]) -> None:
 
 def test_what_is_spare_of_another_kind_is_not_in_the_way(made: list[int]) -> None:
     pool = Buffers()
-    held = [pool.take(SLAB) for _ in range(module._SPARE_BYTES // SLAB)]
+    held = [pool.take(SLAB) for _ in range(module._MAX_IDLE_BYTES // SLAB)]
     del held
     pool.prepare(2 * SLAB, 6 * SLAB)
     assert made[-3:] == [2 * SLAB] * 3

@@ -646,11 +646,11 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
     return Truth(tmp_path_factory.mktemp("truth"))
 
 
-def open_and_ask(truth: Truth, folder: Path, *, is_told: bool = True) -> None:
+def open_and_ask(truth: Truth, folder: Path, *, is_reported: bool = True) -> None:
     """Nothing wrong is said of a file that was changed, and it can be made again."""
     with closing(Catalog(folder, STORE)) as opened:
         complete = truth.check(opened)
-        assert opened.was_damaged or not (complete or is_told)
+        assert opened.was_damaged or not (complete or is_reported)
         opened.mend()
         assert opened.is_sound()
         truth.fill(opened)
@@ -675,7 +675,7 @@ def test_whatever_byte_of_a_part_changes_nothing_wrong_is_said(
         (tmp_path / CATALOG / "part-000000").write_bytes(data)
         try:
             # A part with another head may be one of another store.
-            open_and_ask(truth, tmp_path, is_told=spot > content.index(b"\n"))
+            open_and_ask(truth, tmp_path, is_reported=spot > content.index(b"\n"))
         except Exception as error:
             raise AssertionError(f"byte {spot} of {len(data)}") from error
 

@@ -279,7 +279,7 @@ def test_large_questions_go_in_several_commands(
     database: Database, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     database.insert_raw(name, b"".join(encoded(5)), 5)
-    monkeypatch.setattr(module, "_BYTES_TOGETHER", 2000)
+    monkeypatch.setattr(module, "_MAX_COMMAND_BYTES", 2000)
     long = [(name, {"x": {"$in": [n, *range(-200, 0)]}}) for n in range(7)]
     assert database.count_each(long) == [1, 1, 1, 1, 1, 0, 0]
 

@@ -224,9 +224,9 @@ def test_a_flipped_bit_anywhere_in_an_open_segment_is_seen(
         segment = OpenSegment(tmp_path, 0, writing_s=0)
         segment.follow()
         found = told_by(segment)
-        is_told = bool(segment.damaged) or segment.stopped is not None
+        is_reported = bool(segment.damaged) or segment.stopped is not None
         # Where a message index is damaged, the messages of its chunk tell the same.
-        assert is_told or len(found) < len(right) or (at in indexes and found == right), at
+        assert is_reported or len(found) < len(right) or (at in indexes and found == right), at
         assert all(one in right for one in found[1:]), at
         recovered = recover_segment(path, recording=RECORDING)
         assert recovered.damage or recovered.cut_bytes, at

@@ -206,7 +206,7 @@ def test_folders_are_read_once_for_all_recordings_without_tables(
 ) -> None:
     (path,) = files_of(several)
     path.unlink()
-    monkeypatch.setattr(folders, "_SETTLED_NS", -1)
+    monkeypatch.setattr(folders, "_STABLE_NS", -1)
     entries = list(several.recordings())
     read: list[int] = []
     real = files.names_in

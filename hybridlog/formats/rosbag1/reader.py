@@ -69,7 +69,7 @@ _OVERLAP = 8 << 10
 _MAX_DEFINITION = 64 << 20
 _AT_ONCE = 64 << 20  # bytes of an unpacked chunk in memory; larger ones go to a file
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
-_MOST = 2 << 30  # and whatever it says
+_MAX_CHUNK_BYTES = 2 << 30  # and whatever it says
 _STEP = 64 << 10  # bytes that are unpacked at once
 _STREAMS = 1000  # compressed streams in a chunk, and as many bytes for each further one
 
@@ -303,7 +303,7 @@ class Rosbag1Source(Source):
             if record is None or record.end > self.size_bytes:
                 return
             if record.header.op == OP_CONNECTION:
-                self._keep_definition(record)
+                self._store_definition(record)
                 connections += 1
             elif record.header.op == OP_CHUNK_INFO:
                 data = self._read(record.start, min(record.end - record.start, 1 << 26))
@@ -328,7 +328,7 @@ class Rosbag1Source(Source):
         if chunks and self.message_count:
             self.time_range = (min(begins), max(ends) + 1)
 
-    def _keep_definition(self, record: _Record) -> None:
+    def _store_definition(self, record: _Record) -> None:
         """Store a connection of the index: its definition in a chunk may be lost."""
         if record.end - record.start > _MAX_DEFINITION:
             return
@@ -863,7 +863,7 @@ def _unpack_with(
     make: Callable[[], _Decompressor], magic: bytes, data: bytes, size: int, file: IO[bytes]
 ) -> _Unpacked:
     """Unpack the streams at the start of `data`, at most `size` or `_UNSTATED` bytes."""
-    most = min(max(size, _UNSTATED), _MOST)
+    most = min(max(size, _UNSTATED), _MAX_CHUNK_BYTES)
     streams = _Streams(make, data, magic)
     total = 0
     try:

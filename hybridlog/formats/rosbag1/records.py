@@ -41,7 +41,7 @@ _LOOK_BACK = 320
 _TEMPLATE_HEADER = 512
 _TEMPLATES = 16
 _LEAST_HEADER = 8  # bytes of a header with the field `op` only
-_MANY = 100  # records in a run from which the next run is searched by columns,
+_MIN_COLUMN_RUN = 100  # records in a run from which the next run is searched by columns,
 _SMALL = 4096  # if their mean size is at most this
 _SAMPLE = 1 << 16  # bytes sampled to find rare values
 _MAX_HITS = 1 / 16  # share of candidate positions above which columns cost too much
@@ -263,7 +263,7 @@ class RunReader:
         self._usual = None
         for template in self._templates:
             left = _apply(template, raw, (head, body), todo, (is_message, conn, time))
-            if len(todo) - len(left) > n / 2 and n >= _MANY and end <= _SMALL * n:
+            if len(todo) - len(left) > n / 2 and n >= _MIN_COLUMN_RUN and end <= _SMALL * n:
                 self._usual = template
             todo = left
         while len(todo):

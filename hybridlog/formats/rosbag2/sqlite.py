@@ -284,9 +284,9 @@ class SqliteSource(Source):
             self._undefined.update(topic for topic in topics if topic not in self._channel_of)
         early = (batch.log_time < 0) | (batch.publish_time < 0)
         self._early += int((early & (channel >= 0)).sum())
-        kept = (channel >= 0) & ~early
-        if not kept.all():
-            batch = batch.take(kept)
+        usable = (channel >= 0) & ~early
+        if not usable.all():
+            batch = batch.take(usable)
         if len(batch):
             yield batch
 

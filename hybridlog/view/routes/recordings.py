@@ -10,7 +10,7 @@ import numpy as np
 from hybridlog.query.answers.lost import lost_parts
 from hybridlog.query.choice import Choice
 from hybridlog.record.losses import losses_of
-from hybridlog.schema.states import encoding_of, told_channels
+from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:
 
 def _topics(entry: RecordingEntry, start: int) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    for channel in told_channels(entry.channels):
+    for channel in shown_channels(entry.channels):
         stats = channel.stats
         row = found.setdefault(
             channel.topic,

@@ -479,6 +479,10 @@ class StoreDirectory:
         self.move(label, hidden)
         return hidden
 
+    def remove(self, label: str) -> None:
+        """Hide a recording's directory, then delete its files."""
+        self.sweep(self.hide(label))
+
     def sweep(self, name: str) -> None:
         """Delete a hidden directory below `recordings`."""
         path = self.recording(name)
@@ -712,7 +716,7 @@ def _look(about: os.stat_result, journal: str, fd: int) -> str:
     return f"{look} {lines.st_ino} {lines.st_size} {lines.st_mtime_ns} {lines.st_ctime_ns}"
 
 
-def is_settled(look: str) -> bool:
+def is_stable(look: str) -> bool:
     """False if the look is so new that it would be the same after another change.
 
     Args:

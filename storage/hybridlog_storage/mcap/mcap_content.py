@@ -198,7 +198,7 @@ def parse_content(
         raise SegmentError(f"the record at byte {walk.end} of its content {problem}")
     batch, good, unpublished = _batch(buffer, starts)
     # Rows count valid messages only.
-    kept = None if good is None else np.concatenate(([0], np.cumsum(good)))
+    good_before = None if good is None else np.concatenate(([0], np.cumsum(good)))
     definitions: list[Definition] = []
     damage: list[ScanDamage] = []
     for row, opcode, start, end in walk.others:
@@ -211,7 +211,9 @@ def parse_content(
             damage.append(ScanDamage(start, end - start, str(error), 0))
             continue
         if isinstance(record, records.Schema | records.Channel):
-            definitions.append(Definition(row if kept is None else int(kept[row]), record))
+            definitions.append(
+                Definition(row if good_before is None else int(good_before[row]), record)
+            )
     return ChunkContent(
         batch,
         {d.record.id: d.record for d in definitions if isinstance(d.record, records.Schema)},

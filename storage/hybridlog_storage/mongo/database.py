@@ -63,9 +63,9 @@ BATCH_DOCUMENTS = 5000
 OLDEST_SERVER = (5, 3)
 """The first MongoDB with clustered collections."""
 
-_MAX_TOGETHER = 100
+_MAX_QUESTIONS_PER_COMMAND = 100
 """Most questions in one command."""
-_BYTES_TOGETHER = 4 << 20
+_MAX_COMMAND_BYTES = 4 << 20
 
 _GONE_S = 1.0  # seconds without an answer after which the server counts as ended
 _TRIES = 3  # for a command whose connection breaks
@@ -598,7 +598,7 @@ class Database:
         key: Callable[[int], object],
     ) -> Iterator[tuple[Any, int]]:
         """Numbers of documents by a key, which may differ between questions."""
-        for first, part in _together(questions):
+        for first, part in _batched(questions):
             pipelines = []
             for place, (collection, query) in enumerate(part, first):
                 count: Document = {"$group": {"_id": key(place), "n": {"$sum": 1}}}
@@ -620,7 +620,7 @@ class Database:
             projection: MongoDB's projection document; names the fields to return.
         """
         shape = [] if projection is None else [{"$project": dict(projection)}]
-        for _, part in _together(questions):
+        for _, part in _batched(questions):
             if len(part) == 1:  # one command; a pipeline takes two
                 yield from self.find_raw(*part[0], projection, sort=[("_id", 1)])
                 continue
@@ -847,7 +847,7 @@ def index_name(keys: Sort, only: Mapping[str, str] | None = None) -> str:
     return "_".join(f"{field}_{order}" for field, order in keys)
 
 
-def _together(
+def _batched(
     questions: Sequence[tuple[str, Mapping[str, object]]],
 ) -> Iterator[tuple[int, Sequence[tuple[str, Mapping[str, object]]]]]:
     """Groups of questions that fit into one command, with the number of the first.
@@ -860,7 +860,7 @@ def _together(
         return
     with _mapped("MongoDB", question=True):
         size = max(len(encode(query)) for _, query in questions)
-    step = max(1, min(_MAX_TOGETHER, _BYTES_TOGETHER // size))
+    step = max(1, min(_MAX_QUESTIONS_PER_COMMAND, _MAX_COMMAND_BYTES // size))
     for first in range(0, len(questions), step):
         yield first, questions[first : first + step]
 

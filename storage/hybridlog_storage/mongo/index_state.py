@@ -132,11 +132,11 @@ class IndexState:
 
     def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
         """The index states of these recordings, or of all, by key."""
-        asked: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
+        chosen: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
         wanted = {"id": 1, "index": 1, **dict.fromkeys((*_OF_CHANNELS, *_MAX_NAMES), 1)}
         for document in self._db.find(
-            RECORDINGS, asked, wanted, batch_size=_ENTRIES_PER_BATCH, read="majority"
+            RECORDINGS, chosen, wanted, batch_size=_ENTRIES_PER_BATCH, read="majority"
         ):
             index = document.get("index") or {}
             channels = document.get("channels") or ()
@@ -175,8 +175,8 @@ class IndexState:
         """
         channel = {"$elemMatch": {"topic": text_of(topic), "$or": _UNCERTAIN_CHANNEL}}
         damaged = {"index.damage": {"$exists": True}}
-        asked = {"$or": [{"index.state": {"$ne": "complete"}}, damaged, {"channels": channel}]}
-        return {str(one["_id"]) for one in self._db.find(RECORDINGS, asked, {"_id": 1})}
+        chosen = {"$or": [{"index.state": {"$ne": "complete"}}, damaged, {"channels": channel}]}
+        return {str(one["_id"]) for one in self._db.find(RECORDINGS, chosen, {"_id": 1})}
 
     def field_indexes(self) -> list[tuple[str, tuple[str, ...]]]:
         """Topic and fields of each index on fields, as `put_field_indexes` was told."""
@@ -191,10 +191,10 @@ class IndexState:
 
     def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
         """Progress of recordings by key, without unknown ones."""
-        asked, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
+        chosen, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
         said = {
             found["_id"]: found.get("index") or {}
-            for found in self._db.find(RECORDINGS, asked, wanted, read="majority")
+            for found in self._db.find(RECORDINGS, chosen, wanted, read="majority")
         }
         return {
             key: Progressed(int(index.get("turn", 0)), dict(index.get("segments") or {}))
@@ -275,21 +275,21 @@ class IndexState:
             span: First and last log time of its documents at these places, ns; None for any.
             but: Segments whose documents stay.
         """
-        asked: dict[str, object] = {"_meta.rec": key}
+        chosen: dict[str, object] = {"_meta.rec": key}
         if but:
-            asked["_meta.ref.seg"] = {"$nin": sorted(but)}
+            chosen["_meta.ref.seg"] = {"$nin": sorted(but)}
         if places is None:
             for collection in self.document_collections():
-                self._db.delete(collection, asked)
+                self._db.delete(collection, chosen)
             return
         bounds = (None, None) if span is None else (span[0], span[1] + 1)
         shared: list[dict[str, object]] = []
         for place in places:
-            chosen = {**asked, **place.documents(*bounds)}
+            within = {**chosen, **place.documents(*bounds)}
             if place.is_shared:
-                shared.append(chosen)
+                shared.append(within)
             else:
-                self._db.delete(place.collection, chosen)
+                self._db.delete(place.collection, within)
         self._db.delete_each(SHARED, shared)
 
     def remove(self, key: str) -> None:

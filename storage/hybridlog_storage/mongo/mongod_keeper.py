@@ -76,9 +76,9 @@ class Job(TypedDict):
 def main(job: Job) -> int:
     """Run mongod until it is unused; return the exit status of this process."""
     os.umask(0o077)
-    asked_to_end: list[int] = []
+    end_signals: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda got, _frame: asked_to_end.append(got))
+        signal.signal(number, lambda got, _frame: end_signals.append(got))
     try:
         mongod = _start(job)
     except OSError as error:
@@ -89,7 +89,7 @@ def main(job: Job) -> int:
     try:
         users = _open(job, job["users_lock"], os.O_RDWR)
         _write_record(job, mongod.pid)
-        is_removed = _wait(job, mongod, users, asked_to_end)
+        is_removed = _wait(job, mongod, users, end_signals)
     except OSError as error:  # the record cannot be written on a full disk
         _say(job, f"the keeper of mongod failed: {error}")
     finally:
@@ -169,7 +169,7 @@ def _raise_limits() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: list[int]) -> bool:
+def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, end_signals: list[int]) -> bool:
     """Wait until mongod has ended, a signal asks to end, or it is idle (`users` is then locked).
 
     Returns:
@@ -178,7 +178,7 @@ def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, asked_to_end: l
     born = time.monotonic()
     checked_log = born
     idle_since: float | None = None
-    while mongod.poll() is None and not asked_to_end:
+    while mongod.poll() is None and not end_signals:
         now = time.monotonic()
         if os.fstat(users).st_nlink == 0:
             return True

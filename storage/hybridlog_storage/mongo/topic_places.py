@@ -163,7 +163,7 @@ class TopicPlaces:
         unknown = {collection_of(t): t for t in topics if t not in self._known}
         names = sorted(unknown)
         for first in range(0, len(names), _NAMES_AT_ONCE):
-            asked = {"_id": {"$in": names[first : first + _NAMES_AT_ONCE]}}
-            for found in self._database.find(TOPICS, asked, {"shared": 1}, read=read):
+            chosen = {"_id": {"$in": names[first : first + _NAMES_AT_ONCE]}}
+            for found in self._database.find(TOPICS, chosen, {"shared": 1}, read=read):
                 topic = unknown[found["_id"]]
                 self._known[topic] = TopicPlace(topic, bool(found.get("shared")))

@@ -292,7 +292,7 @@ class Compressor:
         self.level = level
         self._sample_size = sample_size
         self._samples = samples
-        self._keep_above = 1.0 - min_gain
+        self._max_ratio = 1.0 - min_gain
         self._own = threading.local()  # threads must not share a ZstdCompressor
 
     def compress(self, data: Buffer, *, hurried: bool = False) -> tuple[str, Buffer]:
@@ -307,11 +307,11 @@ class Compressor:
             MCAP name of the codec and the compressed bytes, or the empty name and `data`
             itself.
         """
-        bound = _WORTH_IT if hurried else self._keep_above
+        bound = _WORTH_IT if hurried else self._max_ratio
         if self.name == "none" or len(data) == 0 or not self._promising(data, bound):
             return "", data
         packed = self._pack(data, min(self.level, _FAST) if hurried else self.level)
-        if len(packed) > len(data) * self._keep_above or is_implausible(len(data), len(packed)):
+        if len(packed) > len(data) * self._max_ratio or is_implausible(len(data), len(packed)):
             return "", data
         return self.name, packed
 

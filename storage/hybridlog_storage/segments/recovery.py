@@ -178,7 +178,7 @@ class _Rebuilder:
         if isinstance(item, ScanDamage):
             self._damage.append(f"byte {item.offset}: {item.reason}")
         elif isinstance(item, ScannedChunk):
-            self._forget_torn()
+            self._drop_torn()
             self.is_empty = False
             self.good_end = offset + item.length
             self._last_chunk = offset
@@ -188,7 +188,7 @@ class _Rebuilder:
             if self._torn is not None and _is_of_chunk(item):
                 self.good_end = end
                 return
-            self._forget_torn()
+            self._drop_torn()
             if isinstance(item, PrivateRecord) and item.opcode == ARRIVAL_OPCODE:
                 self._take_proof(offset, end)
             else:
@@ -232,7 +232,7 @@ class _Rebuilder:
             except _DamagedError as error:
                 self._damage.append(f"byte {offset}: {error}")
 
-    def _forget_torn(self) -> None:
+    def _drop_torn(self) -> None:
         """Drop a chunk without arrival numbers that is followed by a whole record."""
         if self._torn is not None:
             reason = self._why_torn or "its arrival numbers are missing"
@@ -451,7 +451,7 @@ def recover_segment(
             final name. The file is unchanged.
         DiskFullError: No room for the summary; all whole records stay.
     """
-    tell = on_sealing or (lambda _: None)
+    on_sealed = on_sealing or (lambda _: None)
     number = int(path.name.removesuffix(OPEN_SUFFIX))
     final = path.with_name(sealed_name(number))
     try:
@@ -462,8 +462,8 @@ def recover_segment(
             )
         found = _complete(path, number)
         if found is None:
-            return _rebuild(path, number, tell, recording)
-        tell(found)
+            return _rebuild(path, number, on_sealed, recording)
+        on_sealed(found)
         durability.publish(path, final, depth=files.IN_RECORDING)
         return Recovered(final, sum(channel.messages for channel in found.channels))
     except OSError as error:
@@ -504,7 +504,7 @@ def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
 
 
 def _rebuild(
-    path: Path, number: int, tell: OnSealing, recording: Mapping[str, object] | None
+    path: Path, number: int, on_sealed: OnSealing, recording: Mapping[str, object] | None
 ) -> Recovered:
     """Seal a segment with its readable records."""
     damage: list[str] = []
@@ -530,7 +530,7 @@ def _rebuild(
         if damage or not rebuilder.has_end:
             end_note = {"status": "recovered", "cut_bytes": cut_bytes, "damage": damage}
             segment.add_metadata(json_metadata(END_METADATA, end_note))
-        sealed = segment.seal(sync=True, on_sealing=tell)
+        sealed = segment.seal(sync=True, on_sealing=on_sealed)
     finally:
         segment.abandon()
     return Recovered(sealed, rebuilder.messages, cut_bytes, damage)

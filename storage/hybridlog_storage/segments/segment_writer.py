@@ -223,7 +223,7 @@ class RecordingWriter:
                 self._fill(key, own.take(rows), seq[rows])
         self.totals.messages += len(batch)
         self.totals.payload_bytes += batch.payload_bytes
-        self._keep_pace(limit=4)
+        self._limit_queue(limit=4)
 
     def place_one(
         self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
@@ -280,7 +280,7 @@ class RecordingWriter:
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Store an attachment or a metadata record of the source."""
         self._storing.append(self._disk.submit(self._add, record))
-        self._keep_pace(limit=0)
+        self._limit_queue(limit=0)
 
     def flush(self) -> None:
         """Close and write every open chunk."""
@@ -294,7 +294,7 @@ class RecordingWriter:
         for key, builder in self._clusters.items():
             if builder.opened <= limit:
                 self._close_chunk(key)
-        self._keep_pace(limit=4)
+        self._limit_queue(limit=4)
 
     def close(self, end: Metadata | None = None) -> list[Path]:
         """Flush and seal the last segment; return the paths of all segments.
@@ -435,9 +435,9 @@ class RecordingWriter:
             packed = self._pool.submit(self._pack, copying, batch, seq, size)
             self._packed.append(packed)
             self._storing.append(self._disk.submit(self._store, packed))
-            self._keep_pace(limit=AT_WORK)
+            self._limit_queue(limit=AT_WORK)
 
-    def _keep_pace(self, limit: int) -> None:
+    def _limit_queue(self, limit: int) -> None:
         """Wait as `_drain` does, or with `on_written` only raise a failure."""
         self._drain(limit if self._on_written is None else len(self._storing))
 
@@ -537,7 +537,7 @@ class RecordingWriter:
         elif self.settings.sync == "seal" and not segment.direct:
             self._sync_behind(segment)
         for chunk, place in zip(chunks, stored, strict=False):
-            self._tell(chunk, place)
+            self._publish(chunk, place)
         span = self.settings.segment_span_s
         is_old = span is not None and time.monotonic() - self._opened >= span
         is_full = segment.position >= self.settings.segment_size
@@ -545,7 +545,7 @@ class RecordingWriter:
         if is_old or is_full or has_many:
             self._seal()
 
-    def _tell(self, chunk: PackedChunk, stored: StoredChunk) -> None:
+    def _publish(self, chunk: PackedChunk, stored: StoredChunk) -> None:
         """Report that a chunk is in the file."""
         self.totals.chunks += 1
         for channel_id, data in chunk.indexes.items():

@@ -136,7 +136,7 @@ class Graph:
         self._subscriptions: dict[str, Subscription] = {}
         self._types: dict[str, str] = {}
         self._listed: dict[str, frozenset[str]] = {}
-        self._asked: dict[str, tuple[str, bool]] = {}
+        self._wanted: dict[str, tuple[str, bool]] = {}
         self._hint = asyncio.Event()
         self._hinted: set[str] = set()
         self._calls = asyncio.Semaphore(_CALLS_AT_ONCE)
@@ -217,13 +217,13 @@ class Graph:
 
     def _choose(self, context: Context, state: State) -> None:
         """Adds a subscription for each wanted topic without one."""
-        asked, self._asked = self._asked, {}
+        before, self._wanted = self._wanted, {}
         for topic in state.publishers:
             type_name = self._type_of(topic)
-            known = asked.get(topic)
+            known = before.get(topic)
             if known is None or known[0] != type_name:
                 known = (type_name, context.sink.wants(topic, type_name))
-            self._asked[topic] = known
+            self._wanted[topic] = known
             if known[1] and topic not in self._subscriptions:
                 self._subscriptions[topic] = Subscription(context, topic)
 
@@ -236,7 +236,7 @@ class Graph:
             context.sink.say(f"{one_line(topic)}: the ROS master refuses the subscription: {error}")
             return
         subscription.nodes = state.publishers.get(topic, frozenset())
-        type_name, is_wanted = self._asked.get(topic, ("", True))
+        type_name, is_wanted = self._wanted.get(topic, ("", True))
         subscription.update(type_name, uris, is_wanted=is_wanted)
 
     def _type_of(self, topic: str) -> str:

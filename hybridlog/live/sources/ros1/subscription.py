@@ -171,7 +171,7 @@ class Subscription:
                 del self._links[uri]
         for uri in sorted(listed - set(self._links)):
             link = self._links[uri] = _Link(self, uri)
-            self._context.spawn(self._keep(uri, link))
+            self._context.spawn(self._reconnect(uri, link))
         self.report()
 
     def report(self) -> None:
@@ -222,7 +222,7 @@ class Subscription:
                 self._types[type_name] = wanted
         return wanted
 
-    async def _keep(self, uri: str, link: _Link) -> None:
+    async def _reconnect(self, uri: str, link: _Link) -> None:
         await link.run(self._context)
         link.is_up, link.has_ended = False, True
         if not link.is_listed:

@@ -88,7 +88,7 @@ class Subscription:
         if self._losses is not None:
             self._losses.destroy_when_not_in_use()
             self._losses = None
-        self._middleware.forget(self, self._subscription)
+        self._middleware.remove(self, self._subscription)
 
 
 class Middleware:
@@ -217,7 +217,7 @@ class Middleware:
             self._nodes.append(self._new_node(self._names[len(self._nodes)], context))
         return self._nodes[-1]
 
-    def forget(self, subscription: Subscription, inner: Any) -> None:
+    def remove(self, subscription: Subscription, inner: Any) -> None:
         """Ends a subscription; only `Subscription.close` calls it.
 
         Args:

@@ -216,7 +216,7 @@ class PublicationGapDetector:
         self._jumped.clear()
         self._gaps.clear()
 
-    def keep_only(self, publishers: Collection[bytes]) -> None:
+    def retain(self, publishers: Collection[bytes]) -> None:
         """Forgets other publishers if there have been very many."""
         if len(self._last) > MAX_PUBLISHERS:
             self._last = {key: value for key, value in self._last.items() if key in publishers}

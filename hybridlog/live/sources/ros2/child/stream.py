@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _MAX_MESSAGES = 1000
 _BYTES_AT_ONCE = 8 << 20
 
-_DOUBT_S = 30.0
+_UNSURE_S = 30.0
 """Time after a new subscription in which durable messages may come again, seconds."""
 
 _REPAIR_NS = 4_000_000_000
@@ -79,7 +79,7 @@ class Stream:
         self.alone = len(offers) == 1
         self._old: Subscription | None = None
         self._old_until = 0.0
-        self._doubt_until = 0.0
+        self._unsure_until = 0.0
         self._gaps = PublicationGapDetector()
         self._middleware_losses = MiddlewareLossCounter()
         self._heads: list[Loss] = []
@@ -107,7 +107,7 @@ class Stream:
         tells_twice = self.named and self.numbered
         self._gaps.is_doubled = tells_twice
         self._old_until = now + seconds if tells_twice else now
-        self._doubt_until = now + _DOUBT_S
+        self._unsure_until = now + _UNSURE_S
 
     def close_old(self) -> None:
         """Closes the old subscription."""
@@ -257,7 +257,7 @@ class Stream:
 
     def _follow(self, offers: list[Offer]) -> None:
         """Updates the publishers."""
-        if self._old is None and time.monotonic() >= self._doubt_until:
+        if self._old is None and time.monotonic() >= self._unsure_until:
             self._gaps.is_doubled = False
         publishers = frozenset(offer.publisher for offer in offers)
         if not self.named:
@@ -267,7 +267,7 @@ class Stream:
             self.alone = same
         self._publishers = publishers
         self._reliable = _reliable(offers)
-        self._gaps.keep_only(publishers)
+        self._gaps.retain(publishers)
 
     def close(self) -> None:
         """Closes the subscriptions."""

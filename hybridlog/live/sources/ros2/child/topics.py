@@ -153,9 +153,9 @@ class Topics:
 
     def _adapt(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
         """Adapts a subscription to new publishers."""
-        asked, wanted = stream.subscription.profile, self._wanted(topic)
-        is_incompatible = any(conflicts(offer.profile, asked) for offer in topic.offers)
-        if wanted != asked and (is_incompatible or is_first):
+        requested, wanted = stream.subscription.profile, self._wanted(topic)
+        is_incompatible = any(conflicts(offer.profile, requested) for offer in topic.offers)
+        if wanted != requested and (is_incompatible or is_first):
             self._resubscribe(topic, stream, wanted)
 
     def _resubscribe(self, topic: Topic, stream: Stream, wanted: Profile) -> None:
