@@ -391,6 +391,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         has_losses=bool(losses),
         has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in losses),
         expired=expired_messages(entry),
+        notes=entry.notes,
         look=look,
     )
 

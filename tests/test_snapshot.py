@@ -52,6 +52,7 @@ def summary(number: int, span: tuple[int, int] | None, topics: list[str], **othe
         "has_losses": False,
         "has_lost_segments": False,
         "expired": 0,
+        "notes": [],
         "look": "",
         **other,
     }

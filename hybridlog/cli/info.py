@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
 
 
-_MAX_LINE = 100  # characters of a name and what follows it
 _MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
 _DRAWN_WORK = 1 << 20  # see `density`: little is read for a sparkline
 _LETTERS = 40  # of the coverage bar and of the longest sparkline
@@ -214,7 +213,6 @@ def _as_dict(
         "chunks": entry.chunks,
         "coverage": complete,
         "losses": losses_of(entry),
-        "notes": entry.notes,
         "marks": entry.marks,
         "pins": entry.pins,
         "attachments": [attachment_as_dict(each) for each in attachments],
@@ -392,10 +390,7 @@ def _content(attachment: StoredAttachment) -> str:
 
 def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
     """Rows of a table; the last one counts the lines that are left out."""
-    rows = [
-        (name, line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…")
-        for line in lines[:MAX_LISTED]
-    ]
+    rows = [(name, output.cut(line)) for line in lines[:MAX_LISTED]]
     more = len(lines) - len(rows)
     return [*rows, (name, f"and {more} more")] if more else rows
 

@@ -57,6 +57,8 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
+    if not narrow:
+        notes.extend(output.cut(note["text"]) for note in entry.notes)
     start = output.short_time(span[0], minutes=narrow) if span else "-"
     return [
         entry.label,
@@ -99,6 +101,7 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
         "topics": recording.topic_count,
         "messages": recording.messages,
         "expired": recording.expired,
+        "notes": recording.notes,
         "stored_bytes": recording.stored_bytes,
         "segments": recording.segments,
         "source": recording.source,

@@ -26,6 +26,7 @@ Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
 ROWS_AT_ONCE = 10_000
+_MAX_LINE = 100  # characters of a note, an attachment and the like
 """Rows of a table that are laid out together."""
 
 
@@ -232,6 +233,11 @@ def quoted(text: str) -> str:
     """Typed text in quotes; bytes that are not UTF-8 are shown as escapes."""
     raw = text.encode("utf-8", "surrogateescape")
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
+
+
+def cut(line: str) -> str:
+    """A line, cut off where it is longer than 100 characters."""
+    return line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…"
 
 
 def say(text: str = "") -> None:

@@ -116,6 +116,7 @@ def test_a_lost_journal_is_said_with_answers(damaged: Path) -> None:
 
 def test_info_shows_notes_and_marks(damaged: Path) -> None:
     run("edit", "part", "--note", "the wheel squeaks", store=damaged)
+    assert run("ls", "-r", "part", store=damaged).lines[1].endswith(", the wheel squeaks")
     run("mark", "bump", "-r", "part", "--at", "+1s", store=damaged)
     assert "note       the wheel squeaks" in run("info", "part", store=damaged).out
     told = run("info", "part", "--json", store=damaged).json
