@@ -684,7 +684,7 @@ def documented_classes() -> list[type]:
 
 @pytest.mark.parametrize("thing", documented_classes(), ids=lambda c: c.__name__)
 def test_every_public_name_is_described(thing: type) -> None:
-    text = sections(DOCS / "api.md", 2)[thing.__name__]
+    text = sections(DOCS / "api.md", 3)[thing.__name__]
     rows = dict(re.findall(r"^\| `(\w+)(\([^`]*\))?`", text, flags=re.MULTILINE))
     members = public(thing)
     if thing.__name__ == "LiveRecording":
@@ -725,6 +725,8 @@ def test_every_exported_name_is_described() -> None:
     for name in hl.__all__:
         assert f"`{name}" in text or f"hl.{name}" in text, name
     assert f"`open{spelled(hl.open)}`" in text
+    for family, shown in sections(DOCS / "api.md", 2).items():
+        assert "```python" in shown, f"{family} has no example"
 
 
 def test_every_error_is_described() -> None:
