@@ -392,6 +392,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in losses),
         expired=expired_messages(entry),
         notes=entry.notes,
+        lacks_payloads=entry.lacks_payloads,
         look=look,
     )
 
@@ -428,6 +429,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
         entry.notes = list(state.notes)
         entry.marks = list(state.marks)
         entry.pins = list(state.pins.values())
+        entry.lacks_payloads = state.lacks_payloads and bool(state.expired)
     entry.payloads = [asdict(file) for file in inventory.payloads.values()]
     return entry
 

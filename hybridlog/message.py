@@ -39,8 +39,8 @@ class Message:
         sequence: The sender's sequence number, 0 if unknown.
         seq: Arrival number in its recording.
         recording: Id of its recording.
-        state: `whole`; or `reduced` or `expired`, if its payload was dropped under pressure or
-            deleted to make room.
+        state: `whole`; or `reduced`, `expired` or `not_copied`, if its payload was dropped under
+            pressure, deleted to make room, or not copied yet.
     """
 
     __slots__ = (

@@ -161,8 +161,6 @@ def _extras(
     store: Store, entry: RecordingEntry
 ) -> tuple[list[StoredAttachment], list[StoredMetadata], str]:
     """Attachments and metadata records of a recording that can be read, and its completeness."""
-    from hybridlog.query.answers.lost import why_expired
-
     attachments: list[StoredAttachment] = []
     metadata: list[StoredMetadata] = []
     try:
@@ -170,8 +168,7 @@ def _extras(
         metadata = store.metadata(entry)
     except SegmentError as error:
         output.note(f"{entry.label}: {error}")
-    expired = why_expired(store.directory, [entry.label])
-    return attachments, metadata, coverage(entry, losses_of(entry), expired)
+    return attachments, metadata, coverage(entry, losses_of(entry))
 
 
 def _is_segment(what: str) -> bool:

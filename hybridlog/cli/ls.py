@@ -53,7 +53,10 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     span = entry.span
     notes = [] if entry.status == "complete" else [status_text(entry)]
     if entry.expired:
-        notes.append(f"{output.counted(entry.expired, 'payload')} deleted to make room")
+        from hybridlog.schema.states import CAUSES, expired_state
+
+        why = CAUSES[expired_state(entry)]
+        notes.append(f"{output.counted(entry.expired, 'payload')} {why}")
     if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
@@ -102,6 +105,7 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
         "messages": recording.messages,
         "expired": recording.expired,
         "notes": recording.notes,
+        "lacks_payloads": recording.lacks_payloads,
         "stored_bytes": recording.stored_bytes,
         "segments": recording.segments,
         "source": recording.source,

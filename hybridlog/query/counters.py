@@ -26,7 +26,7 @@ class Counters:
         chunks_read: Chunks read and decompressed.
         documents_read: Index documents received from MongoDB.
         reduced: Messages left out because only their fields are there.
-        expired: Those of them whose payloads were deleted to make room.
+        expired: Those of them whose payloads were deleted to make room, or not copied yet.
         lacking: Messages in the answer whose arrays are null, since only summaries are left.
         unreadable: Messages of the predicate's topics that do not fit their definition, or lack
             arrays that it asks for.
@@ -78,7 +78,7 @@ class Counters:
     def leave_out(self, messages: int, state: State) -> None:
         """Count messages that are left out since their payloads are gone."""
         self.reduced += messages
-        if state == "expired":
+        if state != "reduced":
             self.expired += messages
 
     @contextmanager

@@ -30,18 +30,19 @@ _MAX_NAME = 1000  # bytes
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
 
-def codec_for(channel: Channel) -> Codec:
+def codec_for(channel: Channel, expired: State = State.EXPIRED) -> Codec:
     """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
 
     Args:
         channel: The channel; its message encoding and schema determine the codec.
+        expired: State of its messages if their payloads have expired.
     """
     schema = channel.schema
     if state_of(channel.message_encoding) is State.EXPIRED:
         from hybridlog.schema.reduced_codec import ExpiredCodec
 
         encoding = encoding_of(channel.message_encoding, channel.metadata)
-        return ExpiredCodec(codec_for(replace(channel, message_encoding=encoding)))
+        return ExpiredCodec(codec_for(replace(channel, message_encoding=encoding)), expired)
     if schema is not None and has_hidden_fields(channel):
         return OpaqueCodec(
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "

@@ -200,12 +200,12 @@ class ExpiredCodec(ReducedCodec):
 
     Args:
         original: The codec of their payloads.
+        state: Their state.
     """
 
-    state = State.EXPIRED
-
-    def __init__(self, original: Codec) -> None:
+    def __init__(self, original: Codec, state: State) -> None:
         self._original = original
+        self.state = state
         self.indexed = original.indexed
         self.reason = original.reason
 

@@ -15,6 +15,7 @@ from hybridlog_storage.messages import EXPIRED, EXPIRED_IDS, ORIGINAL_ENCODING, 
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 
 class State(StrEnum):
@@ -32,20 +33,27 @@ class State(StrEnum):
     EXPIRED = "expired"
     """Without its payload, which was deleted to make room; its fields are stored."""
 
+    NOT_COPIED = "not_copied"
+    """Without its payload, which was not copied yet; its fields are stored."""
+
 
 CAUSES: Final = {
     State.REDUCED: "dropped under pressure",
     State.EXPIRED: "deleted to make room",
+    State.NOT_COPIED: "not copied yet (`hybridlog copy` without --only-fields brings it)",
 }
 """Reasons why messages have no payload."""
-NOT_COPIED: Final = "not copied yet (`hybridlog copy` without --only-fields brings it)"
-"""Reason why messages of a copy have expired that were sent without their payloads."""
 _STATES: Final = {REDUCED: State.REDUCED, EXPIRED: State.EXPIRED}
 
 
 def state_of(encoding: str) -> State:
     """The state of the messages of a channel, by its encoding; some may still be unreadable."""
     return _STATES.get(encoding, State.WHOLE)
+
+
+def expired_state(recording: RecordingEntry | RecordingSummary) -> State:
+    """The state of the expired messages of a recording: a copy may have been made without them."""
+    return State.NOT_COPIED if recording.lacks_payloads else State.EXPIRED
 
 
 def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:

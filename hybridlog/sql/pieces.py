@@ -302,6 +302,9 @@ class _TableRows:
             raise self._damaged(error) from error
         if len(expired):
             ours["state"] = _with_expired(ours["state"], ours["ref"], expired)
+        if self._source.entry.lacks_payloads and "state" in ours:
+            is_gone = pc.equal(ours["state"], State.EXPIRED.value)
+            ours["state"] = pc.if_else(is_gone, State.NOT_COPIED.value, ours["state"])
         yield Rows(ours, records, self._part.rows)
 
 

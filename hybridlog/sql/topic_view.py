@@ -354,7 +354,8 @@ class _Plan:
             return  # all are whole
         for found in pc.value_counts(states).to_pylist():
             state = State(found["values"])
-            if state is not State.WHOLE and (state is not State.EXPIRED or lacks_arrays):
+            is_told = lacks_arrays or state in {State.REDUCED, State.UNREADABLE}
+            if is_told and state is not State.WHOLE:
                 self._reading.remarks.absent[topic, state] += found["counts"]
 
 

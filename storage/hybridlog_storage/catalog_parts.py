@@ -22,7 +22,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.stopping import pause
 
-VERSION: Final = 6
+VERSION: Final = 7
 MAX_PART_BYTES: Final = 48 << 10
 """Size of a part from which it takes no more recordings."""
 SUMMARY: Final = "0-summary"

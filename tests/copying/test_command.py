@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 from pathlib import Path
@@ -9,7 +10,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.schema.states import State
+from hybridlog.view.context import Context
+from hybridlog.view.tools import recordings
+from hybridlog_storage.errors import PayloadError
 from tests.cli.running import run, started, wait_for
+from tests.cli.within import answer
 from tests.copying.conftest import answers
 from tests.json_schemas import misfit, schema_of
 
@@ -83,15 +89,38 @@ def test_copies_to_a_directory(
     assert run("copy", "nosuch", tmp_path / "x", "--store", robots, code=2).err
 
 
-def test_payloads_that_were_not_copied_yet_were_not_deleted(robots: Path, tmp_path: Path) -> None:
-    lab = tmp_path / "lab"
-    run("copy", "-r", "noted", "-r", "expired", lab, "--store", robots, "--only-fields")
-    for label, why in {"noted": "not copied yet (`hybridlog copy", "expired": "deleted"}.items():
-        told = f"no payload, which was {why}"
-        fetched = run("fetch", "cloud", "-r", label, "-o", tmp_path / f"{label}.mcap", store=lab)
-        assert told in fetched.err
-        assert told in " ".join(run("info", label, store=lab).out.split())
-        assert told in run("info", label, "--json", store=lab).json["coverage"]
+@pytest.mark.parametrize(
+    ("label", "state", "why"),
+    [
+        ("noted", State.NOT_COPIED, "not copied yet (`hybridlog copy"),
+        ("expired", State.EXPIRED, "deleted to make room"),
+    ],
+)
+def test_payloads_that_were_not_copied_yet_were_not_deleted(
+    robots: Path, tmp_path: Path, label: str, state: State, why: str
+) -> None:
+    lab, told = tmp_path / "lab", f"no payload, which was {why}"
+    run("copy", "-r", label, lab, "--store", robots, "--only-fields")
+    assert told in answer("fetch", "cloud", "-o", tmp_path / "cut.mcap", store=lab).err
+    assert told in " ".join(answer("info", label, store=lab).out.split())
+    assert told in answer("info", label, "--json", store=lab).json["coverage"]
+    assert f"payloads {why}" in " ".join(answer("ls", store=lab).out.split())
+    (listed,) = answer("ls", "--json", store=lab).json
+    assert listed["lacks_payloads"] == (state is State.NOT_COPIED)
+    verified = answer("verify", store=lab)
+    assert "to make room" not in verified.out + verified.err
+    with hl.open(lab, mongo="none") as store:
+        query = store.topic("/cloud")
+        (first,) = query.limit(1)
+        assert first.state is state
+        with pytest.raises(PayloadError, match=f"its payload was {re.escape(why)}"):
+            _ = first.raw
+        assert told in str(query.completeness())
+        assert why in recordings(Context(store), None).text
+        found = store.sql("select distinct state from cloud where state <> 'whole'")
+        assert found.to_arrow()["state"].to_pylist() == [state]
+    arrays = answer("sql", "select sum(len(data)) from cloud", store=lab)
+    assert why in " ".join(arrays.err.split())
 
 
 def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:

@@ -36,7 +36,8 @@ class Completeness:
             the range, all of it.
         is_exact: False if an unknown number is lost besides.
         reduced: Messages of which only the fields are stored.
-        expired: Those of them whose payloads were deleted to make room.
+        expired: Those of them whose payloads were deleted to make room, or not copied yet.
+        why_expired: Which of the two, in words.
         rows: Rows of the loss ledger, with the label of their `recording`.
         unwritten: Messages that a running recorder has taken and not written yet, which are not
             lost; None for an unknown number.
@@ -52,6 +53,7 @@ class Completeness:
     is_exact: bool
     reduced: int = 0
     expired: int = 0
+    why_expired: str = ""
     rows: tuple[Mapping[str, Any], ...] = ()
     unwritten: int | None = 0
     unindexed: int = 0
@@ -69,10 +71,12 @@ class Completeness:
         """The missing messages in words: `4 messages are lost`, and payloads by cause."""
         from hybridlog.schema.states import State, without_payload
 
-        gone = {State.REDUCED: self.reduced - self.expired, State.EXPIRED: self.expired}
-        return "; ".join(
-            [self._losses(), *(without_payload(count, why) for why, count in gone.items() if count)]
-        )
+        found, reduced = [self._losses()], self.reduced - self.expired
+        if reduced:
+            found.append(without_payload(reduced))
+        if self.expired:
+            found.append(without_payload(self.expired, State.EXPIRED, self.why_expired))
+        return "; ".join(found)
 
     def _losses(self) -> str:
         if not self.has_losses:
@@ -241,24 +245,21 @@ def line_of(loss: Mapping[str, Any]) -> str:
     return f"{lost}{loss['cause']}{':' if said else ''}{said}"
 
 
-def coverage(
-    entry: RecordingEntry, losses: Collection[Mapping[str, Any]], expired: str = ""
-) -> str:
+def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
     """The completeness of a recording in words: `complete`, or the number of missing messages.
 
     Args:
         entry: The recording.
         losses: Rows of its ledger.
-        expired: Why payloads have expired, if that is known.
     """
-    from hybridlog.schema.states import State, expired_messages, without_payload
+    from hybridlog.schema.states import expired_messages, expired_state, without_payload
 
     found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
     for cause, what in NOT_LOST.items():
         messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
         found += f"; {counted(messages, 'message')} {what}" if messages else ""
     messages = expired_messages(entry)
-    return found + (f"; {without_payload(messages, State.EXPIRED, expired)}" if messages else "")
+    return found + (f"; {without_payload(messages, expired_state(entry))}" if messages else "")
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:

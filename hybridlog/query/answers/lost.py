@@ -23,9 +23,8 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
-from hybridlog.schema.states import CAUSES, NOT_COPIED, State
-from hybridlog_storage import journal
-from hybridlog_storage.errors import HybridlogError, StoreError, TimeError
+from hybridlog.schema.states import CAUSES, State, expired_state
+from hybridlog_storage.errors import HybridlogError, TimeError
 from hybridlog_storage.settings import EXPIRED
 from hybridlog_storage.times import BEGIN, END, span_of
 
@@ -35,10 +34,8 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
-_MAX_JOURNALS = 100  # that are read for a reason
 _INTERVAL_S = 1.0  # flush interval of recorders that do not say it
 
 
@@ -71,7 +68,8 @@ def completeness_of(
         unindexed += lacks
         late += [not_indexed(lacks)] if lacks else []
         if cost is not None:
-            sentences += left_out(one, cost, _why_expired(session, one, cost))
+            is_short = cost.expired or cost.lacking or cost.without_arrays
+            sentences += left_out(one, cost, _why_expired(session, one) if is_short else "")
     by_recording: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     known: set[tuple[Any, ...]] = set()
     for rows in ledgers:  # a loss of unknown topics is in several
@@ -91,6 +89,7 @@ def completeness_of(
         reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
         + expired,
         expired=expired,
+        why_expired=_why_expired(session, question) if expired else "",
         rows=tuple(lost),
         unwritten=unwritten,
         unindexed=unindexed,
@@ -101,32 +100,12 @@ def completeness_of(
     )
 
 
-def _why_expired(session: Session, question: Question, cost: Counters) -> str:
+def _why_expired(session: Session, question: Question) -> str:
     """Why payloads that an answer lacks have expired: a copy may be waiting for them."""
-    if not (cost.expired or cost.lacking or cost.without_arrays):
-        return CAUSES[State.EXPIRED]
     summaries = session.snapshot().summaries
-    labels = [summaries[place].label for place in session.chosen(question).tolist()]
-    return why_expired(session.directory, labels)
-
-
-def why_expired(directory: StoreDirectory, labels: Sequence[str]) -> str:
-    """Why payloads of some recordings have expired."""
-    deleted = CAUSES[State.EXPIRED]
-    if directory.is_remote:
-        return deleted
-    either = f"{deleted}, or {NOT_COPIED}"
-    if len(labels) > _MAX_JOURNALS:
-        return either
-    waiting = set()
-    for label in labels:
-        with suppress(StoreError):
-            state = journal.read(directory.recording(label))
-            if state is not None and state.expired:
-                waiting.add(state.lacks_payloads)
-    if True not in waiting:
-        return deleted
-    return either if False in waiting else NOT_COPIED
+    chosen = [summaries[place] for place in session.chosen(question).tolist()]
+    states = {expired_state(one) for one in chosen if one.expired} or {State.EXPIRED}
+    return ", or ".join(CAUSES[state] for state in sorted(states))
 
 
 def _expired(session: Session, question: Question) -> int:
