@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.attachments import StoredAttachment, StoredMetadata
-    from hybridlog.contract.contract import Contract
+    from hybridlog.contract import Contract
     from hybridlog.contract.diff import Difference
     from hybridlog.contract.judge import Result
     from hybridlog.formats.reading import Source
@@ -621,7 +621,7 @@ class Store:
             UsageError: The contract cannot be read, or breaks its schema.
             TopicError: No such recording.
         """
-        from hybridlog.contract.contract import Contract
+        from hybridlog.contract import Contract
         from hybridlog.contract.judge import judge
 
         rules = contract if isinstance(contract, Contract) else Contract.read(contract)

@@ -27,7 +27,7 @@ from hybridlog import session as session_module
 from hybridlog.demo.write import write_bag
 from hybridlog.query import index_reader
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines.base import MatchColumns
+from hybridlog.query.engines import MatchColumns
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.index_reader import IndexReader

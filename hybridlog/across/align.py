@@ -11,8 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.across.bins import AGGREGATES, Aggregate, Bins, RegularTimes
-from hybridlog.across.interpolate import interpolated
-from hybridlog.across.match import HOWS, UNKNOWN, How, match
+from hybridlog.across.match import HOWS, UNKNOWN, How, interpolated, match
 from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, concatenated
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of

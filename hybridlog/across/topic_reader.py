@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.interpolate import quaternion_paths
-from hybridlog.across.match import UNKNOWN
+from hybridlog.across.match import UNKNOWN, quaternion_paths
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import lost_times

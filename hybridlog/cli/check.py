@@ -51,7 +51,7 @@ def check_command(given: _Check) -> None:
     Rate, jitter, longest gap and where it begins, late start, early stop and losses of each
     topic. No message is read.
     """
-    from hybridlog.contract.contract import Contract, contract_of
+    from hybridlog.contract import Contract, contract_of
 
     contract, make = given.contract, given.make
     if sum(map(bool, (contract, make))) > 1 or (given.junit and not contract):
@@ -164,7 +164,7 @@ def diff_command(given: _Diff) -> None:
     First what only one has: times and topics. Then types, messages, rates, gaps, losses, and
     statistics of fields of the time that both have. Exit code 12 if anything differs.
     """
-    from hybridlog.contract.contract import Contract, parse_share
+    from hybridlog.contract import Contract, parse_share
 
     rules = None if given.contract is None else Contract.read(given.contract)
     share = parse_share(given.tolerance)

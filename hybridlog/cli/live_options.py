@@ -29,7 +29,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         UsageError: A value is out of range.
         TopicError: A pattern that is malformed.
     """
-    from hybridlog.contract.contract import Contract
+    from hybridlog.contract import Contract
     from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions

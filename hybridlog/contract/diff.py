@@ -15,7 +15,7 @@ from hybridlog.record.marks import MARKS
 from hybridlog.wording import counted
 
 if TYPE_CHECKING:
-    from hybridlog.contract.contract import Contract
+    from hybridlog.contract import Contract
     from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.times import TimeLike

@@ -27,7 +27,7 @@ from hybridlog_storage.errors import WhereError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.contract.contract import Contract, TopicRules
+    from hybridlog.contract import Contract, TopicRules
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary

@@ -49,7 +49,7 @@ from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.messages import Channel
 
 if TYPE_CHECKING:
-    from hybridlog.contract.contract import Contract
+    from hybridlog.contract import Contract
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from hybridlog.query.times import format_duration
 
 if TYPE_CHECKING:
-    from hybridlog.contract.contract import Contract
+    from hybridlog.contract import Contract
 
 RULE: Final = "longest_gap"
 _MAX_INTERVAL_S: Final = 0.5

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybridlog.query.bounds import MIN_RECORDINGS, BoundsFinder, within_bounds
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
-from hybridlog.query.engines.base import Checking, Counting, Need, UndecidedError
+from hybridlog.query.engines import Checking, Counting, Need, UndecidedError
 from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.question import Part
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines.base import Engine, MatchColumns, Objects, Values
+    from hybridlog.query.engines import Engine, MatchColumns, Objects, Values
     from hybridlog.query.engines.running import RunningTables
     from hybridlog.query.engines.tables import ArraysEngine, TablesEngine
     from hybridlog.query.index_reader import IndexReader

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 
 from hybridlog.columns.fields import without
 from hybridlog.columns.rows import Messages, Piece, own_columns
-from hybridlog.query.engines.base import places_of
+from hybridlog.query.engines import places_of
 from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty

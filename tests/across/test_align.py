@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.across import align, topic_reader
-from hybridlog.across.interpolate import interpolated
-from hybridlog.across.match import UNKNOWN, match
+from hybridlog.across.match import UNKNOWN, interpolated, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings

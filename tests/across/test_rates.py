@@ -27,7 +27,7 @@ from hybridlog.query import periods
 from hybridlog.query.answers import rates
 from hybridlog.query.answers.field_statistics import _Running
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines.base import MatchColumns, Need
+from hybridlog.query.engines import MatchColumns, Need
 from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine

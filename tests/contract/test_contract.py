@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 import hybridlog as hl
-from hybridlog.contract.contract import MAX_RULES, Contract, contract_of
+from hybridlog.contract import MAX_RULES, Contract, contract_of
 from hybridlog.contract.judge import broken
 from hybridlog.formats.yaml_values import MAX_BYTES
 from hybridlog.query.topics import matcher

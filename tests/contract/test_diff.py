@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.contract.contract import Contract
+from hybridlog.contract import Contract
 from tests.cli.running import run
 from tests.data import DATA, needs_data
 from tests.some import EXHAUSTIVE

@@ -33,7 +33,7 @@ LINES = '{"log_time_ns": 1000000001, "topic": "/a", "x": 1.5}\nno line\n' + "".j
 HALF = """
 import json, sys
 import hybridlog as hl
-from hybridlog.query.engines.base import Need
+from hybridlog.query.engines import Need
 from hybridlog.query.planner import Planner
 
 with hl.open(sys.argv[1], create=True) as store:

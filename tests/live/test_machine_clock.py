@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 import hybridlog as hl
-from hybridlog.contract.contract import Contract, TopicRules
+from hybridlog.contract import Contract, TopicRules
 from hybridlog.live.clocks import MachineClock
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions

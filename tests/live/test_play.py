@@ -22,7 +22,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.contract.contract import Contract, TopicRules
+from hybridlog.contract import Contract, TopicRules
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.snapshots import SnapshotOptions, Trigger
 from hybridlog.maintenance.retention import MIN_SEGMENT

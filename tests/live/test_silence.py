@@ -15,7 +15,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.contract.contract import Contract, TopicRules
+from hybridlog.contract import Contract, TopicRules
 from hybridlog.contract.judge import broken
 from hybridlog.live.recorder import Recorder, RecorderOptions, state_of, summary_of
 from hybridlog.live.silence import SilenceWatch

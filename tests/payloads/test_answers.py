@@ -13,7 +13,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.columns import payload_writer as writer
-from hybridlog.query.engines.base import Need
+from hybridlog.query.engines import Need
 from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.segments.segment_writer import SegmentSettings

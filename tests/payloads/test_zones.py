@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.columns import payload_writer as writer
 from hybridlog.columns.zones import MAX_REGIONS, Zone, may_hold
-from hybridlog.query.engines.base import Need
+from hybridlog.query.engines import Need
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.schema.column import offsets

@@ -23,7 +23,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
-from hybridlog.query.engines.base import Engine
+from hybridlog.query.engines import Engine
 from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine

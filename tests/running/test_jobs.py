@@ -15,7 +15,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 import hybridlog as hl
-from hybridlog.contract.contract import contract_of
+from hybridlog.contract import contract_of
 from hybridlog.record.marks import MARKS, mark_channel, mark_payload
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel, Schema

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun, ScanPlan
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines.base import Engine
+    from hybridlog.query.engines import Engine
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry

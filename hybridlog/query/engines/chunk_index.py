@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_counts import Placed
-from hybridlog.query.engines.base import Counting, MatchColumns, Need
+from hybridlog.query.engines import Counting, MatchColumns, Need
 from hybridlog_storage.times import inside
 
 if TYPE_CHECKING:

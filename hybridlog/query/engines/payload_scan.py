@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
-from hybridlog.query.engines.base import MatchColumns, Need, Values
+from hybridlog.query.engines import MatchColumns, Need, Values
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, MessageRun
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines.base import Objects
+    from hybridlog.query.engines import Objects
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.schema.codec import Decoded

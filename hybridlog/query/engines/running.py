@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridlog.query.chunk_scan import RowSelection
-from hybridlog.query.engines.base import MatchColumns, Need, Values
+from hybridlog.query.engines import MatchColumns, Need, Values
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.message_filter import MessageFilter

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkKey, RowSelection
-from hybridlog.query.engines.base import (
+from hybridlog.query.engines import (
     MatchColumns,
     Need,
     UndecidedError,
