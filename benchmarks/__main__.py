@@ -1,4 +1,4 @@
-"""`python -m benchmarks STUDY …`: runs studies, keeps a journal, writes a report.
+"""`python -m benchmarks`: measures all that the results show, and writes their page.
 
 Imports nothing heavy: `--help` answers at once.
 """
@@ -7,23 +7,23 @@ from __future__ import annotations
 
 import argparse
 import fcntl
-import json
 import os
+import re
 import shlex
+import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, fields, replace
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from benchmarks.samples import NAME, Journal
+from benchmarks.progress import Progress
+from benchmarks.samples import NAME, Journal, Scale
+from benchmarks.side import SideError
 from hybridlog.cli import signals
 from hybridlog.cli.app import of_os_error
-from hybridlog.cli.output import note, parse_size, print_table, printable
+from hybridlog.cli.output import note, printable
 from hybridlog_storage.errors import HybridlogError, UsageError
 from hybridlog_storage.stopping import anywhere, at_safe_points
 
@@ -31,57 +31,100 @@ if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
     from benchmarks.studies.runs import Context
 
-PARTS = {
-    "throughput": "benchmarks.studies.throughput",
-    "ceilings": "benchmarks.studies.ceiling",
-    "persistence": "benchmarks.studies.persistence",
-    "speed-up": "benchmarks.studies.speed_up",
-    "queries": "benchmarks.studies.queries",
-    "reading": "benchmarks.studies.reading",
-}
-"""Modules with `STUDY`, `Settings` and `run`, in the order of a run."""
-STUDIES = {
-    "throughput": ("throughput", "ceilings"),
-    "persistence": ("persistence", "speed-up"),
-    "queries": ("queries", "reading"),
-    "all": tuple(PARTS),
-}
-_OPTIONS = ("sizes", "rates", "messages", "topics", "seconds", "logs", "log_seconds", "repetitions")
-"""Options that change a setting of that name in each part that has it."""
-_MAY_GROW = frozenset({"sizes", "rates", "backends", "repetitions", "logs", "made"})
-"""Settings that say which runs there are, and nothing about what one run is."""
-_LARGEST = 1 << 30
+ROOT = Path(__file__).parents[1]
+PAGE = "benchmarks.md"
+README = "readme.md"
+BUDGET: Mapping[Scale, float] = {"full": 55.0, "quick": 18.0, "tiny": 0.0}
+"""Minutes; a search is repeated only where that fits."""
 _EPILOG = """\
-studies:
-  throughput   study 1: what is kept of uniform streams; then each backend's ceiling
-  persistence  study 2: what is kept of logs; then played faster until something is lost
-  queries      study 3: the same questions to every system; then slices and whole tables
-  all          the three
-  report       draw the report again, from the journal
-  live         recording a running robot under load, beside `rosbag record`
+parts:
+  tasks    commands, SQL, many recordings, the page and training windows on our stores
+  queries  the paper's questions to every system
+  reading  slices, messages at a time and whole tables from every system
+  live     recording a running robot, beside `rosbag record` where that is installed
+  logs     the log of a robot, played faster until something is lost
+  record   streams of messages: the largest load of which nothing is lost
 
-exit codes: 0 done; 1 a run failed, or answers differ; 2 wrong usage; 3 a log cannot be read;
-130 Ctrl-C. The same command goes on where it stopped. Try `all --quick` first.
+It takes less than an hour and 20 GB of disk; --quick takes 20 minutes. The same command goes on
+where it stopped, and does again what failed. --docs writes docs/benchmarks.md, its samples and
+the table of README.md.
+
+exit codes: 0 done; 1 something failed, or answers differ; 2 wrong usage; 130 Ctrl-C.
 """
 
 
-class Part(NamedTuple):
-    """A part of a run with its settings."""
+class Piece(NamedTuple):
+    """A part of a run that is done as a whole.
 
+    Attributes:
+        part: The part that it belongs to.
+        name: For people.
+        minutes: It may take, by scale.
+        run: Does it.
+        is_extra: It repeats a search, and is left out when there is no time for it.
+    """
+
+    part: str
     name: str
-    module: ModuleType
-    settings: Any
+    minutes: Mapping[Scale, float]
+    run: Callable[[Context], None]
+    is_extra: bool = False
+
+
+def pieces() -> list[Piece]:
+    """All of a run, in its order."""
+    from benchmarks.live import cases
+    from benchmarks.studies import logs, queries, reading, record, tasks
+
+    def minutes(full: float, quick: float) -> Mapping[Scale, float]:
+        return {"full": full, "quick": quick, "tiny": 0.1}
+
+    def task(group: str) -> Piece:
+        times = {"commands": (4.0, 1.5), "many": (2.0, 1.5)}.get(group, (0.5, 0.3))
+        return Piece("tasks", group, minutes(*times), lambda context: tasks.run(context, group))
+
+    def case(name: str) -> Piece:
+        times = {"robot": (2.7, 0.8), "kills": (2.0, 0.4), "database": (1.3, 0.6)}
+        each = minutes(*times.get(name, (0.8, 0.4)))
+        return Piece("live", name, each, lambda context: cases.run(context, name))
+
+    def play(repetition: int) -> Piece:
+        each = minutes(4.5, 1.8)
+        again = repetition > 0
+        return Piece("logs", "logs", each, lambda c: logs.run(c, repetition), is_extra=again)
+
+    def stream(size: int, repetition: int) -> Piece:
+        each = minutes(6.0, 2.7)
+        name = f"record {size // 1000} kB"
+        again = repetition > 0
+        return Piece(
+            "record", name, each, lambda c: record.run(c, size, repetition), is_extra=again
+        )
+
+    return [
+        *map(task, tasks.GROUPS),
+        Piece("queries", "queries", minutes(5.0, 1.5), queries.run),
+        Piece("reading", "reading", minutes(2.5, 1.0), reading.run),
+        *map(case, cases.CASES),
+        play(0),
+        *(stream(size, 0) for size in record.SIZES),
+        *(stream(size, 1) for size in record.SIZES),
+        play(1),
+    ]
+
+
+PARTS = ("tasks", "queries", "reading", "live", "logs", "record")
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run a command; returns the exit code."""
-    if arguments and arguments[0] == "live":
-        return int(import_module("benchmarks.live.command").main(list(arguments[1:])))
+    """Run the command; returns the exit code."""
     signals.install()
     try:
         # Wherever it stops, the processes of a run are ended and the journal is closed.
         with at_safe_points(), anywhere():
-            return _do(_parser().parse_args(arguments), ["python", "-m", "benchmarks", *arguments])
+            chosen = _parser().parse_args(arguments)
+            command = ["python", "-m", "benchmarks", *arguments]
+            return _draw(chosen) if chosen.render else _run(chosen, command)
     except HybridlogError as error:
         print(f"benchmarks: {printable(str(error))}", file=sys.stderr)
         return error.exit_code
@@ -94,70 +137,79 @@ def main(arguments: Sequence[str]) -> int:
         return of_os_error(error)
 
 
-def _do(chosen: argparse.Namespace, command: list[str]) -> int:
-    if chosen.list_backends:
-        return _list_backends()
-    return _draw(chosen.out) if chosen.study == "report" else _run(chosen, command)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "python -m benchmarks",
-        description="Measure what databases, files and hybridlog keep of a robot's messages.",
+        description="Measure hybridlog beside databases and files, and write the page about it.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("study", nargs="?", choices=[*STUDIES, "report"], default="all", metavar="STUDY")
-    add("--only", action="append", choices=list(PARTS), help="only this part; repeatable")
-    add("--quick", action="store_true", help="few messages, the ends of each axis: minutes")
-    add("-b", "--backends", metavar="NAME,…", help="only these")
-    add("--list-backends", action="store_true", help="and whether they can run here")
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument(
+        "--quick", dest="scale", action="store_const", const="quick", help="in 20 minutes"
+    )
+    scale.add_argument(
+        "--tiny", dest="scale", action="store_const", const="tiny", help="only see that it works"
+    )
+    parser.set_defaults(scale="full")
+    add("--only", action="append", choices=PARTS, help="only this part; repeatable")
+    add("-b", "--backends", metavar="NAME,…", help="only these systems")
     add("-o", "--out", type=Path, default=Path("benchmark-results"), metavar="DIR")
     add("--work", type=Path, metavar="DIR", help="where loads are kept and data goes")
     add("--restart", action="store_true", help="set the journal aside that is there")
-    add("--seed", type=_count, default=1, metavar="N", help="of all loads (1)")
-    add("-n", "--repetitions", type=_count, metavar="N", help="of every run")
-    add("--sizes", type=_sizes, metavar="SIZE,…", help="of messages, such as 5kB,640kB")
-    add("--rates", type=_rates, metavar="HZ,…", help="of a topic, such as 4,64")
-    add("--messages", type=_count, metavar="N", help="of a topic (500)")
-    add("--topics", type=_count, metavar="N", help="(20)")
-    add("--seconds", type=_seconds, metavar="S", help="of a trial that looks for a ceiling")
-    add("-l", "--logs", type=Path, action="append", metavar="FILE", help="publish this log")
-    add("--no-made", action="store_true", help="publish no logs that are made")
-    add("--log-seconds", type=_seconds, metavar="S", help="most of each log (60)")
-    add("--speed", type=_seconds, default=1.0, metavar="N", help="times as fast as recorded")
+    add("--seed", type=int, default=1, metavar="N", help="of all loads (1)")
+    add("--docs", action="store_true", help="write the page and README.md of this checkout")
+    add("--render", action="store_true", help="measure nothing: write what the journal shows")
     return parser
 
 
-def _count(text: str) -> int:
-    number = int(text)
-    if not 0 < number <= 10**7:
-        raise argparse.ArgumentTypeError("1 to 10000000")
-    return number
+# --- a run ----------------------------------------------------------------------------
 
 
-def _seconds(text: str) -> float:
-    number = float(text)
-    if not 1e-3 <= number < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0.001 and 1000000")
-    return number
+def _run(chosen: argparse.Namespace, command: list[str]) -> int:
+    backends = _backends(chosen.backends)
+    planned = [piece for piece in pieces() if not chosen.only or piece.part in chosen.only]
+    scale: Scale = chosen.scale
+    with ExitStack() as stack:
+        stack.enter_context(_locked(chosen.out))
+        journal = _journal(chosen)
+        work = _work(chosen.work, stack)
+        header = _header(chosen, command, work)
+        _check_settings(journal, header, chosen.out)
+        first = [(piece.name, piece.minutes[scale]) for piece in planned if not piece.is_extra]
+        progress = Progress([*first, ("repetitions", 0.0)])
+        context = _context(journal, work, backends, chosen, progress)
+        done = sum(sample.status == "ok" for sample in journal.samples.values())
+        if done:
+            note(f"benchmarks: going on with {journal.path}: {done} samples are there")
+        journal.begin(header)
+        try:
+            failures = _pieces(context, planned, BUDGET[scale])
+        except signals.Stopped as stopped:
+            again = shlex.join(word for word in command if word != "--restart")
+            stopped.consequence = f"What was measured is in {journal.path}.\nTo go on: {again}"
+            raise
+        return max(_write(journal, chosen), int(failures))
 
 
-def _rates(text: str) -> list[float]:
-    return sorted({_seconds(word.strip().removesuffix("Hz")) for word in text.split(",")})
-
-
-def _sizes(text: str) -> list[int]:
-    from benchmarks.loads.streams import MIN_SIZE
-
-    try:
-        found = sorted({parse_size(word.strip()) for word in text.split(",")})
-    except UsageError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    if not MIN_SIZE <= found[0] <= found[-1] <= _LARGEST:
-        raise argparse.ArgumentTypeError(f"a message has {MIN_SIZE} to {_LARGEST} bytes")
-    return found
+def _pieces(context: Context, planned: Sequence[Piece], budget: float) -> bool:
+    """Do the pieces of a run; returns whether any broke off."""
+    is_broken, number = False, 0
+    for piece in planned:
+        if piece.is_extra:
+            if context.progress.minutes + piece.minutes[context.scale] > budget:
+                continue
+            number = len(context.progress.pieces) - 1
+        context.progress.begin(number)
+        try:
+            piece.run(context)
+        except (HybridlogError, SideError, RuntimeError, ValueError, ImportError) as error:
+            # The others go on; the same command tries this one again.
+            context.progress.say(f"{piece.name} FAILED: {printable(str(error))}")
+            is_broken = True
+        number += 1
+    return is_broken
 
 
 def _backends(names: str | None) -> dict[str, type[Backend]]:
@@ -168,74 +220,6 @@ def _backends(names: str | None) -> dict[str, type[Backend]]:
         if name not in BACKENDS:
             raise UsageError(f"There is no backend {name!r}; there are {', '.join(BACKENDS)}.")
     return {name: kind for name, kind in BACKENDS.items() if name in chosen}
-
-
-def _missing_reason(kind: type[Backend]) -> str:
-    from benchmarks.backends.base import BackendMissingError
-
-    try:
-        kind.check()
-    except BackendMissingError as error:
-        return str(error)
-    return ""
-
-
-def _list_backends() -> int:
-    found = [(name, _missing_reason(k) or "yes", k.about) for name, k in _backends(None).items()]
-    print_table((("name", "whole"), ("runs here", "left"), ("about", "left")), found)
-    return 0
-
-
-# --- a run ----------------------------------------------------------------------------
-
-
-def _run(chosen: argparse.Namespace, command: list[str]) -> int:
-    backends = _backends(chosen.backends)
-    planned = [_part(name, chosen) for name in STUDIES[chosen.study]]
-    planned = [part for part in planned if not chosen.only or part.name in chosen.only]
-    if not planned:
-        raise UsageError(f"--only leaves nothing of {chosen.study}.")
-    with ExitStack() as stack:
-        stack.enter_context(_locked(chosen.out))
-        journal = _journal(chosen)
-        work = _work(chosen.work, stack)
-        header = _header(chosen, planned, command, work)
-        _check_settings(journal, header, chosen.out)
-        context = _context(journal, work, backends, chosen)
-        done = sum(sample.status == "ok" for sample in journal.samples.values())
-        if done:
-            note(f"benchmarks: going on with {journal.path}: {done} runs are not done again")
-        journal.begin(header)
-        try:
-            for part in planned:
-                speed = chosen.speed if part.name == "persistence" else 1.0
-                part.module.run(replace(context, speed=speed), part.settings)
-        except signals.Stopped as stopped:
-            again = shlex.join(word for word in command if word != "--restart")
-            done = sum(sample.status == "ok" for sample in journal.samples.values())
-            drawing = shlex.join([*command[:3], "report", "--out", str(chosen.out)])
-            stopped.consequence = (
-                f"{done} runs so far.\nTo go on: {again}\nTo draw what is there: {drawing}"
-            )
-            raise
-        return _report(journal, chosen.out)
-
-
-def _part(name: str, chosen: argparse.Namespace) -> Part:
-    """A part with its own settings, changed by the options that it has."""
-    module = import_module(PARTS[name])
-    settings = module.Settings.usual(quick=chosen.quick)
-    asked = {option: getattr(chosen, option) for option in _OPTIONS}
-    for log in chosen.logs or ():
-        if not log.exists():
-            raise UsageError(f"{log}: there is no such file.")
-    asked["logs"] = tuple(log.resolve() for log in chosen.logs or ()) or None
-    asked["made"] = () if chosen.no_made else None
-    names = {field.name for field in fields(settings)}
-    changed = {k: value for k, value in asked.items() if value is not None and k in names}
-    if name in {"queries", "reading"}:
-        changed.pop("seconds", None)  # the length of their load, not of a trial
-    return Part(name, module, replace(settings, **changed))
 
 
 @contextmanager
@@ -273,7 +257,7 @@ def _read(out: Path) -> Journal:
     try:
         return Journal(out)
     except ValueError as error:
-        raise UsageError(f"{out / NAME} is no journal of these studies ({error}).") from None
+        raise UsageError(f"{out / NAME} is no journal of these benchmarks ({error}).") from None
 
 
 def _work(asked: Path | None, stack: ExitStack) -> Path:
@@ -283,38 +267,22 @@ def _work(asked: Path | None, stack: ExitStack) -> Path:
     return asked.resolve()
 
 
-def _header(
-    chosen: argparse.Namespace, planned: Sequence[Part], command: list[str], work: Path
-) -> dict[str, Any]:
+def _header(chosen: argparse.Namespace, command: list[str], work: Path) -> dict[str, Any]:
     from benchmarks.machine import describe
 
-    # A journal gives tuples back as lists, and paths as text.
-    settings = {part.module.STUDY: asdict(part.settings) for part in planned}
-    settings = json.loads(json.dumps(settings, default=str))
-    if "persistence" in settings:
-        settings["persistence"]["speed"] = chosen.speed
-    about = {"quick": chosen.quick, "seed": chosen.seed, "settings": settings, "command": command}
-    return {"benchmark": "studies", **about, **describe(work)}
+    about = {"scale": chosen.scale, "seed": chosen.seed, "command": command}
+    return {**about, **describe(work)}
 
 
 def _check_settings(journal: Journal, header: Mapping[str, Any], out: Path) -> None:
     """Refuse to add runs that are another measurement than those of the journal."""
-
-    def sense(of: Mapping[str, Any]) -> dict[str, Any]:
-        found = {name: of[name] for name in ("quick", "seed") if name in of}
-        for study, values in of.get("settings", {}).items():
-            kept = {f"{study} {k}": v for k, v in values.items() if k not in _MAY_GROW}
-            found.update(kept)
-        return found
-
-    new = sense(header)
-    for old in map(sense, journal.headers if journal.samples else ()):
-        for name, value in new.items():
-            if name in old and old[name] != value:
+    for old in journal.headers if journal.samples else ():
+        for name in ("scale", "seed"):
+            if old[name] != header[name]:
                 raise UsageError(
-                    f"The results in {out} were taken with {name} {old[name]}, now it is {value}. "
-                    "Give the same options again to go on, --out DIR for a second set, or "
-                    "--restart to begin anew."
+                    f"The results in {out} were taken with {name} {old[name]}, now it is "
+                    f"{header[name]}. Give the same options again to go on, --out DIR for a "
+                    "second set, or --restart to begin anew."
                 )
 
 
@@ -323,36 +291,55 @@ def _context(
     work: Path,
     backends: Mapping[str, type[Backend]],
     chosen: argparse.Namespace,
+    progress: Progress,
 ) -> Context:
+    from benchmarks.backends.base import BackendMissingError
     from benchmarks.studies.runs import Context
 
-    missing = {name: reason for name, kind in backends.items() if (reason := _missing_reason(kind))}
-    for name, reason in missing.items():
-        note(f"benchmarks: {name} is left out: {reason}")
-    quick, seed = chosen.quick, chosen.seed
-    return Context(work, backends, journal, quick=quick, seed=seed, missing=missing)
+    missing = {}
+    for name, kind in backends.items():
+        try:
+            kind.check()
+        except BackendMissingError as error:
+            missing[name] = str(error)
+            note(f"benchmarks: {name} is left out: {error}")
+    scale, seed = chosen.scale, chosen.seed
+    return Context(work, backends, journal, scale, seed, progress, missing)
 
 
-# --- a report -------------------------------------------------------------------------
+# --- the page -------------------------------------------------------------------------
 
 
-def _draw(out: Path) -> int:
-    if not (out / NAME).is_file():
-        raise UsageError(f"{out} holds no results ({NAME}); --out DIR says where they are.")
-    return _report(_read(out), out)
+def _draw(chosen: argparse.Namespace) -> int:
+    if not (chosen.out / NAME).is_file():
+        raise UsageError(f"{chosen.out} holds no results ({NAME}); --out DIR says where they are.")
+    return _write(_read(chosen.out), chosen)
 
 
-def _report(journal: Journal, out: Path) -> int:
-    from benchmarks.report import write
+def _write(journal: Journal, chosen: argparse.Namespace) -> int:
+    from benchmarks import page
 
-    report, path = write(journal, out)
-    for text in report.findings:
-        print(f"* {printable(text)}")
-    for one in report.failed:
+    if not journal.headers:
+        raise UsageError("Nothing has been measured yet.")
+    text, table = page.page(journal), page.readme(journal)
+    for name, content in ((PAGE, text), (README, table + "\n")):
+        (chosen.out / name).write_text(content, encoding="utf-8")
+    if chosen.docs:
+        (ROOT / "docs" / PAGE).write_text(text, encoding="utf-8")
+        results = ROOT / "docs" / "benchmarks-results"
+        results.mkdir(exist_ok=True)
+        shutil.copyfile(journal.path, results / NAME)
+        readme = ROOT / "README.md"
+        old = re.escape(page.BEGIN) + ".*" + re.escape(page.END)
+        new, count = re.subn(old, lambda _: table, readme.read_text("utf-8"), flags=re.DOTALL)
+        if count != 1:
+            raise UsageError(f"{readme} lacks {page.BEGIN} or {page.END}.")
+        readme.write_text(new, encoding="utf-8")
+    results_ = page.Results(journal)
+    for one in results_.failed:
         print(f"FAILED {one.study}, {one.backend}: {printable(one.reason)}")
-    note(f"benchmarks: wrote {path}")
-    sys.stdout.flush()
-    return 1 if report.failed or report.differing else 0
+    note(f"benchmarks: wrote {chosen.out / PAGE}{', the page and README.md' * chosen.docs}")
+    return int(bool(results_.failed))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from math import floor, isfinite, log10
 from statistics import median
 from typing import NamedTuple
@@ -15,18 +15,12 @@ FLOORS = frozenset({"nothing", "mcap", "bagfile"})
 
 TITLES = {
     OURS: "hybridlog",
-    "hybridlog_recorder": "hybridlog (recorder)",
-    "hybridlog_api": "hybridlog (its own API)",
-    "hybridlog_indexed": "hybridlog (indexed)",
-    "hybridlog_api_indexed": "hybridlog (its own API, indexed)",
-    "mongo_json": "MongoDB",
-    "mongo_json_indexed": "MongoDB (indexed)",
-    "mongo_json_batched": "MongoDB (batched)",
-    "postgres_autocommit": "PostgreSQL (autocommit)",
-    "postgres_tuned": "PostgreSQL (tuned)",
-    "postgres_tuned_indexed": "PostgreSQL (tuned, indexed)",
-    "sqlite_udf": "SQLite (Python functions)",
-    "sqlite_json1": "SQLite (JSON1)",
+    "mongo": "MongoDB",
+    "mongo_indexed": "MongoDB",
+    "postgres": "PostgreSQL",
+    "postgres_indexed": "PostgreSQL",
+    "sqlite": "SQLite",
+    "sqlite_indexed": "SQLite",
     "bagfile": "ROS bag",
     "mcap": "plain MCAP",
     "nothing": "harness alone",
@@ -57,11 +51,6 @@ def ordered(backends: Iterable[str]) -> list[str]:
     """Backends in the order of every table: ours, the paper's, the rest."""
     places = {name: place for place, name in enumerate(TITLES)}
     return sorted(set(backends), key=lambda name: (places.get(name, len(places)), name))
-
-
-def databases(backends: Iterable[str]) -> list[str]:
-    """Those that can be asked and are not ours."""
-    return [n for n in ordered(backends) if n not in FLOORS and not n.startswith(OURS)]
 
 
 def number(value: float) -> str:
@@ -96,22 +85,3 @@ def percent(value: float) -> str:
         if float(shown) < 100:
             return shown.rstrip("0").rstrip(".")
     return "99.9999"
-
-
-def with_spread(value: Spread) -> str:
-    """`12.3 (11.9…12.8)`; a spread of less than a hundredth of the median is left out."""
-    low, middle, high = map(number, (value.low, value.median, value.high))
-    if low == high or value.high - value.low < 0.01 * abs(value.median):
-        return middle
-    return f"{middle} ({low}…{high})"
-
-
-def percents(value: Spread) -> str:
-    """`98.1 (97…99)`, in percent."""
-    low, middle, high = map(percent, (value.low, value.median, value.high))
-    return middle if low == high else f"{middle} ({low}…{high})"
-
-
-def listed(names: Sequence[str]) -> str:
-    """`a`, `a and b`, `a, b and c`."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))

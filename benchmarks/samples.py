@@ -18,9 +18,9 @@ from typing import Any, Literal
 from benchmarks.disturbance import share_taken
 
 Status = Literal["ok", "missing", "failed"]
+Scale = Literal["full", "quick", "tiny"]
+"""How much is measured: for publication, in a third of the time, or only that it works."""
 NAME = "samples.jsonl"
-DAMAGE = "damage"
-"""Value of a sample of a log that could not be read whole: what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Sample:
     """One run of one backend.
 
     Attributes:
-        study: `throughput`, `ceiling`, `persistence`, `speed-up`, `queries`, `reading`.
+        study: Name of the part, such as `record`.
         case: What was asked of it, by name: `{"size": 5000, "rate": 4}`.
         backend: Name of the backend.
         repetition: From 0.
@@ -119,13 +119,6 @@ class Journal:
     def successes(self, sample: Sample) -> int:
         """How often a run has been done to its end."""
         return self._successes[sample.key]
-
-    def settings_of(self, sample: Sample) -> Mapping[str, Any]:
-        """Settings of the study of a sample, in the run in which it was taken."""
-        run = self.runs[sample.key]
-        settings = self.headers[run].get("settings") if run >= 0 else None
-        found = settings.get(sample.study) if isinstance(settings, dict) else None
-        return found if isinstance(found, dict) else {}
 
     def _keep(self, sample: Sample) -> None:
         if sample.status == "ok":

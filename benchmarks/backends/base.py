@@ -35,14 +35,11 @@ class Backend(ABC):
         name: As on the command line and in tables.
         about: One line: what it is and how it is set up.
         kind: `file`, `database`, `hybrid` (both), or `none` (keeps nothing).
-        intake: `threads`: a thread and a queue of ten a topic, as in the paper; `single`:
-            one thread takes in everything.
     """
 
     name: ClassVar[str]
     about: ClassVar[str]
     kind: ClassVar[Kind]
-    intake: ClassVar[Literal["threads", "single"]] = "threads"
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory

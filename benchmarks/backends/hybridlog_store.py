@@ -135,18 +135,6 @@ class Hybridlog(Backend):
         return working_below(self.path, "mongod") if self._opened is not None else ()
 
 
-class HybridlogRecorder(Hybridlog):
-    """The same without a thread and a queue of ten a topic: one thread takes in everything.
-
-    Before it 512 MiB may wait, and it waits itself when the memory budget is spent, where
-    a recorder would give up payloads.
-    """
-
-    name = "hybridlog_recorder"
-    about = "hybridlog with one thread that takes in everything instead of the queues"
-    intake = "single"
-
-
 @contextmanager
 def _no_linger() -> Iterator[None]:
     """Let a mongod that is started here end with its last user, not seconds later."""

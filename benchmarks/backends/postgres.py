@@ -1,4 +1,4 @@
-"""PostgreSQL with messages as JSON: as it comes, tuned, and tuned and indexed."""
+"""PostgreSQL with messages as JSON: tuned, and tuned and indexed."""
 
 from __future__ import annotations
 
@@ -62,15 +62,46 @@ def expression(path: str, column: str = "data") -> str:
     return f"(({'->'.join([column, *outer])}->>{last})::{kind})"
 
 
-class PostgresAutocommit(DatabaseBackend):
-    """A server of its own with its default settings; each message is a transaction.
+@dataclass(slots=True)
+class _Batch:
+    """One channel's transaction, to which its messages go as they come."""
 
-    One connection a channel, made before the first message. `max_connections` alone is
-    raised, and only when there are more channels than connections.
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    copy: Copy | None = None
+    ending: ExitStack = field(default_factory=ExitStack)
+    texts: list[str] = field(default_factory=list)
+    size: int = 0
+    since: float = 0.0
+
+    def give_up(self, why: BaseException) -> None:
+        """Take back what it was given."""
+        import psycopg
+
+        self.copy = None
+        with suppress(psycopg.Error):
+            self.ending.__exit__(type(why), why, why.__traceback__)
+
+
+class Postgres(DatabaseBackend):
+    """A server of its own, tuned as in the paper, and as PostgreSQL's documentation says.
+
+    `shared_buffers` is a quarter and `effective_cache_size` three quarters of the memory.
+    For loading: `max_wal_size` of 4 GB (fewer checkpoints), `wal_level = minimal` and
+    `max_wal_senders = 0` (nobody replicates), and COPY: one of 2 s or 16 MiB of messages,
+    which are handed over as they come, is a transaction. Commits stay synchronous. Small
+    messages go in three times as fast with COPY as with `executemany`, large ones as fast.
+
+    One connection a channel, made before the first message; `max_connections` is raised
+    only when there are more channels than connections.
+
+    The column is `json`, as in the paper; `postgres_indexed` has `jsonb`.
     """
 
-    name = "postgres_autocommit"
-    about = "PostgreSQL: json, one table a topic, one insert and one transaction a message"
+    name = "postgres"
+    about = (
+        "PostgreSQL: json, shared_buffers 25 % and effective_cache_size 75 % of memory, "
+        "max_wal_size 4 GB, wal_level minimal, one COPY and transaction for 2 s or 16 MiB"
+    )
 
     _type: ClassVar[str] = "json"
     _is_indexed: ClassVar[bool] = False
@@ -80,6 +111,8 @@ class PostgresAutocommit(DatabaseBackend):
         self._server = Server("postgres", directory)
         self._inserts: list[Composed] = []
         self._connections: list[Connection] = []
+        self._batches: list[_Batch] = []
+        self._copies: list[Composed] = []
 
     @classmethod
     def check(cls) -> None:
@@ -106,19 +139,21 @@ class PostgresAutocommit(DatabaseBackend):
         self.check()
         self._take_channels(channels)
         needed = len(channels) + _SPARE_CONNECTIONS
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         settings: dict[str, str | int] = {
             "max_connections": max(_DEFAULT_CONNECTIONS, needed),
-            **self._settings(),
+            "shared_buffers": f"{memory // 4 // _MIB}MB",
+            "effective_cache_size": f"{memory * 3 // 4 // _MIB}MB",
+            "max_wal_size": "4GB",
+            "wal_level": "minimal",
+            "max_wal_senders": 0,
         }
         programs = postgres_server.find_programs()
         postgres_server.start(programs, self._server, self.directory / "postgres", settings)
         self._make_tables()
         for _ in channels:
             self._connections.append(self.connect())
-
-    def _settings(self) -> dict[str, str | int]:
-        """Settings that are not the default ones."""
-        return {}
+        self._batches = [_Batch() for _ in channels]
 
     def _make_tables(self) -> None:
         import psycopg
@@ -132,6 +167,10 @@ class PostgresAutocommit(DatabaseBackend):
                 raise _failed(error) from error
         self._inserts = [
             SQL("INSERT INTO {} (data) VALUES (%s)").format(Identifier(table_of(channel.topic)))
+            for channel in self._channels
+        ]
+        self._copies = [
+            SQL("COPY {} (data) FROM STDIN").format(Identifier(table_of(channel.topic)))
             for channel in self._channels
         ]
 
@@ -157,7 +196,15 @@ class PostgresAutocommit(DatabaseBackend):
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         text = self._text(channel, log_time, payload)
-        self._insert_one(channel, text)
+        batch = self._batches[channel]
+        with batch.lock:
+            with self._one_by_one(channel, batch):
+                copy = batch.copy or self._begin(channel, batch)
+                batch.texts.append(text)
+                batch.size += len(text)
+                copy.write_row((text,))
+            if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
+                self._commit(channel, batch)
 
     def _text(self, channel: int, log_time: int, payload: bytes) -> str:
         return self._converters[channel].text(log_time, payload)
@@ -173,7 +220,9 @@ class PostgresAutocommit(DatabaseBackend):
             raise _failed(error) from error
 
     def finish(self) -> None:
-        """Nothing is left to do: a commit that has returned is on the disk."""
+        for channel, batch in enumerate(self._batches):
+            with batch.lock:
+                self._commit(channel, batch)
 
     def counts(self) -> Mapping[str, int]:
         import psycopg
@@ -191,6 +240,9 @@ class PostgresAutocommit(DatabaseBackend):
         return found
 
     def close(self) -> None:
+        for batch in self._batches:
+            if batch.copy is not None:
+                batch.give_up(BackendFailedError("PostgreSQL: closed too early"))
         connections, self._connections = self._connections, []
         try:
             for connection in connections:
@@ -200,93 +252,6 @@ class PostgresAutocommit(DatabaseBackend):
 
     def processes(self) -> Sequence[int]:
         return self._server.processes()
-
-
-@dataclass(slots=True)
-class _Batch:
-    """One channel's transaction, to which its messages go as they come."""
-
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    copy: Copy | None = None
-    ending: ExitStack = field(default_factory=ExitStack)
-    texts: list[str] = field(default_factory=list)
-    size: int = 0
-    since: float = 0.0
-
-    def give_up(self, why: BaseException) -> None:
-        """Take back what it was given."""
-        import psycopg
-
-        self.copy = None
-        with suppress(psycopg.Error):
-            self.ending.__exit__(type(why), why, why.__traceback__)
-
-
-class PostgresTuned(PostgresAutocommit):
-    """Tuned as in the paper, and as PostgreSQL's documentation advises for loading.
-
-    `shared_buffers` is a quarter and `effective_cache_size` three quarters of the memory.
-    For loading: `max_wal_size` of 4 GB (fewer checkpoints), `wal_level = minimal` and
-    `max_wal_senders = 0` (nobody replicates), and COPY: one of 2 s or 16 MiB of messages,
-    which are handed over as they come, is a transaction. Commits stay synchronous. Small
-    messages go in three times as fast with COPY as with `executemany`, large ones as fast.
-
-    The column is `json`, as in the paper; `postgres_tuned_indexed` has `jsonb`.
-    """
-
-    name = "postgres_tuned"
-    about = (
-        "PostgreSQL: json, shared_buffers 25 % and effective_cache_size 75 % of memory, "
-        "max_wal_size 4 GB, wal_level minimal, one COPY and transaction for 2 s or 16 MiB"
-    )
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(directory)
-        self._batches: list[_Batch] = []
-        self._copies: list[Composed] = []
-
-    def _settings(self) -> dict[str, str | int]:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        return {
-            "shared_buffers": f"{memory // 4 // _MIB}MB",
-            "effective_cache_size": f"{memory * 3 // 4 // _MIB}MB",
-            "max_wal_size": "4GB",
-            "wal_level": "minimal",
-            "max_wal_senders": 0,
-        }
-
-    def open(self, channels: Sequence[Channel]) -> None:
-        super().open(channels)
-        from psycopg.sql import SQL, Identifier
-
-        self._batches = [_Batch() for _ in channels]
-        self._copies = [
-            SQL("COPY {} (data) FROM STDIN").format(Identifier(table_of(channel.topic)))
-            for channel in channels
-        ]
-
-    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        text = self._text(channel, log_time, payload)
-        batch = self._batches[channel]
-        with batch.lock:
-            with self._one_by_one(channel, batch):
-                copy = batch.copy or self._begin(channel, batch)
-                batch.texts.append(text)
-                batch.size += len(text)
-                copy.write_row((text,))
-            if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
-                self._commit(channel, batch)
-
-    def finish(self) -> None:
-        for channel, batch in enumerate(self._batches):
-            with batch.lock:
-                self._commit(channel, batch)
-
-    def close(self) -> None:
-        for batch in self._batches:
-            if batch.copy is not None:
-                batch.give_up(BackendFailedError("PostgreSQL: closed too early"))
-        super().close()
 
     def _begin(self, channel: int, batch: _Batch) -> Copy:
         """A COPY, which is a transaction by itself."""
@@ -320,7 +285,7 @@ class PostgresTuned(PostgresAutocommit):
             raise _failed(error) from error
 
 
-class PostgresTunedIndexed(PostgresTuned):
+class PostgresIndexed(Postgres):
     """Tuned, with expression indexes on the fields of the paper's appendix A.
 
     The paper could not index a cast; today's PostgreSQL can. The column is `jsonb`, as its
@@ -330,9 +295,9 @@ class PostgresTunedIndexed(PostgresTuned):
     `jsonb` refuses, becomes U+FFFD.
     """
 
-    name = "postgres_tuned_indexed"
+    name = "postgres_indexed"
     about = (
-        "PostgreSQL as postgres_tuned, but jsonb, with expression indexes on the fields of "
+        "PostgreSQL as postgres, but jsonb, with expression indexes on the fields of "
         "the paper's appendix A"
     )
 

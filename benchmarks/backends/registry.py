@@ -4,28 +4,25 @@ from __future__ import annotations
 
 from benchmarks.backends.bagfile import BagFile
 from benchmarks.backends.base import Backend
-from benchmarks.backends.hybridlog_store import Hybridlog, HybridlogRecorder
+from benchmarks.backends.hybridlog_store import Hybridlog
 from benchmarks.backends.mcap_file import McapFile
-from benchmarks.backends.mongo_json import MongoJson, MongoJsonBatched, MongoJsonIndexed
+from benchmarks.backends.mongo import Mongo, MongoIndexed
 from benchmarks.backends.nothing import Nothing
-from benchmarks.backends.postgres import PostgresAutocommit, PostgresTuned, PostgresTunedIndexed
-from benchmarks.backends.sqlite import SqliteJson1, SqliteUdf
+from benchmarks.backends.postgres import Postgres, PostgresIndexed
+from benchmarks.backends.sqlite import Sqlite, SqliteIndexed
 
 BACKENDS: dict[str, type[Backend]] = {
     backend.name: backend
     for backend in (
-        Nothing,
-        McapFile,
-        BagFile,
-        MongoJson,
-        MongoJsonIndexed,
-        MongoJsonBatched,
-        PostgresAutocommit,
-        PostgresTuned,
-        PostgresTunedIndexed,
-        SqliteUdf,
-        SqliteJson1,
         Hybridlog,
-        HybridlogRecorder,
+        Mongo,
+        MongoIndexed,
+        Postgres,
+        PostgresIndexed,
+        Sqlite,
+        SqliteIndexed,
+        BagFile,
+        McapFile,
+        Nothing,
     )
 }

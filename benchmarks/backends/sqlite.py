@@ -56,15 +56,14 @@ def expression(path: str, column: str = "msg") -> str:
     return f"json_extract({column}, '$.{path}')"
 
 
-class SqliteUdf(DatabaseBackend):
+class Sqlite(DatabaseBackend):
     """One file, one connection under a lock, one transaction a message.
 
     As SQLite's documentation advises for many small transactions: the journal mode is
-    WAL, `synchronous` is NORMAL. Questions about fields are asked through functions
-    written in Python.
+    WAL, `synchronous` is NORMAL.
     """
 
-    name = "sqlite_udf"
+    name = "sqlite"
     about = (
         "SQLite: JSON text, one table a topic, one transaction a message, WAL, synchronous NORMAL"
     )
@@ -156,7 +155,7 @@ class SqliteUdf(DatabaseBackend):
                 connection.close()
 
 
-class SqliteJson1(SqliteUdf):
+class SqliteIndexed(Sqlite):
     """The same text, with SQLite's own JSON functions, indexes on them, and 2 s batches.
 
     One transaction holds the messages of all topics for 2 s or 16 MiB. There are indexes
@@ -164,7 +163,7 @@ class SqliteJson1(SqliteUdf):
     them, and of `_meta.t`.
     """
 
-    name = "sqlite_json1"
+    name = "sqlite_indexed"
     about = (
         "SQLite: JSON text, one table a topic, transactions of 2 s or 16 MiB, WAL, synchronous "
         "NORMAL, indexes on json_extract of the fields of the paper's appendix A"

@@ -26,20 +26,17 @@ class Counters:
         dropped: Messages of each channel that found their queue full; the publisher writes.
         taken: Messages of each channel that left their queue; the channel's subscriber writes.
         errors: Messages of each channel whose insert raised; the channel's subscriber writes.
-        taken_bytes: Payload bytes that left the queues; a single intake writes, so that
-            the publisher knows how many bytes it is ahead. One number.
     """
 
     def __init__(self, path: Path, topics: int | None = None) -> None:
         if topics is not None:
-            path.write_bytes(bytes(8 * (4 * topics + 1)))
+            path.write_bytes(bytes(8 * 4 * topics))
         with path.open("r+b") as stream:
             whole = memoryview(mmap.mmap(stream.fileno(), 0)).cast("q")
-        count = (len(whole) - 1) // 4
+        count = len(whole) // 4
         self.sent, self.dropped, self.taken, self.errors = (
             whole[n * count : (n + 1) * count] for n in range(4)
         )
-        self.taken_bytes = whole[4 * count :]
 
     def published(self) -> list[int]:
         """Messages that were due, of each channel: those sent and those dropped."""

@@ -30,8 +30,8 @@ from benchmarks.loads.base import Load
 from benchmarks.side import Values
 
 Publishing = dict[str, Any]
-"""What the publisher needs besides: `counters`, a file that is made; `speed`; `intake`,
-which is `threads` or `single`; `limit`, the messages a queue or the bytes of an intake."""
+"""What the publisher needs besides: `counters`, a file that is made; `speed`; `limit`, the
+messages that a queue holds."""
 
 _LOOK_S = 0.1
 _END_S = 5.0
@@ -108,10 +108,9 @@ def _close(system: Backend, values: Values) -> None:
 
 def _run(system: Backend, load: Load, publishing: Publishing, values: Values, parent: int) -> None:
     """Everything between opening and closing; `values` is filled as things become known."""
-    single = publishing["intake"] == "single"
     counters = Counters(Path(publishing["counters"]), len(load.channels))
     subscribers = Subscribers(load, system, counters)
-    pipes = [os.pipe() for _ in range(1 if single else len(load.channels))]
+    pipes = [os.pipe() for _ in load.channels]
     arguments = {
         **publishing,
         "load": str(load.payloads.parent),
@@ -132,7 +131,7 @@ def _run(system: Backend, load: Load, publishing: Publishing, values: Values, pa
         if publisher.stdout.readline().strip() != READY:
             raise RuntimeError("the publisher did not start")
         values["spin_ms"] = usage.spin_ms()
-        subscribers.start([read for read, _ in pipes], single=single)
+        subscribers.start([read for read, _ in pipes])
         # A look of the collector at all that was imported would stop every subscriber for
         # tens of milliseconds, and be counted against whatever backend runs then.
         gc.collect()

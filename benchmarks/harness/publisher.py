@@ -11,7 +11,6 @@ of JSON.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import sys
@@ -19,7 +18,6 @@ import time
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +37,6 @@ _BATCH = 512
 """Messages after which the clock is looked at again by a publisher that is late."""
 _NAP_NS = 250_000_000
 """Longest sleep; after each the publisher sees whether its logger is still there."""
-_PIPE_BYTES = 1 << 20
 _PERCENTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
 
@@ -110,53 +107,6 @@ def publish_to_queues(
     return track
 
 
-def publish_ahead(
-    load: Load, counters: Counters, *, start: int, speed: float, pipe: int, limit: int
-) -> Track:
-    """Publish into one intake, which may lie behind by a number of bytes.
-
-    Args:
-        load: What.
-        counters: Of this run.
-        start: When, ns of the monotonic clock.
-        speed: Times as fast as the load says.
-        pipe: Where all tokens go.
-        limit: Payload bytes that may be waiting; a longer message may wait alone.
-    """
-    track = Track(len(load))
-    depths, late_us = track.depth, track.late_us
-    sent, dropped, taken_bytes = counters.sent, counters.dropped, counters.taken_bytes
-    clock = time.monotonic_ns
-    os.set_blocking(pipe, False)
-    _widen(pipe)
-    waiting = bytearray()
-    total = total_bytes = 0
-    for first, channels, due in _batches(load, start, speed):
-        stop = first + len(channels)
-        lengths = load.length[first:stop].tolist()
-        taken = sum(counters.taken)
-        for row, channel, when, length in zip(
-            range(first, stop), channels, due, lengths, strict=True
-        ):
-            late_us[row] = (clock() - when) // 1000
-            ahead = total_bytes - taken_bytes[0]
-            depths[row] = max(total - taken, 0)
-            if not ahead or ahead + length <= limit:
-                sent[channel] += 1
-                total += 1
-                total_bytes += length
-                waiting += row.to_bytes(TOKEN, "little")
-            else:
-                dropped[channel] += 1
-        track.rows = stop
-        # What the pipe does not hold waits here: the limit is one of payloads, not of tokens.
-        _pass_on(pipe, waiting)
-    os.set_blocking(pipe, True)
-    while waiting:
-        _pass_on(pipe, waiting)
-    return track
-
-
 def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[int], list[int]]]:
     """Sleep until messages are due; give the first row, the channels and the due times."""
     clock, parent = time.monotonic_ns, os.getppid()
@@ -177,32 +127,15 @@ def _batches(load: Load, start: int, speed: float) -> Iterator[tuple[int, list[i
             at = stop
 
 
-def _pass_on(pipe: int, waiting: bytearray) -> None:
-    if waiting:
-        with suppress(BlockingIOError):
-            del waiting[: os.write(pipe, waiting)]
-
-
-def _widen(pipe: int) -> None:
-    """Ask for a larger pipe, where that can be done: fewer turns for the same tokens."""
-    if hasattr(fcntl, "F_SETPIPE_SZ"):
-        # Refused to who is over the user's share; the pipe works as it is.
-        with suppress(OSError):
-            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-
-
-def main(
-    *, load: str, counters: str, pipes: list[int], limit: int, speed: float, intake: str
-) -> dict[str, Any]:
+def main(*, load: str, counters: str, pipes: list[int], limit: int, speed: float) -> dict[str, Any]:
     """Publish a load once.
 
     Args:
         load: Its directory.
         counters: The counters' file.
         pipes: Descriptors of the pipes.
-        limit: Messages a queue, or bytes ahead of a single intake.
+        limit: Messages a queue.
         speed: Times as fast as the load says.
-        intake: `threads` or `single`.
 
     Returns:
         `start_ns` and `end_ns` of the monotonic clock (the start, and when the last
@@ -214,12 +147,7 @@ def main(
     sys.stdin.readline()
     used = time.process_time()
     start = time.monotonic_ns() + _HEAD_START_NS
-    if intake == "single":
-        track = publish_ahead(opened, shared, start=start, speed=speed, pipe=pipes[0], limit=limit)
-    else:
-        track = publish_to_queues(
-            opened, shared, start=start, speed=speed, pipes=pipes, limit=limit
-        )
+    track = publish_to_queues(opened, shared, start=start, speed=speed, pipes=pipes, limit=limit)
     used = time.process_time() - used
     for pipe in pipes:
         os.close(pipe)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +17,8 @@ from benchmarks.loads.base import Load
 from benchmarks.samples import Status
 from benchmarks.side import SideError, Values, run_side, warm_cache
 
-Intake = Literal["threads", "single"]
-
 QUEUE = 10
 """Messages that the queue of a topic holds."""
-AHEAD_BYTES = 512 << 20
-"""Payload bytes that may wait for a single intake."""
 
 _COUNT_S = 900.0
 _COUNT_FAILED_S = 60.0
@@ -35,17 +31,12 @@ class Setting:
 
     Attributes:
         speed: Times as fast as the load says.
-        intake: `threads`: a thread and a queue a topic. `single`: one thread takes all,
-            in the order of publication, for a recorder that has its own threads and queues.
         queue: Messages that a topic's queue holds.
-        ahead_bytes: Payload bytes that may wait for a single intake.
         timeout_s: A run is ended after it; None for thrice its duration and five minutes.
     """
 
     speed: float = 1.0
-    intake: Intake = "threads"
     queue: int = QUEUE
-    ahead_bytes: int = AHEAD_BYTES
     timeout_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -101,14 +92,12 @@ def run(
         "directory": str(data),
     }
     counters = directory / "counters"
-    single = setting.intake == "single"
     arguments = {
         **common,
         "publishing": {
             "counters": str(counters),
             "speed": setting.speed,
-            "intake": setting.intake,
-            "limit": setting.ahead_bytes if single else setting.queue,
+            "limit": setting.queue,
         },
     }
     timeout = setting.timeout_s

@@ -1,4 +1,4 @@
-"""The subscribers: a thread a topic, or one intake, that hand messages to the backend."""
+"""The subscribers: a thread a topic, which hands messages to the backend."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _HELD = 128 << 20  # bytes of payloads up to which they are held in memory
 _QUEUE_READ = 16 * TOKEN
-_INTAKE_READ = 8192 * TOKEN
 
 
 class Subscribers:
@@ -51,18 +50,14 @@ class Subscribers:
         self._payloads = _at_hand(load)
         self._threads: list[threading.Thread] = []
 
-    def start(self, pipes: Sequence[int], *, single: bool) -> None:
+    def start(self, pipes: Sequence[int]) -> None:
         """Start taking messages.
 
         Args:
-            pipes: A descriptor a channel, or one for all; closed at the end.
-            single: One intake takes everything.
+            pipes: A descriptor a channel; closed at the end.
         """
-        if single:
-            self._add(self._take_all, pipes[0])
-        else:
-            for channel, pipe in enumerate(pipes):
-                self._add(self._take_one, pipe, channel)
+        for channel, pipe in enumerate(pipes):
+            self._add(self._take_one, pipe, channel)
         for thread in self._threads:
             thread.start()
 
@@ -125,42 +120,6 @@ class Subscribers:
                     raise
                 except Exception as error:
                     self._count_error(channel, error)
-
-    def _take_all(self, pipe: int) -> None:
-        """Take the messages of all channels, in the order in which they were published."""
-        load, payloads = self._load, self._payloads
-        insert, taken = self._backend.insert, self._counters.taken
-        taken_bytes = self._counters.taken_bytes
-        stop, now = self.failed.is_set, time.time_ns
-        counts = [0] * len(load.channels)
-        total = 0
-        rest = b""
-        while data := os.read(pipe, _INTAKE_READ):
-            # A large write may have been cut anywhere.
-            data = rest + data
-            whole = len(data) // TOKEN * TOKEN
-            rest = data[whole:]
-            rows = np.frombuffer(data, "<i8", whole // TOKEN)
-            for channel, start, size in zip(
-                load.channel[rows].tolist(),
-                load.offset[rows].tolist(),
-                load.length[rows].tolist(),
-                strict=True,
-            ):
-                if stop():
-                    return
-                counts[channel] += 1
-                taken[channel] = counts[channel]
-                payload = bytes(payloads[start : start + size])
-                try:
-                    insert(channel, now(), payload)
-                except BackendFailedError:
-                    raise
-                except Exception as error:
-                    self._count_error(channel, error)
-                # Only now: what is being inserted still takes its memory.
-                total += size
-                taken_bytes[0] = total
 
     def _count_error(self, channel: int, error: Exception) -> None:
         self._counters.errors[channel] += 1

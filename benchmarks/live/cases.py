@@ -10,16 +10,22 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from os import kill
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.live.master import Master
 from benchmarks.live.recorders import Kept, Ours, Rosbag, rosbag, speech
 from benchmarks.live.talker import Data, Load
+from benchmarks.samples import Sample, Status
 from benchmarks.side import SideError
 from benchmarks.usage import cpu_s, machine, rss, with_children, working_below
 
+if TYPE_CHECKING:
+    from benchmarks.studies.runs import Context
+
+STUDY = "live"
 _FLUSH_S = 1.0
 """The recorder's own interval between flushes, as it is by default."""
 
@@ -123,7 +129,7 @@ def _row(name: str, recorder: str, recorded: _Recorded) -> Row:
 
 def _stopped_database(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     """mongod is halted, later killed, while a robot speaks."""
-    pause = 3.0 if quick else 20.0
+    pause = 3.0 if quick else 10.0
     load = Load(20, 40_000, 50, 2 * pause + 4)
     for how in ("halted", "killed"):
         with (
@@ -159,7 +165,7 @@ def _kills(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
     load = Load(20, 40_000, 100, 0)
     moments = random.Random(1)
     lost_s, stored, wrong = [], 0, 0
-    count = 3 if quick else 50
+    count = 3 if quick else 15
     for _ in range(count):
         with _clean(work), Master() as master:
             with (
@@ -207,12 +213,6 @@ def _recovered(store: Path, load: Load, killed_ns: int) -> tuple[float, int, int
             messages += 1
         wrong += len(opened.verify().findings)
     return (killed_ns - last_ns) / 1e9, messages, wrong
-
-
-def _memory(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
-    """Resident memory over a long run of what can be compressed: no disk is that large."""
-    load = Load(20, 100_000, 100, 20.0 if quick else 600.0, period=4096)
-    yield _watched("memory", "hybridlog", load, work)
 
 
 def _robot(work: Path, quick: bool) -> Iterator[Row]:  # noqa: FBT001
@@ -308,12 +308,32 @@ def _share(part: float, whole: float) -> str:
 
 
 CASES: dict[str, Case] = {
-    "small": _beside("small", Load(1, 500, 30_000, 20, queue=1000)),
-    "bursts": _beside("bursts", Load(1, 500, 10_000, 20, burst=10)),
+    "small": _beside("small", Load(1, 500, 30_000, 15, queue=1000)),
     "large": _beside("large", Load(12, 640_000, 128, 10)),
-    "paper": _beside("paper", Load(20, 640_000, 64, 30)),
     "database": Case("mongod halted, and killed", _stopped_database),
-    "kills": Case("kill -9 at 50 random moments under 80 MB/s", _kills),
-    "memory": Case("ten minutes at 200 MB/s", _memory),
+    "kills": Case("kill -9 at random moments under 80 MB/s", _kills),
     "robot": Case("a minute at 50 MB/s, --budget 128MiB, without and with MongoDB", _robot),
 }
+
+
+def run(context: Context, name: str) -> None:
+    """Do a case that is not in the journal.
+
+    Args:
+        context: Where and how.
+        name: Key of `CASES`.
+    """
+    wanted = Sample(STUDY, {"case": name}, "hybridlog", 0)
+    if not context.to_do(wanted):
+        return
+    case, rows, reason = CASES[name], [], ""
+    with context.progress.step(f"live: {case.about}"):
+        try:
+            rows = list(case.run(context.work / "live", context.scale != "full"))
+        except SideError as error:
+            reason = str(error)
+    ours = [row for row in rows if row.recorder.startswith("hybridlog")]
+    reason = reason or "; ".join(row.text for row in ours if not row.holds)
+    status: Status = "failed" if reason else "ok"
+    values = {"rows": [row._asdict() for row in rows]}
+    context.journal.add(replace(wanted, status=status, values=values, reason=reason))

@@ -28,8 +28,8 @@ class Load:
     Rows may share a payload: a stream of many messages needs a file of only a few.
 
     Attributes:
-        name: Short, for tables: `throughput 5 kB 64 Hz`, `mit_like`.
-        seed: From which it was made; None for a real log.
+        name: Short, for tables: `5 kB 64 Hz`, `robot`.
+        seed: From which it was made.
         channels: One a topic.
         channel: int32[n], index into `channels`.
         due: int64[n], ns after the start, ascending.
@@ -37,7 +37,6 @@ class Load:
         offset: int64[n], byte in the payload file.
         length: int64[n], bytes of the payload.
         payloads: The payload file.
-        damage: What of a log could not be read and is left out; empty when all was.
     """
 
     name: str
@@ -49,7 +48,6 @@ class Load:
     offset: NDArray[np.int64]
     length: NDArray[np.int64]
     payloads: Path
-    damage: str = ""
 
     def __len__(self) -> int:
         """Number of messages."""
@@ -84,7 +82,6 @@ class Load:
         about = {
             "name": self.name,
             "seed": self.seed,
-            "damage": self.damage,
             "channels": [_channel_to_json(channel) for channel in self.channels],
         }
         # Last: a directory without it is a load that was not finished.
@@ -105,7 +102,6 @@ class Load:
                 seed=about["seed"],
                 channels=tuple(_channel_from_json(value) for value in about["channels"]),
                 payloads=directory / PAYLOADS,
-                damage=about.get("damage", ""),  # loads are kept from run to run, older ones too
                 **{name: columns[name] for name in columns.files},
             )
 

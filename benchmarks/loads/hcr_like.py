@@ -10,20 +10,18 @@ is made: `truth.json` beside it.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from benchmarks.loads import made, user
-from benchmarks.loads import mit_like as pr2
-from benchmarks.loads.made import OldTypes, Values, payloads, scene, yaw
+from benchmarks.loads.made import RobotTypes, Values, payloads, yaw
 from benchmarks.loads.spool import Spool
-from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, NAME, RobotError, Truth
+from benchmarks.loads.truth import BEFORE_ERROR_NS, MINUTE_NS, RobotError, Truth
 from benchmarks.loads.user import ARM_GRID, GRASPS, TICK_NS, Drag, ViewpointPlan, plan_drags
-from hybridlog_storage.errors import MissingDependencyError, UsageError
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,10 +40,6 @@ LEFT_ARM = "/l_cart/command_pose"
 FEEDBACK = "/pr2_marker_control_transparent/feedback"
 DIAGNOSTICS = "/diagnostics_agg"
 ROSOUT = "/rosout"
-WEBCAM = "/webcam_node/image_raw/compressed"
-KINECT = "/head_mount_kinect/rgb/image_color/compressed"
-JOINT_STATES = "/joint_states"
-TF = "/tf"
 
 _GRIPPER = "pr2_controllers_msgs/msg/Pr2GripperCommand"
 START_NS = 1_383_588_000_000_000_000  # 2013-11-04 18:00 UTC
@@ -61,16 +55,6 @@ _REST = {RIGHT_ARM: 20, LEFT_ARM: 400}
 """Mean ticks between two drags of an arm."""
 _MARKERS = {RIGHT_ARM: "r_gripper_control", LEFT_ARM: "l_gripper_control"}
 _POSE_UPDATE, _MOUSE_DOWN, _MOUSE_UP = 1, 4, 5
-_REGULAR = {
-    DIAGNOSTICS: (1.0, 0.4, 0.004, 0.001),
-    WEBCAM: (30.0, 0.012, 0.03, 0.002),
-    KINECT: (30.0, 0.021, 0.04, 0.003),
-    JOINT_STATES: (100.0, 0.003, 0.0006, 0.0002),
-    TF: (50.0, 0.005, 0.001, 0.0003),
-    "pose": (30.0, 0.009, 0.001, 0.0003),
-}
-"""Rate, phase, and least and mean delay of what the robot says by itself."""
-_PICTURES = 16
 _ERRORS = (
     "EtherCAT dropped a packet: motors halted",
     "r_wrist_roll_joint: motor over-temperature, motors halted",
@@ -93,14 +77,8 @@ _TYPES = {
     FEEDBACK: ("visualization_msgs/msg/InteractiveMarkerFeedback", "/rviz"),
     DIAGNOSTICS: ("diagnostic_msgs/msg/DiagnosticArray", "/diag_agg"),
     ROSOUT: ("rosgraph_msgs/msg/Log", "/rosout"),
-    WEBCAM: ("sensor_msgs/msg/CompressedImage", "/webcam_node"),
-    KINECT: ("sensor_msgs/msg/CompressedImage", "/head_mount_kinect"),
-    JOINT_STATES: ("sensor_msgs/msg/JointState", "/realtime_loop"),
-    TF: (made.TF_TYPE, "/robot_state_publisher"),
 }
 """Type and node of each topic."""
-_CAMERAS = (WEBCAM, KINECT)
-_STATE = (JOINT_STATES, TF)
 
 
 def hcr_like(
@@ -109,9 +87,6 @@ def hcr_like(
     seed: int,
     sessions: int = 8,
     minutes: float = 10.0,
-    cameras: bool = False,
-    state: bool = False,
-    name: str = "hcr_like",
 ) -> Load:
     """Make a load of some sessions, one after the other with a gap, and its truth.
 
@@ -120,31 +95,24 @@ def hcr_like(
         seed: Not negative.
         sessions: How many, above 0.
         minutes: Length of each, at least 1.
-        cameras: With the two streams of JPEG images that were recorded too. They are
-            nothing to the questions and twenty times the bytes.
-        state: With joint states and transforms, which the robot publishes and the
-            study's launch file does not record.
-        name: Of the load.
     """
     if sessions < 1 or not minutes >= 1 or seed < 0:
         raise UsageError(
             f"no load of {sessions} sessions of {minutes:g} minutes from seed {seed}; choose at "
             "least 1 session of at least 1 minute, and a seed that is not negative"
         )
-    types = OldTypes()
-    left_out = (() if cameras else _CAMERAS) + (() if state else _STATE)
-    topics = [topic for topic in _TYPES if topic not in left_out]
+    types = RobotTypes()
+    topics = list(_TYPES)
     channels = [types.channel(topic, *_TYPES[topic]) for topic in topics]
     ticks = round(minutes * 60e9 / TICK_NS)
-    pictures = _jpegs(seed) if cameras else []
     plans = []
     with Spool(directory) as spool:
         for number in range(sessions):
             start = START_NS + number * round((minutes * 60 + GAP_S) * 1e9)
-            plan = _plan(seed, number, start, ticks, topics)
-            _write(spool, types, topics, plan, pictures)
+            plan = _plan(seed, number, start, ticks)
+            _write(spool, types, topics, plan)
             plans.append(plan)
-        load = spool.finish(name, seed, channels)
+        load = spool.finish("hcr_like", seed, channels)
     _truth(plans).save(directory)
     return load
 
@@ -176,7 +144,7 @@ class _Plan:
         return self.start + np.asarray(ticks, np.int64) * TICK_NS + round(offset_ms * 1e6)
 
 
-def _plan(seed: int, number: int, start: int, ticks: int, topics: Sequence[str]) -> _Plan:
+def _plan(seed: int, number: int, start: int, ticks: int) -> _Plan:
     """Plan a session; the order of the ways to grasp goes on from session to session."""
     rng = made.generator(seed, number, "user")
     first = number % len(GRASPS)
@@ -199,7 +167,7 @@ def _plan(seed: int, number: int, start: int, ticks: int, topics: Sequence[str])
         times[arm] = plan.at(moved, offset) + rng.integers(0, 2_000_000, len(moved))
         feedback.append(plan.at(_ticks_of(plan.drags[arm], ends=True), offset - 4))
     times[FEEDBACK] = np.concatenate(feedback)
-    _plan_robot(plan, topics)
+    _plan_robot(plan)
     _plan_errors(plan)
     return plan
 
@@ -210,23 +178,14 @@ def _ticks_of(drags: Sequence[Drag], *, ends: bool) -> Times:
     return np.concatenate([np.empty(0, np.int64), *found])
 
 
-def _plan_robot(plan: _Plan, topics: Sequence[str]) -> None:
+def _plan_robot(plan: _Plan) -> None:
     """Log times of what the robot says whatever the user does."""
     times, seconds = plan.times, plan.seconds
     rng = plan.rng("robot")
-
-    def regular(topic: str) -> Times:
-        hz, phase, least, mean = _REGULAR[topic]
-        stamps = plan.start + made.steady(rng, hz, seconds - 0.2, phase=phase)
-        return made.received(rng, stamps, least, mean)
-
     remarks = np.sort(rng.choice(int(seconds * 1000), int(seconds / 4), replace=False))
     times[ROSOUT] = plan.start + remarks * 1_000_000 + 500_000
-    for topic in (DIAGNOSTICS, WEBCAM, KINECT, JOINT_STATES):
-        if topic in topics:
-            times[topic] = regular(topic)
-    if TF in topics:
-        times[TF] = np.concatenate(made.of_two_sources(regular(TF), regular("pose")))
+    stamps = made.steady(rng, 1.0, seconds - 0.2, phase=0.4)
+    times[DIAGNOSTICS] = made.received(rng, plan.start + stamps, 0.004, 0.001)
 
 
 def _plan_errors(plan: _Plan) -> None:
@@ -314,10 +273,9 @@ def _joined(windows: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 def _write(
     spool: Spool,
-    types: OldTypes,
+    types: RobotTypes,
     topics: Sequence[str],
     plan: _Plan,
-    pictures: Sequence[NDArray[np.uint8]],
 ) -> None:
     """Add the messages of a session."""
 
@@ -341,24 +299,6 @@ def _write(
     columns = _stamped(times, 4_000_000) | {"status.3.level": warns.astype(np.uint8)}
     add(DIAGNOSTICS, times, {"status": _diagnostics(types)}, columns)
     _write_rosout(add, plan)
-    for topic, frame in ((WEBCAM, "webcam"), (KINECT, "head_mount_kinect_rgb_optical_frame")):
-        if topic in topics:
-            times = plan.times[topic]
-            # A short drive, shown forwards and backwards for ever.
-            turn = np.arange(len(times)) % (2 * _PICTURES - 2)
-            shown = np.minimum(turn, 2 * _PICTURES - 2 - turn)
-            columns = _stamped(times, 30_000_000) | {"data": [pictures[n] for n in shown]}
-            add(topic, times, {"header.frame_id": frame, "format": "jpeg"}, columns)
-    if TF in topics:
-        # The two publishers of /tf tell themselves apart by odd and even nanoseconds.
-        tf = plan.times[TF]
-        of = ((pr2.JOINT_TOPIC, plan.times[JOINT_STATES]), (pr2.LINKS_TOPIC, tf[tf % 2 == 0]))
-        for row, log_times in (*of, (pr2.BASE_TOPIC, tf[tf % 2 == 1])):
-            since = log_times - plan.start
-            both = (since - 600_000, since)
-            made.write(
-                spool, topics.index(row.name), types, row, (plan.start, *both), seed=plan.seed
-            )
 
 
 _Add = Callable[[str, Times, Values, Values], None]
@@ -415,7 +355,7 @@ def _posed(path: str, where: NDArray[np.float64]) -> Values:
     return made.xyz(f"{path}position", *where.T) | yaw(f"{path}orientation", heading)
 
 
-def _diagnostics(types: OldTypes) -> list[Any]:
+def _diagnostics(types: RobotTypes) -> list[Any]:
     keys = ("state", "temperature", "last update", "errors since start")
     kind = "diagnostic_msgs/msg/KeyValue"
     pairs = [types.make(kind, {"key": key, "value": "nominal"}) for key in keys]
@@ -424,33 +364,3 @@ def _diagnostics(types: OldTypes) -> list[Any]:
     names = [f"/{part}/{number}" for part in parts for number in range(3)]
     kind = "diagnostic_msgs/msg/DiagnosticStatus"
     return [types.make(kind, {"name": name, **about}) for name in names]
-
-
-def _jpegs(seed: int) -> list[NDArray[np.uint8]]:
-    """Pictures as JPEG files, of the quality that the image transport of ROS sets."""
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingDependencyError(
-            "JPEG images need Pillow; install it with: pip install 'hybridlog[images]'"
-        ) from error
-    found = []
-    for frame in scene(np.random.default_rng([seed, 0x19E6]), 0, (_PICTURES, 480, 640)):
-        stream = io.BytesIO()
-        Image.fromarray(frame).convert("RGB").save(stream, "JPEG", quality=80)
-        found.append(np.frombuffer(stream.getvalue(), np.uint8))
-    return found
-
-
-def cut(load: Load, seconds: float) -> Load:
-    """Keep what is due in the first seconds, and save that in the place of the whole.
-
-    A truth beside it goes: it is one of the whole load. At least the first message stays.
-    """
-    directory = load.payloads.parent
-    (directory / NAME).unlink(missing_ok=True)
-    rows = slice(max(1, int(np.searchsorted(load.due, round(seconds * 1e9)))))
-    names = ("channel", "due", "log_time", "offset", "length")
-    shorter = replace(load, **{name: getattr(load, name)[rows] for name in names})
-    shorter.save(directory)
-    return shorter

@@ -87,8 +87,6 @@ class Spool:
         name: str,
         seed: int | None,
         channels: Sequence[Channel],
-        seconds: float | None = None,
-        damage: str = "",
     ) -> Load:
         """Order what was added by log time, and save it.
 
@@ -97,10 +95,8 @@ class Spool:
 
         Args:
             name: Of the load.
-            seed: From which it was made; None for a real log.
+            seed: From which it was made.
             channels: One a topic.
-            seconds: Leave out what is due this long after the start, or later.
-            damage: What of a log could not be read.
         """
         if not self._columns:
             raise UsageError(f"{name}: no messages; choose a longer time or another log")
@@ -113,9 +109,6 @@ class Spool:
         )
         order = np.argsort(log_time, kind="stable")
         due = log_time[order] - log_time[order[0]]
-        if seconds is not None:
-            due = due[: np.searchsorted(due, round(seconds * 1e9))]
-            order = order[: len(due)]
         load = Load(
             name=name,
             seed=seed,
@@ -126,7 +119,6 @@ class Spool:
             offset=offset[order],
             length=length[order],
             payloads=self._directory / PAYLOADS,
-            damage=damage,
         )
         load.save(self._directory)
         return load

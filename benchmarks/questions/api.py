@@ -37,11 +37,8 @@ class _Stored:
         self.store = backend.store
 
 
-class ApiAsker(_Stored, Asker):
+class HybridlogAsker(_Stored, Asker):
     """One chain of calls a question; Q4 is a join by time."""
-
-    def index_bytes(self) -> int | None:
-        return index_bytes(self.store)
 
     def closings(self) -> int:
         return self.store.topic(GRIPPER).where("position == 0").count()
@@ -79,29 +76,6 @@ class ApiAsker(_Stored, Asker):
     def before_errors(self) -> int:
         errors = self.store.topic(ROSOUT).where(f"level == {ERROR}")
         return self.store.all_topics().around(errors, before="5min").count()
-
-
-class IndexedApiAsker(ApiAsker):
-    """With the paper's indexes, and one on the time, as `hybridlog index` makes them."""
-
-    def start(self, backend: Backend) -> None:
-        super().start(backend)
-        add_indexes(self.store)
-
-
-def add_indexes(store: Store) -> None:
-    """Make those that `mongo_json_indexed` has on the topics that are asked about."""
-    store.add_index(GRIPPER, "position")
-    store.add_index(VIEWPOINT, "position.x", "_meta.inserted_at")
-    store.add_index(ARM, *(f"pose.position.{axis}" for axis in "xyz"))
-    store.add_index("re:.*", "_meta.inserted_at")
-
-
-def index_bytes(store: Store) -> int:
-    """Bytes on the disk of all that is not in the segments: documents and catalog."""
-    database = store.database_for("Its size")
-    sizes = [database.stats(name) for name in database.list_collections()]
-    return sum(size.storage_bytes + size.index_bytes for size in sizes)
 
 
 class HybridlogReading(_Stored, Reading):

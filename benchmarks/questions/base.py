@@ -89,10 +89,6 @@ class Asker(ABC):
     def before_errors(self) -> int:
         """Messages of all topics in the five minutes before each system error."""
 
-    def index_bytes(self) -> int | None:
-        """Bytes on the disk of what serves questions alone; None when that is not told."""
-        return None
-
     def close(self) -> None:  # noqa: B027 - most have nothing to give back
         """Give back what `start` took."""
 

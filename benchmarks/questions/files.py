@@ -276,10 +276,6 @@ class BagAsker(_Bag, _FileAsker):
     """A loop over a bag."""
 
 
-class McapAsker(_Mcap, _FileAsker):
-    """A loop over an MCAP file."""
-
-
 class BagReading(_Bag, _FileReading):
     """From a bag, by its index."""
 

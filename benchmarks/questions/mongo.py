@@ -1,8 +1,4 @@
-"""Questions to MongoDB: the paper's appendix A through pymongo, and aggregations.
-
-They run unchanged against the collections of our own MongoDB backends and against those
-that hybridlog writes: names, paths and the date in `_meta.inserted_at` are the same.
-"""
+"""Questions to MongoDB: the paper's appendix A through pymongo, and aggregations."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.questions.api import add_indexes, index_bytes
 from benchmarks.questions.base import (
     ARM,
     ERROR,
@@ -29,7 +24,6 @@ from hybridlog_storage.mongo.collection_names import collection_of
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
-    from pymongo import MongoClient
     from pymongo.collection import Collection
     from pymongo.database import Database
 
@@ -46,9 +40,9 @@ class MongoAsker(Asker):
     """
 
     def start(self, backend: Backend) -> None:
-        from benchmarks.backends.mongo_json import MongoJson
+        from benchmarks.backends.mongo import Mongo
 
-        assert isinstance(backend, MongoJson)
+        assert isinstance(backend, Mongo)
         self._database: Database[dict[str, Any]] = backend.database
 
     def closings(self) -> int:
@@ -138,51 +132,17 @@ class MongoAsker(Asker):
             for begin, end in windows
         )
 
-    def index_bytes(self) -> int | None:
-        """All indexes, with the one on `_id` that every collection has."""
-        self._database.client.admin.command("fsync")  # sizes are those of the last checkpoint
-        return int(self._database.command("dbStats")["indexSize"])
-
     def _of(self, topic: str) -> Collection[dict[str, Any]]:
         return self._database[collection_of(topic)]
-
-
-class HybridlogAppendixAsker(MongoAsker):
-    """The same questions, through pymongo, to the collections that hybridlog writes."""
-
-    def start(self, backend: Backend) -> None:
-        from pymongo import MongoClient
-
-        from benchmarks.backends.hybridlog_store import Hybridlog
-
-        assert isinstance(backend, Hybridlog)
-        database = backend.store.database_for("These questions")
-        self._client: MongoClient[dict[str, Any]] = MongoClient(database.address)
-        self._database = self._client[database.name]
-        self._store = backend.store
-
-    def index_bytes(self) -> int | None:
-        return index_bytes(self._store)
-
-    def close(self) -> None:
-        self._client.close()
-
-
-class HybridlogIndexedAsker(HybridlogAppendixAsker):
-    """With the paper's indexes, and one on the time, as `hybridlog index` makes them."""
-
-    def start(self, backend: Backend) -> None:
-        super().start(backend)
-        add_indexes(self._store)
 
 
 class MongoReading(Reading):
     """By `_meta.inserted_at`, which is what the indexes are on."""
 
     def start(self, backend: Backend) -> None:
-        from benchmarks.backends.mongo_json import MongoJson
+        from benchmarks.backends.mongo import Mongo
 
-        assert isinstance(backend, MongoJson)
+        assert isinstance(backend, Mongo)
         self._database = backend.database
 
     def slice(self, topic: str, begin: int, end: int) -> NDArray[np.float32]:

@@ -11,13 +11,13 @@ from benchmarks.harness.run import Outcome
 from benchmarks.questions.base import SLOW_TIMES
 from benchmarks.samples import Sample
 from benchmarks.side import SideError, run_side, warm_cache
-from benchmarks.studies.runs import Context, run_directory, step
+from benchmarks.studies.runs import Context, run_directory
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
     from benchmarks.loads.base import Load
 
-TIMEOUT_S = 3600.0
+TIMEOUT_S = 900.0
 """A side is ended after it."""
 SLOW = "slow"
 """Value of the samples of a question that was slow, and has `SLOW_TIMES` of them at most."""
@@ -31,13 +31,12 @@ class Turn:
 
     Attributes:
         backend: Its name.
-        rows: Rows of the tables that it fills, and who asks for each; empty when nobody
-            does.
+        asker: Who asks it, `module:class`.
         samples: What is wanted of it.
     """
 
     backend: str
-    rows: Mapping[str, str]
+    asker: str
     samples: Sequence[Sample]
 
 
@@ -80,16 +79,11 @@ def do(
     if not to_do(context, turn):
         return
     reason = context.missing.get(turn.backend)
-    if not turn.rows:
-        reason = (
-            f"nobody asks the backend {turn.backend}: write a class for it and name it in "
-            "benchmarks/questions/askers.py"
-        )
     if reason is not None:
         outcome = Outcome("missing", {}, reason)
         _note(context, turn, outcome, [])
         return
-    with step(f"{turn.samples[0].study}: {turn.backend}"):
+    with context.progress.step(f"{turn.samples[0].study}: {turn.backend}"):
         outcome, results = _run(context, turn, side, load(), arguments)
     if outcome.status == "missing":
         context.missing[turn.backend] = outcome.reason
@@ -108,12 +102,13 @@ def _run(
             "load": str(load.payloads.parent.resolve()),
             "backend": f"{kind.__module__}:{kind.__qualname__}",
             "directory": str(data),
-            "rows": dict(turn.rows),
+            "row": turn.backend,
+            "asker": turn.asker,
             "results": str(results),
             **arguments,
         }
         try:
-            values = run_side(side, given, directory, context.timeout_s or TIMEOUT_S)
+            values = run_side(side, given, directory, TIMEOUT_S)
         except SideError as error:
             values = {"status": "failed", "reason": str(error)}
         told = results.read_bytes() if results.is_file() else b""

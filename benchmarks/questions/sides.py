@@ -35,14 +35,15 @@ def ask(
     load: str,
     backend: str,
     directory: str,
-    rows: dict[str, str],
+    row: str,
+    asker: str,
     questions: Sequence[str],
     repetitions: int,
     results: str,
 ) -> Values:
     """Fill a backend and ask it.
 
-    A result is a JSON line: `row`, `question`, `index_bytes`, and `cold_ms` (a list, the
+    A result is a JSON line: `row`, `question`, and `cold_ms` (a list, the
     first time after the backend was opened again), `ms` (a list, the times after the first
     of those) and `answer`; or `error`. A later line takes the place of an earlier one of the
     same question. What was slow is asked `SLOW_TIMES` in all, each time for the first time.
@@ -51,7 +52,8 @@ def ask(
         load: The load's directory.
         backend: `module:class`.
         directory: For the backend's data.
-        rows: Names, and the class that asks each, `module:class`.
+        row: Name of the backend.
+        asker: The class that asks, `module:class`.
         questions: Keys of `QUESTIONS`.
         repetitions: How often each is asked after the first time, and how often the
             backend is opened, to ask for the first time.
@@ -62,22 +64,20 @@ def ask(
     """
 
     def use(reopened: _Opener, channels: Sequence[Channel], out: TextIO) -> None:
-        for row, kind in rows.items():
-            known: dict[str, dict[str, Any]] = {}
-            for opening in range(repetitions):
-                with reopened() as system, closing(_named(kind)(system, channels)) as asker:
-                    size = asker.index_bytes() if not opening else None
-                    for name in questions:
-                        question = partial(QUESTIONS[name], asker)
-                        if not opening:
-                            found = _timed(question, repetitions)
-                            known[name] = {"row": row, "question": name, "index_bytes": size}
-                        elif "error" in known[name] or _has_enough(known[name]):
-                            continue
-                        else:
-                            found = _first_again(question, known[name])
-                        known[name] |= found
-                        _tell(out, known[name])
+        known: dict[str, dict[str, Any]] = {}
+        for opening in range(repetitions):
+            with reopened() as system, closing(_named(asker)(system, channels)) as asking:
+                for name in questions:
+                    question = partial(QUESTIONS[name], asking)
+                    if not opening:
+                        found = _timed(question, repetitions)
+                        known[name] = {"row": row, "question": name}
+                    elif "error" in known[name] or _has_enough(known[name]):
+                        continue
+                    else:
+                        found = _first_again(question, known[name])
+                    known[name] |= found
+                    _tell(out, known[name])
 
     return _filled(load, backend, directory, results, use)
 
@@ -87,7 +87,8 @@ def read(
     load: str,
     backend: str,
     directory: str,
-    rows: dict[str, str],
+    row: str,
+    asker: str,
     repetitions: int,
     results: str,
 ) -> Values:
@@ -98,16 +99,15 @@ def read(
     opened = Load.open(Path(load))
 
     def use(reopened: _Opener, channels: Sequence[Channel], out: TextIO) -> None:
-        for row, kind in rows.items():
-            with reopened() as system, closing(_named(kind)(system, channels)) as reading:
-                for name, task in tasks.TASKS.items():
-                    for repetition in range(repetitions):
-                        found = _caught(partial(task, reading, opened, repetition))
-                        _tell(out, {"row": row, "task": name, "repetition": repetition, **found})
-                        if not repetition:
-                            is_slow = found.get("total_ms", 0.0) > SLOW_S * 1e3
-                        if "error" in found or (is_slow and repetition + 1 >= SLOW_TIMES):
-                            break
+        with reopened() as system, closing(_named(asker)(system, channels)) as reading:
+            for name, task in tasks.TASKS.items():
+                for repetition in range(repetitions):
+                    found = _caught(partial(task, reading, opened, repetition))
+                    _tell(out, {"row": row, "task": name, "repetition": repetition, **found})
+                    if not repetition:
+                        is_slow = found.get("total_ms", 0.0) > SLOW_S * 1e3
+                    if "error" in found or (is_slow and repetition + 1 >= SLOW_TIMES):
+                        break
 
     return _filled(load, backend, directory, results, use)
 

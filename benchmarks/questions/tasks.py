@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-SCAN: Final = "/base_scan"
-IMU: Final = "/torso_lift_imu/data"
+SCAN: Final = "/scan"
+IMU: Final = "/imu/data"
 SLICES: Final = 20
 """In one repetition."""
 MOMENTS: Final = 100
@@ -36,7 +36,7 @@ MOMENTS: Final = 100
 
 
 def slices(reading: Reading, load: Load, repetition: int) -> dict[str, Any]:
-    """One second of the base laser, decoded, 20 times."""
+    """One second of the laser, decoded, 20 times."""
     spans = slice_spans(load, repetition)
     return _measured([partial(reading.slice, SCAN, *span) for span in spans], checksum)
 

@@ -1,4 +1,4 @@
-"""Study 3: the paper's questions about teleoperation, Table 1, and three more.
+"""Study 3: the paper's questions about teleoperation, Table 1, and more.
 
 Every backend is filled with the same load as fast as it takes it, closed, opened again,
 and asked in its own language. All answers are known from the plan of the load; one that
@@ -8,16 +8,15 @@ is wrong makes the sample a failure.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.loads.hcr_like import hcr_like
 from benchmarks.loads.truth import Truth
 from benchmarks.questions import run as turns
-from benchmarks.questions.askers import ASKERS, SAME
+from benchmarks.questions.askers import ASKERS
 from benchmarks.questions.base import QUESTIONS, true_answers
 from benchmarks.questions.run import Turn
-from benchmarks.samples import Sample
+from benchmarks.samples import Sample, Scale
 from benchmarks.studies.runs import Context, chosen
 
 if TYPE_CHECKING:
@@ -25,13 +24,10 @@ if TYPE_CHECKING:
     from benchmarks.loads.base import Load
 
 STUDY = "queries"
-_VERSION = 2
-"""Goes up when the generator makes other messages from the same seed."""
 _SIDE = "benchmarks.questions.sides:ask"
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
+class Settings(NamedTuple):
     """How much there is to ask about, and how often it is asked.
 
     Attributes:
@@ -39,71 +35,65 @@ class Settings:
         minutes: Length of each session, at least 1.
         repetitions: Of each question, for the first time since the backend was opened, and
             after one of those; what takes more than 10 s is asked twice in all.
-        backends: Names of those that take part; None for all.
     """
 
-    sessions: int = 8
-    minutes: float = 10.0
-    repetitions: int = 5
-    backends: Sequence[str] | None = None
-
-    @classmethod
-    def usual(cls, *, quick: bool) -> Settings:
-        """Those of a full or of a quick run."""
-        return cls(sessions=1, minutes=4.0, repetitions=1) if quick else cls()
+    sessions: int
+    minutes: float
+    repetitions: int
 
 
-def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
+SETTINGS: dict[Scale, Settings] = {
+    "full": Settings(4, 10.0, 5),
+    "quick": Settings(2, 5.0, 2),
+    "tiny": Settings(1, 1.0, 1),
+}
+
+
+def plan(context: Context) -> list[Turn]:
     """Every backend's turn, those that the journal has included."""
-    settings = settings or Settings.usual(quick=context.quick)
-    found = []
-    for name, kind in chosen(context.backends, settings.backends).items():
-        if kind.kind == "none" or name in SAME:
-            continue  # what is not kept cannot be asked about
-        rows = ASKERS.get(name, {})
-        samples = [
-            Sample(STUDY, _case(question, settings), row, repetition)
-            for row in rows or [name]
-            for question in QUESTIONS
-            for repetition in range(settings.repetitions)
-        ]
-        found.append(Turn(name, rows, samples))
-    return found
+    settings = SETTINGS[context.scale]
+    return [
+        Turn(
+            name,
+            ASKERS[name],
+            [
+                Sample(STUDY, _case(question, settings), name, repetition)
+                for question in QUESTIONS
+                for repetition in range(settings.repetitions)
+            ],
+        )
+        for name in chosen(context.backends, list(ASKERS))
+    ]
 
 
-def run(context: Context, settings: Settings | None = None) -> None:
+def run(context: Context) -> None:
     """Do what is still to be done."""
-    settings = settings or Settings.usual(quick=context.quick)
+    settings = SETTINGS[context.scale]
 
     def load() -> Load:
         return make_load(context, settings)
 
     def samples_of(outcome: Outcome, results: Sequence[turns.Result]) -> Iterable[Sample]:
-        directory = load().payloads.parent
-        truth = true_answers(Truth.open(directory))
+        truth = true_answers(Truth.open(load().payloads.parent))
         # The last that was told of a question has all its times.
-        latest = {(result["row"], result["question"]): result for result in results}
+        latest = {result["question"]: result for result in results}
         for result in latest.values():
             yield from _samples(outcome, result, truth, settings)
 
     arguments = {"questions": list(QUESTIONS), "repetitions": settings.repetitions}
-    for turn in plan(context, settings):
+    for turn in plan(context):
         turns.do(context, turn, side=_SIDE, load=load, arguments=arguments, samples_of=samples_of)
 
 
 def make_load(context: Context, settings: Settings) -> Load:
     """The load, made once; its truth lies beside it."""
-    about = {
-        "version": _VERSION,
-        "seed": context.seed,
-        "sessions": settings.sessions,
-        "minutes": settings.minutes,
-    }
+    sessions, minutes, _ = settings
+    about = {"seed": context.seed, "sessions": sessions, "minutes": minutes}
     return context.load(
         "questions",
         about,
         lambda directory: hcr_like(
-            directory, seed=context.seed, sessions=settings.sessions, minutes=settings.minutes
+            directory, seed=context.seed, sessions=sessions, minutes=minutes
         ),
     )
 
@@ -115,8 +105,6 @@ def _samples(
     question = result["question"]
     error = result.get("error", "")
     values = dict(outcome.values)
-    if result["index_bytes"] is not None:
-        values["index_bytes"] = result["index_bytes"]
     first_times: list[float] = [] if error else result["cold_ms"]
     times: list[float] = [] if error else result["ms"]
     if not error:

@@ -1,23 +1,21 @@
 """What comes after a question: messages by time, a message at a time, a table of a topic.
 
-The load is that of a robot which drives through a building. Every backend is filled with
-it as fast as it takes it, closed, opened again, and read from. What must come out is
-decoded from the load itself.
+The load is the log of a robot. Every backend is filled with it as fast as it takes it,
+closed, opened again, and read from. What must come out is decoded from the load itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from benchmarks.loads.mit_like import mit_like
 from benchmarks.questions import run as turns
 from benchmarks.questions import tasks
-from benchmarks.questions.askers import READERS, SAME
+from benchmarks.questions.askers import READERS
 from benchmarks.questions.base import SLOW_S
 from benchmarks.questions.run import Turn
-from benchmarks.samples import Sample
+from benchmarks.samples import Sample, Scale
+from benchmarks.studies import logs
 from benchmarks.studies.runs import Context, chosen
 
 if TYPE_CHECKING:
@@ -25,75 +23,62 @@ if TYPE_CHECKING:
     from benchmarks.loads.base import Load
 
 STUDY = "reading"
-_VERSION = 2
 _SIDE = "benchmarks.questions.sides:read"
 _USUAL_MEASURES = ("first_ms", "ms", "total_ms", "answer")
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
+class Settings(NamedTuple):
     """How much there is to read, and how often.
 
     Attributes:
         seconds: Of the load.
         repetitions: Of each task; one of which the first takes more than 10 s is done twice.
-        backends: Names of those that take part; None for all.
     """
 
-    seconds: float = 30.0
-    repetitions: int = 3
-    backends: Sequence[str] | None = None
-
-    @classmethod
-    def usual(cls, *, quick: bool) -> Settings:
-        """Those of a full or of a quick run."""
-        return cls(seconds=2.0, repetitions=1) if quick else cls()
+    seconds: int
+    repetitions: int
 
 
-def plan(context: Context, settings: Settings | None = None) -> list[Turn]:
+SETTINGS: dict[Scale, Settings] = {
+    "full": Settings(30, 3),
+    "quick": Settings(20, 2),
+    "tiny": Settings(2, 1),
+}
+
+
+def plan(context: Context) -> list[Turn]:
     """Every backend's turn, those that the journal has included."""
-    settings = settings or Settings.usual(quick=context.quick)
-    found = []
-    for name, kind in chosen(context.backends, settings.backends).items():
-        if kind.kind == "none" or name in SAME:
-            continue  # what is not kept cannot be read
-        rows = READERS.get(name, {})
-        samples = [
-            Sample(STUDY, _case(task, settings), row, repetition)
-            for row in rows or [name]
-            for task in tasks.TASKS
-            for repetition in range(settings.repetitions)
-        ]
-        found.append(Turn(name, rows, samples))
-    return found
+    settings = SETTINGS[context.scale]
+    return [
+        Turn(
+            name,
+            READERS[name],
+            [
+                Sample(STUDY, _case(task, settings), name, repetition)
+                for task in tasks.TASKS
+                for repetition in range(settings.repetitions)
+            ],
+        )
+        for name in chosen(context.backends, list(READERS))
+    ]
 
 
-def run(context: Context, settings: Settings | None = None) -> None:
+def run(context: Context) -> None:
     """Do what is still to be done."""
-    settings = settings or Settings.usual(quick=context.quick)
+    settings = SETTINGS[context.scale]
     truth: dict[tuple[str, int], list[int]] = {}
 
     def load() -> Load:
-        return make_load(context, settings)
+        return logs.make_load(context, settings.seconds)
 
     def samples_of(outcome: Outcome, results: Sequence[turns.Result]) -> Iterable[Sample]:
         if results and not truth:
             truth.update(tasks.true_answers(load(), settings.repetitions))
         return [_sample(outcome, result, truth, settings) for result in results]
 
-    for turn in plan(context, settings):
+    for turn in plan(context):
         arguments = {"repetitions": settings.repetitions}
         turns.do(context, turn, side=_SIDE, load=load, arguments=arguments, samples_of=samples_of)
-
-
-def make_load(context: Context, settings: Settings) -> Load:
-    """The load, made once."""
-    about = {"version": _VERSION, "seed": context.seed, "seconds": settings.seconds}
-    return context.load(
-        "reading",
-        about,
-        lambda directory: mit_like(directory, seconds=settings.seconds, seed=context.seed),
-    )
 
 
 def _sample(

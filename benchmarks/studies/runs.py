@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,8 @@ from benchmarks.disturbance import MAX_RUNS, is_disturbed
 from benchmarks.harness.run import Setting
 from benchmarks.harness.run import run as run_load
 from benchmarks.loads.base import Load
-from benchmarks.samples import DAMAGE, Journal, Sample, Status
+from benchmarks.progress import Progress
+from benchmarks.samples import Journal, Sample, Scale, Status
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
@@ -37,10 +37,9 @@ class Context:
         work: Directory for loads (kept) and the data of runs (removed after each).
         backends: Those that take part, by name, in the order in which they take turns.
         journal: Where samples go, and where those lie that need not be run again.
-        quick: Small cases.
+        scale: How much is measured.
         seed: Of all loads.
-        speed: Times as fast as the loads say.
-        timeout_s: A run is ended after it; None to let it depend on its duration.
+        progress: Where steps are told.
         missing: Why backends are missing that were found so: they are not tried again.
         quiet_at: When the machine will be done with what the last run left, seconds of
             `time.monotonic`.
@@ -49,10 +48,9 @@ class Context:
     work: Path
     backends: Mapping[str, type[Backend]]
     journal: Journal
-    quick: bool = False
+    scale: Scale = "full"
     seed: int = 1
-    speed: float = 1.0
-    timeout_s: float | None = None
+    progress: Progress = field(default_factory=lambda: Progress(quiet=True))
     missing: dict[str, str] = field(default_factory=dict)
     quiet_at: float = 0.0
 
@@ -81,26 +79,24 @@ class Context:
         """Whether a run has still to be done.
 
         It is not in the journal as a success, or the machine disturbed it, and it has not
-        been repeated often enough. A quick study repeats nothing.
+        been repeated often enough. Only a full run repeats any.
         """
         if not self.journal.has(sample):
             return True
         known = self.journal.samples[sample.key]
         return (
-            not self.quick
+            self.scale == "full"
             and is_disturbed(known.values)
             and self.journal.successes(sample) < MAX_RUNS
         )
 
-    def run(
-        self, wanted: Sample, load: Callable[[], Load], *, speed: float | None = None
-    ) -> Sample:
+    def run(self, wanted: Sample, load: Callable[[], Load], *, speed: float = 1.0) -> Sample:
         """Run one case with one backend, unless the journal has it; again when disturbed.
 
         Args:
             wanted: Study, case, backend and repetition.
             load: Gives the load; called only when it is needed.
-            speed: Times as fast as the load says; None for this context's.
+            speed: Times as fast as the load says.
 
         Returns:
             The sample, which is in the journal.
@@ -113,8 +109,8 @@ class Context:
             self.journal.add(sample)
             return sample
         while self.to_do(wanted):
-            with step(describe_run(wanted)):
-                sample = self._run(wanted, load(), self.speed if speed is None else speed)
+            with self.progress.step(describe_run(wanted)):
+                sample = self._run(wanted, load(), speed)
             self.journal.add(sample)
             if sample.status == "missing":
                 self.missing[wanted.backend] = sample.reason
@@ -124,47 +120,24 @@ class Context:
 
     def _run(self, wanted: Sample, load: Load, speed: float) -> Sample:
         backend = self.backends[wanted.backend]
-        setting = Setting(speed=speed, intake=backend.intake, timeout_s=self.timeout_s)
-        if not self.quick:
+        if self.scale == "full":
             time.sleep(max(self.quiet_at - time.monotonic(), 0))
         with run_directory(self.work) as directory:
-            outcome = run_load(load, backend, directory, setting)
+            outcome = run_load(load, backend, directory, Setting(speed=speed))
         self.quiet_at = time.monotonic() + _digesting_s(outcome.values)
-        damage = {DAMAGE: load.damage} if load.damage else {}
-        return _filled(wanted, outcome.status, {**outcome.values, **damage}, outcome.reason)
+        values = {name: v for name, v in outcome.values.items() if name != "topics"}
+        return _filled(wanted, outcome.status, values, outcome.reason)
 
 
-@contextmanager
-def step(text: str) -> Iterator[None]:
-    """Write a line to standard error when the block has ended well."""
-    started = time.monotonic()
-    yield
-    print(f"{text} ({time.monotonic() - started:.1f} s)", file=sys.stderr, flush=True)
-
-
-def chosen(
-    backends: Mapping[str, type[Backend]], names: Sequence[str] | None
-) -> dict[str, type[Backend]]:
-    """Some of the backends, in the order of all.
-
-    Args:
-        backends: All, by name.
-        names: Which; None for all.
-    """
-    if names is None:
-        return dict(backends)
-    unknown = [name for name in names if name not in backends]
-    if unknown:
-        raise ValueError(
-            f"there is no backend {', '.join(map(repr, unknown))}; there are {', '.join(backends)}"
-        )
-    return {name: kind for name, kind in backends.items() if name in names}
+def chosen(backends: Mapping[str, type[Backend]], names: Sequence[str]) -> dict[str, type[Backend]]:
+    """Those of the backends that a study has, in its order."""
+    return {name: backends[name] for name in names if name in backends}
 
 
 def describe_run(sample: Sample) -> str:
     """A run in a line of progress."""
     case = ", ".join(f"{name} {value}" for name, value in sample.case.items())
-    return f"{sample.study}: {sample.backend}, {case}, run {sample.repetition + 1}"
+    return f"{sample.study}: {sample.backend}, {case}, round {sample.repetition + 1}"
 
 
 def _digesting_s(values: Mapping[str, Any]) -> float:

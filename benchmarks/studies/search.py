@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from benchmarks.samples import Sample
 
@@ -121,26 +121,6 @@ def next_rate(kept: Mapping[float, bool], bounds: Bounds) -> float | None:
     return (best + lost) / 2 if is_wide else None
 
 
-def is_over(kept: Mapping[float, bool], settings: Mapping[str, Any]) -> bool:
-    """Whether a search came to its end, and was not stopped before.
-
-    Args:
-        kept: Of the rates that were tried, whether all was kept.
-        settings: Of the study, as its journal has them; where they do not say where it
-            looks, it is taken for over.
-    """
-    start, lowest, highest = (_above_0(settings, name) for name in ("start", "lowest", "highest"))
-    halvings = settings.get("halvings")
-    if start is None or lowest is None or highest is None or not isinstance(halvings, int):
-        return True
-    return next_rate(kept, Bounds(start, lowest, highest, halvings)) is None
-
-
-def _above_0(settings: Mapping[str, Any], name: str) -> float | None:
-    found = settings.get(name)
-    return float(found) if isinstance(found, int | float) and found > 0 else None
-
-
 def next_trial(context: Context, search: Search, failed: Collection[str] = ()) -> Trial | None:
     """What a search tries next.
 
@@ -188,3 +168,50 @@ def _try(context: Context, search: Search, failed: set[str]) -> bool:
     if found.status == "failed":
         failed.add(found.key)
     return found.status != "missing"
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The end of one search.
+
+    Attributes:
+        rate: The greatest of which all was persisted; None when something was always lost.
+        best: The trial at that rate.
+        is_above: The limit is higher: none higher was tried, or the harness did no better.
+    """
+
+    rate: float | None
+    best: Sample | None
+    is_above: bool
+
+
+def searches(samples: Iterable[Sample], axis: str, harness: str) -> dict[str, list[Found]]:
+    """What searches have found, by backend.
+
+    Args:
+        samples: Those of the searches, of one case.
+        axis: Name of the rate in the case of a trial.
+        harness: The backend that keeps nothing, and so shows what the harness can carry.
+    """
+    trials: dict[tuple[str, int], dict[float, Sample]] = {}
+    for sample in samples:
+        if sample.status != "missing":
+            by_rate = trials.setdefault((sample.backend, sample.repetition), {})
+            by_rate[float(sample.case[axis])] = sample
+    carried = min(
+        (
+            rate
+            for (name, _), by_rate in trials.items()
+            for rate, sample in by_rate.items()
+            if name == harness and verdict(sample) != "kept"
+        ),
+        default=math.inf,
+    )
+    found: dict[str, list[Found]] = {}
+    for (name, _), by_rate in trials.items():
+        verdicts = {rate: verdict(sample) for rate, sample in by_rate.items()}
+        rate, lost = bracket({rate: shown == "kept" for rate, shown in verdicts.items()})
+        is_above = lost is None or verdicts[lost] == "late" or lost >= carried
+        best = None if rate is None else by_rate[rate]
+        found.setdefault(name, []).append(Found(rate, best, is_above))
+    return found

@@ -1,4 +1,4 @@
-"""MongoDB, a document a message: as the paper and its predecessor use it, and in batches."""
+"""MongoDB, a document a message, inserted in batches."""
 
 from __future__ import annotations
 
@@ -39,17 +39,31 @@ _ANSWER_MS = 120_000
 _PING_MS = 250
 
 
-class MongoJson(DatabaseBackend):
-    """A mongod of its own with its default settings.
+@dataclass(slots=True)
+class _Batch:
+    """What one channel has not sent yet."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    documents: list[RawBSONDocument] = field(default_factory=list)
+    size: int = 0
+    since: float = 0.0
+
+
+class Mongo(DatabaseBackend):
+    """A mongod of its own with its default settings, and many messages an insert.
+
+    Documents are encoded as they come: a driver that is given a batch of dictionaries
+    encodes them all while every other thread waits. Inserts are unordered. Larger batches
+    lose more messages while one is sent, smaller ones take more of the processor.
 
     The WiredTiger cache has its default size (half of the memory less 1 GiB), the journal
     is on, the write concern is the default one. One client is shared by all threads.
     """
 
-    name = "mongo_json"
+    name = "mongo"
     about = (
-        "MongoDB: one document a message, one collection a topic, one insert a message; "
-        "default settings"
+        "MongoDB: one document a message, one collection a topic, one unordered insert_many for "
+        "2 s or 256 KiB of a topic; default settings"
     )
 
     _is_indexed = False
@@ -59,6 +73,8 @@ class MongoJson(DatabaseBackend):
         self._server = Server("mongod", directory)
         self._client: MongoClient[Document] | None = None
         self._collections: list[Collection[Document]] = []
+        self._batches: list[_Batch] = []
+        self._largest = 0
 
     @classmethod
     def check(cls) -> None:
@@ -100,6 +116,8 @@ class MongoJson(DatabaseBackend):
             self._make_collections()
         except PyMongoError as error:
             raise BackendFailedError(f"MongoDB: {error}") from error
+        self._largest = self.database.command("hello")["maxBsonObjectSize"]
+        self._batches = [_Batch() for _ in channels]
 
     def _make_collections(self) -> None:
         there = set(self.database.list_collection_names())
@@ -113,21 +131,35 @@ class MongoJson(DatabaseBackend):
         self._collections = [self.database[collection_of(c.topic)] for c in self._channels]
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
+        from bson import ObjectId, encode
         from bson.errors import InvalidDocument
-        from pymongo.errors import DocumentTooLarge, PyMongoError
+        from bson.raw_bson import RawBSONDocument
 
         document = self._converters[channel].document(log_time, payload)
         try:
-            self._collections[channel].insert_one(document)
-        except (DocumentTooLarge, InvalidDocument):
+            encoded = encode({"_id": ObjectId(), **document})
+        except InvalidDocument:
             self._refuse(channel)
-        except PyMongoError as error:
-            raise BackendFailedError(f"MongoDB: {error}") from error
+            return
+        if len(encoded) > self._largest:
+            self._refuse(channel)
+            return
+        batch = self._batches[channel]
+        with batch.lock:
+            if not batch.documents:
+                batch.since = time.monotonic()
+            batch.documents.append(RawBSONDocument(encoded))
+            batch.size += len(encoded)
+            if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
+                self._send(channel, batch)
 
     def finish(self) -> None:
         from pymongo import WriteConcern
         from pymongo.errors import PyMongoError
 
+        for channel, batch in enumerate(self._batches):
+            with batch.lock:
+                self._send(channel, batch)
         assert self._client is not None
         # All that was written before this one is in the journal when this one is.
         journaled = self._client["harness"].get_collection(
@@ -160,83 +192,6 @@ class MongoJson(DatabaseBackend):
     def processes(self) -> Sequence[int]:
         return self._server.processes()
 
-
-class MongoJsonIndexed(MongoJson):
-    """The same with the indexes of the paper's appendix A, made before the first message.
-
-    They are made where a topic's type has the fields; every collection has one on
-    `_meta.inserted_at`.
-    """
-
-    name = "mongo_json_indexed"
-    about = (
-        "MongoDB as mongo_json, with the indexes of the paper's appendix A and one on the time "
-        "of every topic"
-    )
-
-    _is_indexed = True
-
-
-@dataclass(slots=True)
-class _Batch:
-    """What one channel has not sent yet."""
-
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    documents: list[RawBSONDocument] = field(default_factory=list)
-    size: int = 0
-    since: float = 0.0
-
-
-class MongoJsonBatched(MongoJson):
-    """The same with many messages an insert, as MongoDB's documentation advises for loading.
-
-    Documents are encoded as they come: a driver that is given a batch of dictionaries
-    encodes them all while every other thread waits. Inserts are unordered. Larger batches
-    lose more messages while one is sent, smaller ones take more of the processor.
-    """
-
-    name = "mongo_json_batched"
-    about = "MongoDB as mongo_json, but one unordered insert_many for 2 s or 256 KiB of a topic"
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(directory)
-        self._batches: list[_Batch] = []
-        self._largest = 0
-
-    def open(self, channels: Sequence[Channel]) -> None:
-        super().open(channels)
-        self._largest = self.database.command("hello")["maxBsonObjectSize"]
-        self._batches = [_Batch() for _ in channels]
-
-    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        from bson import ObjectId, encode
-        from bson.errors import InvalidDocument
-        from bson.raw_bson import RawBSONDocument
-
-        document = self._converters[channel].document(log_time, payload)
-        try:
-            encoded = encode({"_id": ObjectId(), **document})
-        except InvalidDocument:
-            self._refuse(channel)
-            return
-        if len(encoded) > self._largest:
-            self._refuse(channel)
-            return
-        batch = self._batches[channel]
-        with batch.lock:
-            if not batch.documents:
-                batch.since = time.monotonic()
-            batch.documents.append(RawBSONDocument(encoded))
-            batch.size += len(encoded)
-            if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
-                self._send(channel, batch)
-
-    def finish(self) -> None:
-        for channel, batch in enumerate(self._batches):
-            with batch.lock:
-                self._send(channel, batch)
-        super().finish()
-
     def _send(self, channel: int, batch: _Batch) -> None:
         from pymongo.errors import PyMongoError
 
@@ -247,6 +202,19 @@ class MongoJsonBatched(MongoJson):
         except PyMongoError as error:
             raise BackendFailedError(f"MongoDB: {error}") from error
         batch.documents, batch.size = [], 0
+
+
+class MongoIndexed(Mongo):
+    """The same with the indexes of the paper's appendix A, made before the first message.
+
+    They are made where a topic's type has the fields; every collection has one on
+    `_meta.inserted_at`.
+    """
+
+    name = "mongo_indexed"
+    about = "MongoDB as mongo, with the indexes of the paper's appendix A and one on the time"
+
+    _is_indexed = True
 
 
 def _keys(group: tuple[str, ...]) -> list[tuple[str, int]]:

@@ -1,0 +1,404 @@
+"""What a user does with a store, timed: commands, SQL, many recordings, the page, windows.
+
+All of it but `many` is about one recording of the robot's log. Each group runs in a process
+of its own; a figure is the median of several times after a first one, on the clock and of
+the processor (that of MongoDB is not counted).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from benchmarks.loads import robot
+from benchmarks.samples import Sample, Scale
+from benchmarks.side import SideError, Values, run_side
+from benchmarks.studies.runs import Context, run_directory
+from benchmarks.usage import disk_bytes
+
+if TYPE_CHECKING:
+    from hybridlog.store import Store
+
+STUDY = "tasks"
+_TIMEOUT_S = 900.0
+_DAY_NS = 86_400 * 10**9
+_MANY_MESSAGES = 200
+PIXELS = 1600
+
+
+class Settings(NamedTuple):
+    """How much there is, and how often each task is done.
+
+    Attributes:
+        seconds: Of the robot's log.
+        recordings: In the store of many.
+        times: Of each task.
+        windows: Windows of pictures.
+    """
+
+    seconds: int
+    recordings: int
+    times: int
+    windows: int
+
+
+SETTINGS: dict[Scale, Settings] = {
+    "full": Settings(600, 1000, 5, 100),
+    "quick": Settings(300, 1000, 3, 50),
+    "tiny": Settings(10, 10, 1, 5),
+}
+NEAR = "/odom: twist.twist.linear.x > 1.2"
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "`hybridlog --version`": ("--version",),
+    "`info`": ("info",),
+    "`fetch` of a second of all topics into MCAP": (
+        *("fetch", "-t", "*", "--between", "+5s", "+6s", "-o", "{out}.mcap"),
+    ),
+    "`fetch --count` with a predicate on `imu/data`": (
+        *("fetch", "-t", "imu/data", "--where", "angular_velocity.z > 0.02", "--count"),
+    ),
+    "`fetch --count` of scans near a fast `odom`": (
+        *("fetch", "-t", "scan", "--where", NEAR, "--within", "0.1s", "--count"),
+    ),
+    "`sql`: mean of a field of `odom` where another is large": (
+        "sql",
+        "select count(*), avg(twist.twist.linear.x) from odom where twist.twist.linear.x > 0.5",
+    ),
+    "`align` of `odom` and `scan` to `imu/data`, into Parquet": (
+        *("align", "--to", "imu/data", "-t", "odom", "-t", "scan", "-o", "{out}.parquet"),
+    ),
+    "`fetch` of `imu/data` into Parquet": ("fetch", "-t", "imu/data", "-o", "{out}.parquet"),
+    "`export` into a bag": ("export", "{out}.bag"),
+    "`verify`": ("verify",),
+}
+"""Arguments by what they do."""
+SQL = {
+    "count": "select count(*) from odom",
+    "filter of two fields, mean of a third": (
+        "select count(*), avg(pose.pose.position.y) from odom "
+        "where twist.twist.linear.x > 0.5 and pose.pose.position.x > 0"
+    ),
+    "group of `imu/data` by minute": (
+        "select t // 60000000000 as m, max(linear_acceleration.z) from imu__data group by 1"
+    ),
+    "as-of join of `imu/data` and `odom`": (
+        "select count(*), avg(o.twist.twist.linear.x) from imu__data i "
+        "asof join odom o on i.t >= o.t where i.angular_velocity.z > 0"
+    ),
+}
+
+
+def run(context: Context, group: str) -> None:
+    """Do a group that is not in the journal.
+
+    Args:
+        context: Where and how.
+        group: Key of `GROUPS`.
+    """
+    settings = SETTINGS[context.scale]
+    wanted = Sample(STUDY, {"group": group, **settings._asdict()}, "hybridlog", 0)
+    if not context.to_do(wanted):
+        return
+    with context.progress.step(f"tasks: {group}"), run_directory(context.work) as directory:
+        arguments = {"directory": str(directory), "seed": context.seed, **settings._asdict()}
+        try:
+            if group != "many":
+                arguments["store"] = str(robot_store(context, settings))
+            side = f"{__name__}:{group}_side"
+            values = run_side(side, arguments, directory, _TIMEOUT_S)
+            sample = Sample(STUDY, wanted.case, "hybridlog", 0, "ok", values)
+        except SideError as error:
+            sample = Sample(STUDY, wanted.case, "hybridlog", 0, "failed", {}, str(error))
+    context.journal.add(sample)
+
+
+def robot_store(context: Context, settings: Settings) -> Path:
+    """The store with the robot's log, recorded once; the log lies beside it."""
+    place = context.work / "loads" / f"robot-{settings.seconds}-{context.seed}"
+    if not place.exists():
+        part = Path(tempfile.mkdtemp(prefix="part-", dir=_made(place.parent)))
+        try:
+            robot.write_log(part / "robot.mcap", seconds=settings.seconds, seed=context.seed)
+            _recorded(part / "robot.mcap", part / "store")
+            part.rename(place)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    return place / "store"
+
+
+def _made(place: Path) -> Path:
+    place.mkdir(parents=True, exist_ok=True)
+    return place
+
+
+def _recorded(log: Path, store: Path) -> Values:
+    return command(("record", str(log)), store)
+
+
+# --- timing ---------------------------------------------------------------------------
+
+
+def timed(work: Callable[[], object], times: int) -> Values:
+    """Milliseconds of a function, on the clock and of the processor, after a first time."""
+    work()
+    clocks, processors = [], []
+    for _ in range(times):
+        begun, used = time.perf_counter(), time.process_time()
+        work()
+        clocks.append(1e3 * (time.perf_counter() - begun))
+        processors.append(1e3 * (time.process_time() - used))
+    return _spread(clocks) | {"cpu_ms": statistics.median(processors)}
+
+
+def _spread(clocks: Sequence[float]) -> Values:
+    found = {"ms": statistics.median(clocks), "low": min(clocks), "high": max(clocks)}
+    return {name: round(value, 4) for name, value in found.items()}
+
+
+def command(arguments: Sequence[str], store: Path) -> Values:
+    """Run `hybridlog` in a process: ms on the clock and of the processor, peak memory in MB."""
+    environment = os.environ | {"HYBRIDLOG_STORE": str(store)}
+    with tempfile.TemporaryFile() as printed:
+        begun = time.monotonic()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hybridlog", *arguments],
+            env=environment,
+            stdout=printed,
+            stderr=printed,
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        clock = time.monotonic() - begun
+        process.returncode = os.waitstatus_to_exitcode(status)
+        printed.seek(0)
+        said = printed.read().decode(errors="replace").strip()
+    if process.returncode:
+        raise SideError(f"hybridlog {arguments[0]}: exit code {process.returncode}: {said[-500:]}")
+    return {
+        "ms": 1e3 * clock,
+        "cpu_ms": 1e3 * (usage.ru_utime + usage.ru_stime),
+        "peak_mb": usage.ru_maxrss / 1000,
+    }
+
+
+def _commands(arguments: Sequence[str], store: Path, times: int) -> Values:
+    runs = []
+    for _ in range(times + 1):
+        with tempfile.TemporaryDirectory(dir=store.parent) as folder:
+            filled = [part.replace("{out}", f"{folder}/out") for part in arguments]
+            runs.append(command(filled, store))
+    runs = runs[1:]
+    medians = {name: statistics.median(run[name] for run in runs) for name in ("cpu_ms", "peak_mb")}
+    return _spread([run["ms"] for run in runs]) | medians
+
+
+# --- the groups -----------------------------------------------------------------------
+
+
+def commands_side(*, store: str, directory: str, times: int, **_: Any) -> Values:
+    """The command line on the robot's log."""
+    place = Path(store)
+    log = place.parent / "robot.mcap"
+    fresh = Path(directory) / "store"
+    rows = {"`record` of the log": _recorded(log, fresh)}
+    stored = disk_bytes(fresh)
+    segments = sum(path.stat().st_size for path in fresh.rglob("*.mcap"))
+    rows["`compact`"] = command(("compact",), fresh)
+    for name, arguments in COMMANDS.items():
+        rows[name] = _commands(arguments, place, times)
+    about = {"log_bytes": log.stat().st_size, "disk_bytes": stored, "segment_bytes": segments}
+    return {"rows": rows, **about}
+
+
+def sql_side(*, store: str, times: int, **_: Any) -> Values:
+    """SQL in an open store, beside DuckDB alone on the same files."""
+    import duckdb
+
+    import hybridlog as hl
+
+    rows: Values = {}
+    with hl.open(store) as opened, duckdb.connect() as alone:
+        for name, kind in (("odom", "nav_msgs_Odometry"), ("imu__data", "sensor_msgs_Imu")):
+            glob = f"{store}/tables/{kind}~*/*.parquet"
+            alone.execute(f"create view {name} as select * from read_parquet('{glob}')")
+        for name, query in SQL.items():
+
+            def ours(query: str = query) -> Any:
+                return opened.sql(query).rows()
+
+            def theirs(query: str = query) -> Any:
+                return alone.sql(query).fetchall()
+
+            if len(ours()) != len(theirs()):
+                raise SideError(f"{name}: the answers differ")
+            rows[name] = timed(ours, times) | {"duckdb_ms": timed(theirs, times)["ms"]}
+    return {"rows": rows}
+
+
+def many_side(*, directory: str, recordings: int, times: int, **_: Any) -> Values:
+    """A store with many recordings of 200 messages on four topics, a day apart."""
+    import hybridlog as hl
+
+    place, logs = Path(directory) / "many", Path(directory)
+    with hl.open(place, create=True) as store:
+        for day in range(recordings):
+            store.record(_write_day(logs / "day.mcap", day), name=f"day{day:05d}")
+    listing = _commands(("ls",), place, times)
+    del listing["peak_mb"]  # that of this process, of which a child is a copy at first
+    rows = {
+        "`ls`": listing,
+        "open the store": timed(lambda: hl.open(place).close(), times),
+    }
+    begun = robot.START_NS + min(3, recordings - 1) * _DAY_NS
+    days = iter(range(recordings, recordings + 100))
+    with hl.open(place) as store:
+        pose = store.topic("pose")
+        of_a_day = pose.between(begun, begun + _DAY_NS)
+        rows |= {
+            "messages of a day": timed(lambda: sum(1 for _ in of_a_day), times),
+            "count of a day by a predicate": timed(of_a_day.where("x > 7").count, times),
+            "count of all by a predicate": timed(pose.where("x > 7").count, times),
+            "count of the matches in one of all": timed(pose.where("y == 3").count, times),
+            "record one more": timed(lambda: _record_day(store, logs, next(days)), times),
+        }
+    return {"rows": rows}
+
+
+def _record_day(store: Store, logs: Path, day: int) -> None:
+    store.record(_write_day(logs / "more.mcap", day), name=f"more{day}")
+
+
+def _write_day(path: Path, day: int) -> Path:
+    """A log of one day."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1")
+        kind = writer.register_schema(
+            "geometry_msgs/Vector3", "ros1msg", b"float64 x\nfloat64 y\nfloat64 z\n"
+        )
+        topics = ("/pose", "/imu", "/tf", "/joint_states")
+        channels = [writer.register_channel(topic, "ros1", kind) for topic in topics]
+        for number in range(_MANY_MESSAGES):
+            log_time = robot.START_NS + day * _DAY_NS + number * 10**7
+            payload = struct.pack("<3d", number, day, number * 0.01)
+            writer.add_message(channels[number % len(channels)], log_time, payload, log_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def page_side(*, store: str, times: int, seed: int, **_: Any) -> Values:
+    """What the page of `hybridlog view` asks for, 1,600 pixels wide, with all topics."""
+    import httpx2
+    import numpy as np
+
+    random = np.random.default_rng(seed)
+    with _viewed(store) as (address, pid), httpx2.Client(base_url=address, timeout=120) as client:
+
+        def get(path: str, **parameters: Any) -> tuple[float, Any]:
+            begun = time.perf_counter()
+            answer = client.get(path, params=parameters)
+            answer.raise_for_status()
+            return 1e3 * (time.perf_counter() - begun), answer
+
+        listing = [get("recordings", count=100) for _ in range(times + 1)]
+        chosen = listing[0][1].json()["rows"][0]["id"]
+        about = get("recording", recording=chosen)[1].json()
+        begin, end = int(about["begin"]), int(about["end"])
+        topics = [topic["topic"] for topic in about["topics"]]
+
+        def timeline(begin: int, end: int) -> tuple[float, int]:
+            span = {"begin": begin, "end": end, "pixels": PIXELS}
+            ms, answer = get("timeline", recording=chosen, topic=topics, **span)
+            return ms, len(answer.content)
+
+        first = timeline(begin, end)
+        zooms = []
+        for number in range(8 * times):
+            width = max((end - begin) >> (number % 8 + 1), 1_000_000)
+            at = begin + int(random.random() * max(end - begin - width, 1))
+            zooms.append(timeline(at, at + width))
+        memory = _resident_mb(pid)
+    return {
+        "rows": {
+            "list of recordings": _spread([ms for ms, _ in listing[1:]]),
+            "first timeline": _spread([first[0]]),
+            "zoom": _spread([ms for ms, _ in zooms]),
+        },
+        "timeline_bytes": first[1],
+        "memory_mb": memory,
+    }
+
+
+@contextmanager
+def _viewed(store: str) -> Iterator[tuple[str, int]]:
+    """The address of `hybridlog view` on a store, and its process."""
+    arguments = [sys.executable, "-m", "hybridlog", "view", "--json", "--store", store]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            text = ""
+            for line in process.stdout:
+                text += line
+                if text.rstrip().endswith("}"):
+                    break
+            if not text:
+                raise SideError("hybridlog view did not start")
+            yield json.loads(text)["url"], process.pid
+        finally:
+            process.terminate()
+
+
+def _resident_mb(pid: int) -> float:
+    from benchmarks.usage import rss, with_children
+
+    return rss(with_children([pid])) / 1e6
+
+
+def windows_side(*, store: str, windows: int, seed: int, **_: Any) -> Values:
+    """Windows of pictures at random places, beside `preadv` of as many bytes."""
+    import numpy as np
+
+    import hybridlog as hl
+
+    topic, rows = "camera/image_raw", {}
+    segment = max(Path(store).rglob("*.mcap"), key=lambda path: path.stat().st_size)
+    with hl.open(store) as opened, segment.open("rb", buffering=0) as file:
+        for length in (1, 16):
+            size = length * robot.WIDTH * robot.HEIGHT
+            found = opened.windows(
+                topic, fps=5, length=length, features={"images": {"camera": topic}}
+            )
+            order = found.order(seed)[:windows].tolist()
+            last = max(segment.stat().st_size - size, 1)
+            offsets = np.random.default_rng(seed).integers(0, last, windows).tolist()
+
+            def ours(found: Any = found, order: Sequence[int] = order) -> object:
+                return [found[number] for number in order]
+
+            def theirs(offsets: Sequence[int] = offsets, size: int = size) -> object:
+                descriptor = file.fileno()
+                return [os.preadv(descriptor, [bytearray(size)], at) for at in offsets]
+
+            mine, plain = timed(ours, 1), timed(theirs, 1)
+            rows[f"window of {length} picture{'s'[: length > 1]}"] = {
+                "ms": mine["ms"] / len(order),
+                "cpu_ms": mine["cpu_ms"] / len(order),
+                "preadv_ms": plain["ms"] / len(offsets),
+            }
+    return {"rows": rows}
+
+
+GROUPS = ("commands", "sql", "many", "page", "windows")
+"""In their order; `<name>_side` does each."""
