@@ -312,7 +312,7 @@ CASES: dict[str, Case] = {
     "large": _beside("large", Load(12, 640_000, 128, 10)),
     "database": Case("mongod halted, and killed", _stopped_database),
     "kills": Case("kill -9 at random moments under 80 MB/s", _kills),
-    "robot": Case("a minute at 50 MB/s, --budget 128MiB, without and with MongoDB", _robot),
+    "robot": Case("50 MB/s, --budget 128MiB, without and with MongoDB", _robot),
 }
 
 
