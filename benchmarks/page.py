@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.live.cases import CASES
+from benchmarks.loads.robot import RATE
 from benchmarks.numbers import FLOORS, OURS, Spread, number, ordered, percent, size, title
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import record
@@ -263,7 +264,7 @@ def _recording(results: Results) -> list[str]:
     return [
         "## Recording",
         "Twenty topics with messages of one size: the largest load in MB/s of which every message "
-        "was found afterwards; how much faster than real time the log of a robot (928 messages a "
+        f"was found afterwards; how much faster than real time the log of a robot ({RATE} messages a "
         "second, with camera and laser) is kept whole; and what is kept of 640 kB at 64 Hz a "
         "topic, 819 MB/s. ≥: the harness could not offer more.",
         _by_backend(["system", *sizes, "a robot's log", "kept of 819 MB/s"], columns),
@@ -356,7 +357,7 @@ def _tasks(results: Results) -> list[str]:
     if commands:
         case = next(s.case for s in results.of("tasks") if s.case["group"] == "commands")
         parts += [
-            f"One recording of {case['seconds']} s of the robot's log, {case['seconds'] * 928:,} "
+            f"One recording of {case['seconds']} s of the robot's log, {case['seconds'] * RATE:,} "
             f"messages: {size(commands['log_bytes'])} of MCAP, {size(commands['segment_bytes'])} "
             f"of segments, {size(commands['disk_bytes'])} with all indexes. Each command is a "
             "process of its own.",

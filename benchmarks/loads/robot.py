@@ -1,4 +1,4 @@
-"""The log of a robot: 928 messages a second on eight topics, scans and camera included.
+"""The log of a robot: 948 messages a second on eight topics, scans and camera included.
 
 As messages of a load for the harness, and as an MCAP file to be recorded.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 START_NS = 1_700_000_000 * 10**9
 SECOND_NS = 10**9
-BEAMS, WIDTH, HEIGHT = 360, 640, 480
+BEAMS, WIDTH, HEIGHT = 1080, 640, 480
 JOINTS = (b"left__", b"right_", b"mast__")
 Rows = NDArray[np.void]
 Seconds = NDArray[np.float64]
@@ -102,7 +102,7 @@ def _joint_states(rows: Rows, seconds: Seconds, noise: np.random.Generator) -> N
 def _scan(rows: Rows, seconds: Seconds, noise: np.random.Generator) -> None:
     rows["settings"] = -3.14, 3.14, 6.28 / BEAMS, 0, 0.05, 0.1, 30
     rows["beams"] = BEAMS
-    walls = 6 + 5.6 * np.sin(seconds[:, None] / 61 + np.arange(BEAMS) / 57)
+    walls = 6 + 5.6 * np.sin(seconds[:, None] / 61 + np.arange(BEAMS) / 171)
     rows["ranges"] = np.round(walls + noise.normal(scale=0.01, size=walls.shape), 3)
 
 
@@ -130,12 +130,14 @@ TOPICS: dict[str, tuple[int, str, np.dtype[Any], Fill]] = {
     "/tf": (200, "tf2_msgs/TFMessage", TF, _tf),
     "/odom": (100, "nav_msgs/Odometry", ODOM, _odom),
     "/joint_states": (100, "sensor_msgs/JointState", JOINT_STATES, _joint_states),
-    "/scan": (20, "sensor_msgs/LaserScan", SCAN, _scan),
+    "/scan": (40, "sensor_msgs/LaserScan", SCAN, _scan),
     "/camera/image_raw": (5, "sensor_msgs/Image", IMAGE, _image),
     "/fix": (1, "sensor_msgs/NavSatFix", FIX, _fix),
     "/mode": (1, "std_msgs/UInt8", MODE, _mode),
 }
 """Messages a second, type, layout and content."""
+RATE = sum(rate for rate, *_ in TOPICS.values())
+"""Messages a second of all topics."""
 
 Message = tuple[int, int, bytes]
 """Log time, number of the channel, payload."""

@@ -42,7 +42,7 @@ GROUP_BYTES: Final = 4 << 20
 FILE_BYTES: Final = 1 << 30
 """Bytes of the messages of a file."""
 LEVEL: Final = 3
-"""Level of zstd: the higher ones cost more time than they save room (docs/benchmarks.md)."""
+"""Level of zstd: the higher ones cost more time than they save room (9 takes 1 to 5 % less)."""
 _PLAIN: Final = "PLAIN"
 _SPLIT: Final = "BYTE_STREAM_SPLIT"
 _DELTA: Final = "DELTA_BINARY_PACKED"

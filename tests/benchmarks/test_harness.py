@@ -49,10 +49,6 @@ class Digests(Nothing):
         (self.directory.parent / "seen.json").write_text(json.dumps(self.seen))
 
 
-class SingleDigests(Digests):
-    intake = "single"
-
-
 class Slow(Nothing):
     """The first topic takes 20 ms a message, the others nothing."""
 
@@ -221,13 +217,10 @@ def start(tmp_path: Path) -> Iterator[Runner]:
 # What is counted.
 
 
-@pytest.mark.parametrize(("kind", "intake"), [(Digests, "threads"), (SingleDigests, "single")])
-def test_every_message_arrives_as_it_is(
-    tmp_path: Path, start: Runner, kind: type[Digests], intake: str
-) -> None:
+def test_every_message_arrives_as_it_is(tmp_path: Path, start: Runner) -> None:
     load = make_load(tmp_path / "load")
     before = time.time_ns()
-    found = start(kind, load, intake=intake)
+    found = start(Digests, load)
     after = time.time_ns()
     assert (found.status, found.reason) == ("ok", "")
     seen = json.loads((tmp_path / "run" / "seen.json").read_text())
@@ -238,8 +231,6 @@ def test_every_message_arrives_as_it_is(
     ]
     for channel in range(3):
         assert [d for c, _, d in seen if c == channel] == [d for c, d in sent if c == channel]
-    if intake == "single":
-        assert [(c, d) for c, _, d in seen] == sent
     assert all(before < log_time < after for _, log_time, _ in seen)
 
 
@@ -304,36 +295,6 @@ def test_longer_queues_drop_less(tmp_path: Path, start: Runner) -> None:
     found = start(Slow, make_load(tmp_path / "load", messages=60), queue=60)
     assert found.values["dropped"] == 0
     assert found.values["depth_max"] > 10
-
-
-def test_a_single_intake_may_lie_behind_by_bytes(tmp_path: Path, start: Runner) -> None:
-    load = make_load(tmp_path / "load", messages=60)
-    limit = int(load.length[:30].sum())
-    values = start(Slow, load, intake="single", ahead_bytes=limit).values
-    assert values["dropped"] > 0
-    assert values["published"] == values["persisted"] + values["dropped"] == 180
-    assert values["depth_max"] > 10
-    assert sum(persisted for _, _, persisted in values["topics"].values()) == values["persisted"]
-
-
-def test_a_message_over_the_limit_of_a_single_intake_travels_alone(
-    tmp_path: Path, start: Runner
-) -> None:
-    load = make_load(tmp_path / "load", messages=5, rate=10)
-    values = start(Nothing, load, intake="single", ahead_bytes=1).values
-    # A slow machine may drop the next one; each that travels is over the limit.
-    assert values["persisted"] + values["dropped"] == 15
-    assert values["persisted"] > 5
-
-
-def test_more_tokens_than_a_pipe_holds(tmp_path: Path, start: Runner) -> None:
-    load = make_load(tmp_path / "load", topics=1, messages=140_000, rate=1e6)
-    values = start(SingleDigests, load, intake="single").values
-    assert (values["persisted"], values["dropped"]) == (140_000, 0)
-    seen = json.loads((tmp_path / "run" / "seen.json").read_text())
-    content = load.payloads.read_bytes()
-    last = content[int(load.offset[-1]) :]
-    assert seen[-1][2] == sha256(last).hexdigest()
 
 
 def test_inserts_that_raise_are_counted(start: Runner) -> None:
@@ -496,9 +457,8 @@ def test_counters_are_shared_through_the_file(tmp_path: Path) -> None:
     one = Counters(tmp_path / "counters", 3)
     other = Counters(tmp_path / "counters")
     one.sent[2], one.dropped[0], one.taken[1], one.errors[2] = 2**40, 5, 6, 7
-    one.taken_bytes[0] = 8
     assert other.published() == [5, 0, 2**40]
-    assert (other.taken[1], other.errors[2], other.taken_bytes[0]) == (6, 7, 8)
+    assert (other.taken[1], other.errors[2]) == (6, 7)
     assert len(other.sent) == len(other.errors) == 3
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from benchmarks.live import cases
-from benchmarks.live.cases import CASES, Row, _recorded
-from benchmarks.live.command import main, markdown
+from benchmarks.live.cases import CASES, Case, Row, _recorded
 from benchmarks.live.recorders import Kept
 from benchmarks.live.talker import Load
+from benchmarks.samples import Journal
+from benchmarks.studies.runs import Context
 
 
 def test_a_load_is_counted_to_the_last_message(tmp_path: Path) -> None:
@@ -43,28 +44,12 @@ def test_messages_are_counted_in_whole_bursts() -> None:
     assert Load(20, 640_000, 64, 30).megabytes_per_s == pytest.approx(819.2)
 
 
-def test_the_table_names_its_conditions() -> None:
-    header = {
-        "cpu": "a cpu",
-        "cores": 2,
-        "memory_gib": 8,
-        "disk": "ext4 on vda",
-        "system": "Linux",
-        "python": "3.11",
-        "mongod": "6.0",
-        "revision": "abc",
-        "started": "today",
-        "quick": True,
-    }
-    text = markdown(header, [Row("paper", "hybridlog", {"stolen_s": 2.5}, "all", holds=True)])
-    assert f"| {CASES['paper'].about} | hybridlog | all |" in text
-    assert "took 2.5 s of processor time away" in text
-    assert "Quick run" in text
-
-
-def test_help_names_every_case(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as leaving:
-        main(["--help"])
-    assert leaving.value.code == 0
-    said = capsys.readouterr().out
-    assert all(name in said for name in CASES)
+def test_every_case_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not hold is a failure, and its row is kept."""
+    row = Row("small", "hybridlog", {"missing": 1}, "one is missing", holds=False)
+    monkeypatch.setitem(CASES, "small", Case("one topic", lambda work, quick: iter([row])))
+    context = Context(tmp_path, {}, Journal(tmp_path / "out"))
+    cases.run(context, "small")
+    (sample,) = context.journal.samples.values()
+    assert (sample.status, sample.reason) == ("failed", "one is missing")
+    assert sample.values["rows"] == [row._asdict()]
