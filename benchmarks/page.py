@@ -265,8 +265,8 @@ def _recording(results: Results) -> list[str]:
         "## Recording",
         "Twenty topics with messages of one size: the largest load in MB/s of which every message "
         "was found afterwards; how much faster than real time the log of a robot "
-        f"({RATE} messages a second, with camera and laser) is kept whole; and what is kept of 640 kB at 64 Hz a "
-        "topic, 819 MB/s. ≥: the harness could not offer more.",
+        f"({RATE} messages a second, with camera and laser) is kept whole; and what is kept of "
+        "640 kB at 64 Hz a topic, 819 MB/s. ≥: the harness could not offer more.",
         _by_backend(["system", *sizes, "a robot's log", "kept of 819 MB/s"], columns),
         "A trial is short, so part of a heavy stream may wait in memory: hybridlog within its "
         "budget, files in the cache of the system. ROS bag and MCAP index no fields; the ROS bag "
