@@ -10,7 +10,6 @@ the rows, so it lacks no file of a recording that it lists. Lines of removed rec
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import re
@@ -359,8 +358,7 @@ def locked(root: Path) -> Iterator[None]:
     Raises:
         FileNotFoundError: there are none.
     """
-    with files.folder(root / TABLES, 1) as fd:
-        fcntl.flock(fd, fcntl.LOCK_EX)
+    with files.locked_folder(root / TABLES, 1):
         yield
 
 

@@ -7,7 +7,6 @@ Agreements are outside all stores, in `$XDG_STATE_HOME/hybridlog/trusted.json`.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import stat
@@ -126,8 +125,7 @@ def _changing() -> Iterator[dict[str, list[str]]]:
     path = directory / _NAME
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with files.folder(directory, 0) as fd:
-            fcntl.flock(fd, fcntl.LOCK_EX)
+        with files.locked_folder(directory, 0):
             trusted = _trusted()
             yield trusted
             content = json.dumps({_STORES: trusted}, indent=2) + "\n"

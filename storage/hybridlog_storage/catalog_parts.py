@@ -8,7 +8,6 @@ whoever misses it.
 
 from __future__ import annotations
 
-import fcntl
 import re
 import time
 from collections.abc import Iterator
@@ -20,7 +19,6 @@ from urllib.parse import quote, unquote
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.stopping import pause
 
 VERSION: Final = 7
 MAX_PART_BYTES: Final = 48 << 10
@@ -42,7 +40,6 @@ _HEAD = re.compile(rb"hybridlog catalog (\d+) (\S*) (\d{10})\n")
 _LINE_BYTES: Final = 64  # of a line besides its text
 _MAX_BYTES: Final = 1 << 30
 _TICK_NS: Final = 50_000_000
-_POLL_S: Final = 0.005
 
 Version = tuple[int, ...]
 
@@ -267,14 +264,5 @@ class DiskFolder(MemoryFolder):
         """
         with suppress(FileExistsError):
             files.make_folder(self.path, depth=files.IN_STORE)
-        begun = time.monotonic()
-        with files.folder(self.path, files.IN_STORE) as fd:
-            while True:
-                try:
-                    fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError:
-                    if time.monotonic() - begun >= wait_s:
-                        raise
-                    pause(_POLL_S)
+        with files.locked_folder(self.path, files.IN_STORE, wait_s):
             yield

@@ -323,7 +323,7 @@ def step_database(seam: Seam) -> None:
 
         setattr(Database, method, call)
 
-    insert, delete, replace_all = Database.insert_raw, Database.delete, Database.replace_all
+    insert, delete = Database.insert_raw, Database.delete
     delete_each = Database.delete_each
 
     def half_of_insert(
@@ -341,13 +341,9 @@ def step_database(seam: Seam) -> None:
     def half_of_delete_each(self: Database, collection: str, filters: Sequence[Any]) -> None:
         delete_each(self, collection, filters[: len(filters) // 2])
 
-    def half_of_replace_all(self: Database, collection: str, documents: Sequence[Any]) -> None:
-        replace_all(self, collection, documents[: len(documents) // 2])
-
     stepped("insert_raw", "insert", half_of_insert)
     stepped("delete", "delete", half_of_delete)
     stepped("delete_each", "delete", half_of_delete_each)
-    stepped("replace_all", "replace all", half_of_replace_all)
     for method in ("replace", "update"):
         stepped(method, method)
     for method in ("ensure_collection", "drop", "create_index", "drop_index"):

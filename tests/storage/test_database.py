@@ -152,7 +152,7 @@ def test_nothing_to_insert(database: Database, name: str) -> None:
 
 
 def test_with_the_journal(database: Database, name: str) -> None:
-    assert database.insert_raw(name, b"".join(encoded(3)), 3, journal=True) == 3
+    assert database.insert_raw(name, b"".join(encoded(3)), 3) == 3
 
 
 @pytest.mark.parametrize(
@@ -560,8 +560,9 @@ def test_killed_in_the_middle_of_inserting(
     with EmbeddedMongod(directory, linger_s=0) as user:
         with Database.connect(user.start(), timeout_s=0.5) as database:
             database.ensure_collection("a")
-            # What is acknowledged with the journal outlives a kill.
-            assert database.insert_raw("a", raw[: lengths[:10].sum()], 10, journal=True) == 10
+            # What was written before a checkpoint outlives a kill.
+            assert database.insert_raw("a", raw[: lengths[:10].sum()], 10) == 10
+            database.checkpoint()
             pid = json.loads((directory / "mongod.json").read_text())["mongod"]
             threading.Timer(0.05, os.kill, (pid, signal.SIGKILL)).start()
 

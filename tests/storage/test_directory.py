@@ -137,7 +137,7 @@ def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:
     for name in names:
         (recording / name).write_bytes(b"")
     assert [n for n, _ in store.segments("r")] == [2, 10]
-    assert [n for n, _ in store.open_segments("r")] == [3]
+    assert [*store.listing("r").open] == [3]
     assert store.segments("nothing") == []
 
 

@@ -140,7 +140,7 @@ class StoreDirectory:
             if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
-                with _alone(path, depth=0):
+                with files.locked_folder(path, 0):
                     settings = StoreSettings(
                         secrets.token_hex(16), mongo=mongo, shared=shared, cache_mb=cache_mb
                     )
@@ -405,11 +405,6 @@ class StoreDirectory:
         path = self.recording(label)
         return [(number, path / name) for number, name in self.listing(label).sealed.items()]
 
-    def open_segments(self, label: str) -> list[tuple[int, Path]]:
-        """Number and path of each unsealed segment, in order."""
-        path = self.recording(label)
-        return [(number, path / name) for number, name in self.listing(label).open.items()]
-
     @property
     def mongod(self) -> Path:
         """Directory of the embedded MongoDB."""
@@ -451,7 +446,7 @@ class StoreDirectory:
         locked. Without that lock, an empty recording is left from a crash.
         """
         try:
-            with _alone(self.recordings, depth=files.IN_STORE, wait=False):
+            with files.locked_folder(self.recordings, files.IN_STORE, 0):
                 return False
         except OSError:
             return True
@@ -499,7 +494,7 @@ class StoreDirectory:
     def alone(self) -> Iterator[None]:
         """Lock `recordings`, so that no other process starts a recording; for moments only."""
         try:
-            with _alone(self.recordings, depth=files.IN_STORE):
+            with files.locked_folder(self.recordings, files.IN_STORE):
                 yield
         except OSError as error:
             raise durability.explain(error, self.path, "locking") from error
@@ -509,7 +504,7 @@ class StoreDirectory:
         """Lock out other passes of retention; yields False if another process makes one."""
         with ExitStack() as held:
             try:
-                held.enter_context(_alone(self.path, depth=0, wait=False))
+                held.enter_context(files.locked_folder(self.path, 0, 0))
             except BlockingIOError:
                 yield False
                 return
@@ -682,18 +677,6 @@ def _read_holder(fd: int) -> Holder:
     if found is None or not line.isprintable():
         return Holder("another process", is_recording=False)
     return Holder(f"process {found[1]} ({found[3]})", is_recording=found[2] == "1")
-
-
-@contextmanager
-def _alone(directory: Path, *, depth: int, wait: bool = True) -> Iterator[None]:
-    """Lock a directory.
-
-    Raises:
-        BlockingIOError: Another process holds the lock, and `wait` is not set.
-    """
-    with files.folder(directory, depth) as fd:
-        fcntl.flock(fd, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
 
 
 def _numbered_label(base: str, number: int) -> str:

@@ -10,10 +10,7 @@ never meets a half-made one.
 from __future__ import annotations
 
 import errno
-import os
-import secrets
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,39 +80,6 @@ def publish(temporary: Path, final: Path, *, depth: int) -> None:
     files.sync_folder(final.parent, depth=depth - 1)
 
 
-@contextmanager
-def new_file(final: Path, *, depth: int) -> Iterator[int]:
-    """Descriptor of a temporary file that becomes `final` if the block succeeds.
-
-    Otherwise the temporary file is removed. The umask decides who may read the file.
-
-    Args:
-        final: Its name after the block.
-        depth: As for `files.open_file`.
-
-    Raises:
-        HybridlogError: It cannot be created or written.
-    """
-    temporary = final.with_name(f".{final.name}.{secrets.token_hex(8)}")
-    try:
-        fd = files.open_file(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, depth=depth)
-    except OSError as error:
-        raise explain(error, final, "creating") from error
-    published = False
-    try:
-        yield fd
-        sync_file(fd)
-        publish(temporary, final, depth=depth)
-        published = True
-    except OSError as error:
-        raise explain(error, final, "writing") from error
-    finally:
-        os.close(fd)
-        if not published:
-            with suppress(OSError):
-                files.unlink(temporary, depth=depth)
-
-
 def write_new(final: Path, content: bytes, *, depth: int) -> None:
     """Write a small file atomically.
 
@@ -127,5 +91,7 @@ def write_new(final: Path, content: bytes, *, depth: int) -> None:
     Raises:
         HybridlogError: It cannot be written.
     """
-    with new_file(final, depth=depth) as fd:
-        write_all(fd, [content])
+    try:
+        files.write_file(final, content, depth=depth)
+    except OSError as error:
+        raise explain(error, final, "writing") from error

@@ -19,16 +19,20 @@ order of steps, to fail at a step, or to lose unsynced data.
 from __future__ import annotations
 
 import errno
+import fcntl
+import math
 import os
 import resource
 import secrets
 import stat
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, Protocol, cast
 
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.stopping import pause
 
 IN_STORE: Final = 1
 """Depth of a file in the store's own folder."""
@@ -40,6 +44,7 @@ IN_RECORDING: Final = 3
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _SHARED = stat.S_ISGID | stat.S_IWGRP
 _GROUP = stat.S_IRWXG
+_POLL_S = 0.005  # between two looks at a lock
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 Identity = tuple[int, int]
 """Inode of a folder, and time of its last change, ns."""
@@ -219,7 +224,7 @@ def write_file(
     Raises:
         OSError: It cannot be written; no part of it remains.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode, depth=depth)
     try:
         try:
@@ -237,6 +242,32 @@ def write_file(
         raise
     if sync:
         sync_folder(path.parent, depth=depth - 1)
+
+
+@contextmanager
+def locked_folder(path: Path, depth: int, wait_s: float = math.inf) -> Iterator[None]:
+    """Lock a folder against other processes.
+
+    Args:
+        path: The folder.
+        depth: As for `folder`.
+        wait_s: Seconds to wait for them; without end if not given.
+
+    Raises:
+        BlockingIOError: Another process has held the lock for longer.
+        OSError: The folder cannot be opened.
+    """
+    begun = time.monotonic()
+    with folder(path, depth) as fd:
+        while True:
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait_s == math.inf else fcntl.LOCK_NB))
+                break
+            except BlockingIOError:
+                if time.monotonic() - begun >= wait_s:
+                    raise
+                pause(_POLL_S)
+        yield
 
 
 def status(path: Path, *, depth: int = IN_RECORDING) -> os.stat_result:

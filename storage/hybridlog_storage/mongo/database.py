@@ -324,7 +324,6 @@ class Database:
         count: int,
         *,
         lengths: NDArray[np.int64] | None = None,
-        journal: bool = False,
     ) -> int:
         """Insert documents as they are.
 
@@ -337,8 +336,6 @@ class Database:
             documents: `count` BSON documents, one after the other.
             count: Their number.
             lengths: int64[count], bytes of each document; avoids walking over them.
-            journal: Return only when the documents are in the journal on disk (and, in a
-                replica set, with the majority).
 
         Returns:
             Number of new documents; fewer after a repeated command.
@@ -356,7 +353,7 @@ class Database:
             # All documents are passed without a copy; pymongo before 4.18 takes bytes only.
             is_whole = isinstance(documents, bytes) and end - start == len(documents)
             part = documents if is_whole else whole[start:end]
-            inserted += self._insert_batch(collection, bytes(part), journal=journal)
+            inserted += self._insert_batch(collection, bytes(part))
         return inserted
 
     def insert_missing(self, collection: str, documents: Sequence[Mapping[str, object]]) -> int:
@@ -367,7 +364,7 @@ class Database:
             encoded = [encode(document) for document in documents]
         return self.insert_raw(collection, b"".join(encoded), len(encoded))
 
-    def _insert_batch(self, collection: str, documents: bytes, *, journal: bool) -> int:
+    def _insert_batch(self, collection: str, documents: bytes) -> int:
         if not collection or "$" in collection or "\0" in collection:
             raise DatabaseError(f"{collection!r} cannot be the name of a collection.")
         command: Document = {
@@ -375,9 +372,7 @@ class Database:
             "documents": [_pass_through(documents)],
             "ordered": False,
         }
-        if journal:
-            command["writeConcern"] = {"w": "majority", "j": True}
-        elif not self._write_concern.is_server_default:
+        if not self._write_concern.is_server_default:
             command["writeConcern"] = self._write_concern.document
 
         def insert() -> Document:
@@ -677,15 +672,6 @@ class Database:
         """Replace the first matching document, or insert it if none matches."""
         of = self._collection(collection)
         self._again(lambda: of.replace_one(dict(filter), dict(document), upsert=upsert))
-
-    def replace_all(self, collection: str, documents: Sequence[Mapping[str, object]]) -> None:
-        """Replace or insert each document by its `_id`."""
-        from pymongo import ReplaceOne
-
-        if documents:
-            changes = [ReplaceOne({"_id": d["_id"]}, dict(d), upsert=True) for d in documents]
-            of = self._collection(collection)
-            self._again(lambda: of.bulk_write(changes, ordered=False))
 
     def update(
         self,

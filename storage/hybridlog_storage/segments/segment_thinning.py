@@ -55,7 +55,6 @@ def thin(
     target: Path,
     records: Mapping[int, Callable[[Buffer], bytes]],
     about: Mapping[str, Any],
-    progress: Callable[[], None] | None = None,
 ) -> Sealed:
     """Write a segment without the content of some chunks.
 
@@ -65,7 +64,6 @@ def thin(
         records: What makes the record in place of that of a chunk, by the chunk's number:
             `moved_record` or `expired_record`.
         about: Content of the metadata record that says so.
-        progress: Called after each chunk.
 
     Returns:
         The new segment; it is on the disk.
@@ -82,7 +80,7 @@ def thin(
         raise durability.explain(error, target, "creating") from error
     segment = SegmentFile(target, reader.number, file)
     try:
-        _copy(reader, summary, segment, records, progress)
+        _copy(reader, summary, segment, records)
         segment.add_metadata(json_metadata(COMPACTED_METADATA, about))
         sealed = segment.complete()
         segment.finish()
@@ -97,7 +95,6 @@ def _copy(
     summary: SegmentSummary,
     segment: SegmentFile,
     records: Mapping[int, Callable[[Buffer], bytes]],
-    progress: Callable[[], None] | None,
 ) -> None:
     ids = summary.schema_ids
     stored = summary.table.as_stored()
@@ -121,8 +118,6 @@ def _copy(
             record = records[piece.chunk](record)
         parts = stored.parts[bounds[piece.chunk] : bounds[piece.chunk + 1]]
         segment.append_copy(record, trailer, parts)
-        if progress is not None:
-            progress()
 
     def moved_to(offset: int) -> int:
         at = bisect_right(old, offset) - 1
