@@ -512,6 +512,16 @@ class Session:
         finally:
             self._pinned.moment = None
 
+    @contextmanager
+    def noticing_changes(self) -> Iterator[None]:
+        """Let the next question read the store again if an answer meets changed files."""
+        try:
+            yield
+        except StoreError:
+            if self.has_changed():
+                self.invalidate()
+            raise
+
     def all_at_one_moment(self, steps: Generator[_T, None, None]) -> Generator[_T, None, None]:
         """Let a generator see the recordings of one moment, whichever threads its steps run on.
 

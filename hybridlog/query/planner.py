@@ -321,17 +321,19 @@ class Planner:
         """All messages that match, in order; recordings are read when their turn comes."""
         limit = self.question.limit
         ahead = limit is None or limit > _READ_AHEAD_FROM
-        for group in self.groups():
-            plan = self.plan(group)
-            yield from ChunkScan(plan, self.session.segment, ahead=ahead).runs()
+        with self.session.noticing_changes():
+            for group in self.groups():
+                plan = self.plan(group)
+                yield from ChunkScan(plan, self.session.segment, ahead=ahead).runs()
 
     def unordered(self) -> Iterator[MessageRun]:
         """The messages of an answer without `limit` and `every`, unordered."""
-        for group in self.groups():
-            plan = self.plan(group)
-            for run in ChunkScan(plan, self.session.segment).unordered():
-                self.counters.add_messages(run.batch)
-                yield run
+        with self.session.noticing_changes():
+            for group in self.groups():
+                plan = self.plan(group)
+                for run in ChunkScan(plan, self.session.segment).unordered():
+                    self.counters.add_messages(run.batch)
+                    yield run
 
     def groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.

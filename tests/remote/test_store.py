@@ -332,6 +332,8 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, changes: bool) -
         lose(address, "000001.mcap", run, changes=changes)
         with pytest.raises(StoreError, match="missing or was changed"):
             list(store.topic("/scan"))  # it has begun to answer
+        assert 20 < sum(1 for _ in store.topic("/scan")) < whole + 20
+        assert store.topic("/scan").completeness().has_losses
     files.mounted.clear()
     with hl.open(address) as store:
         left = sum(1 for _ in store.topic("/scan")) - 20
