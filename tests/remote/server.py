@@ -51,6 +51,8 @@ class Proxy:
 
     Attributes:
         requests: Method, object and range of each request so far.
+        received: Bytes of their answers.
+        sent: Bytes of their bodies.
         spoil: Called with the number of each request, from 1; says what becomes of it: "reset"
             before it reaches the server, "lost" after that, "503", "403", "cut" in the middle of
             the answer, "slow", or "" for nothing.
@@ -61,6 +63,7 @@ class Proxy:
 
     def __init__(self, port: int) -> None:
         self.requests: list[tuple[str, str, str]] = []
+        self.received = self.sent = 0
         self.spoil: Callable[[int], str] = lambda _: ""
         self.delay = 0.0
         self.without_conditions = False
@@ -87,6 +90,7 @@ class Proxy:
     def reset(self) -> None:
         """Forget the requests, and spoil none."""
         self.requests.clear()
+        self.received = self.sent = 0
         self.spoil = lambda _: ""
         self.delay = 0.0
         self.without_conditions = False
@@ -102,6 +106,7 @@ class Proxy:
         self.requests.append((client.command, client.path, headers.get("range", "")))
         what = self.spoil(len(self.requests))
         body = client.rfile.read(int(headers.get("content-length", 0)))
+        self.sent += len(body)
         time.sleep(self.delay)
         if what == "reset":
             _break(client)
@@ -117,6 +122,7 @@ class Proxy:
             server.request(client.command, client.path, body, headers)
             answer = server.getresponse()
             content = answer.read()
+        self.received += len(content)
         if self.old_lists is not None and "list-type" in client.path:
             content = self.old_lists.setdefault(client.path, content)
         if what == "lost":
