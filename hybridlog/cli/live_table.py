@@ -14,8 +14,6 @@ from hybridlog.record.losses import Cause
 from hybridlog.wording import listed
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from rich.console import Group
     from rich.text import Text
 
@@ -53,12 +51,7 @@ class LiveTable:
         self._live.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Remove the table."""
         self._live.stop()
         restore_echo()

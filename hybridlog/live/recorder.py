@@ -611,7 +611,7 @@ class Recorder:
         """See `Sink.clock`; `SimulatedTime` uses it."""
 
     def drop(self, channel: Channel, size: int, cause: Cause, detail: str, at: int) -> None:
-        """See `simulated_time.Recording.drop`."""
+        """See `clocks.Recording.drop`."""
         recorded = self._recorded.get(channel) or self._meet(channel, None)
         recorded.tally.add(size, at)
         self._lose(recorded, cause, detail, at)

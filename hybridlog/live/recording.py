@@ -36,8 +36,6 @@ from hybridlog_storage.segments.segment_writer import AT_WORK, PACKERS, SegmentS
 from hybridlog_storage.threads import processors
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog_storage.catalog import Catalog
@@ -248,12 +246,7 @@ class LiveRecording:
         """The recording itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the recording, unless that was tried already."""
         with self._closing:
             if not self._is_closing:

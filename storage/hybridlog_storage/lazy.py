@@ -1,4 +1,4 @@
-"""What is made at its first use: attributes, types of rows, and the import of numpy.
+"""Objects made at their first use: attributes, types of rows, and the import of numpy.
 
 The attribute has no lock: before Python 3.12, the one of functools can outlive a fork.
 """

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Protocol, Self
 from hybridlog.record.losses import Cause
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from hybridlog_storage.messages import Channel
 
 
@@ -171,12 +169,7 @@ class LiveSource(ABC):
         """The source itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop."""
         self.stop()
 

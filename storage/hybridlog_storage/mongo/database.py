@@ -37,8 +37,6 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.settings import LOGIN_CURE
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from numpy.typing import NDArray
     from pymongo import MongoClient
     from pymongo.collection import Collection
@@ -238,12 +236,7 @@ class Database:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

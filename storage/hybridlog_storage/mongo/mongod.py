@@ -44,7 +44,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 from urllib.parse import quote
 
 from hybridlog_storage.disk import files
@@ -60,9 +60,6 @@ from hybridlog_storage.errors import (
     exhausted,
 )
 from hybridlog_storage.settings import MIN_CACHE_MB
-
-if TYPE_CHECKING:
-    from types import TracebackType
 
 DEFAULT_LINGER_S = 5.0
 SILENCE_LIMIT_S = 30.0
@@ -230,12 +227,7 @@ class EmbeddedMongod:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _leave(self) -> None:
