@@ -46,11 +46,11 @@ GROUPS: Final = {
     "Record": {
         "record": "record",
         "mark": "edit",
-        "trigger": "trigger",
+        "trigger": "top",
         "top": "top",
         "import": "copy",
     },
-    "Look": {"ls": "ls", "info": "info", "view": "view", "open": "open", "plot": "plot"},
+    "Look": {"ls": "ls", "info": "info", "view": "open", "open": "open", "plot": "plot"},
     "Ask": {
         "fetch": "fetch",
         "intervals": "intervals",
@@ -61,18 +61,18 @@ GROUPS: Final = {
         "check": "check",
         "diff": "check",
     },
-    "Export": {"export": "export", "copy": "copy", "mcp": "mcp"},
+    "Export": {"export": "export", "copy": "copy", "mcp": "open"},
     "Maintain": {
         "tag": "edit",
         "edit": "edit",
         "keep": "keep",
         "index": "index",
-        "tables": "tables",
+        "tables": "maintain",
         "verify": "maintain",
         "repair": "maintain",
         "compact": "maintain",
         "rm": "edit",
-        "demo": "demo",
+        "demo": "record",
     },
 }
 """Names of the commands by group, in the order of the help text, and their modules."""

@@ -1,9 +1,9 @@
-"""`hybridlog export`."""
+"""`hybridlog export`, and answers that are split over several files."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,6 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.lerobot import LEROBOT, check_options, export_set, lerobot_options
 from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.split import pieces
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
@@ -35,10 +34,12 @@ from hybridlog_storage.errors import (
     TimeError,
     UsageError,
 )
-from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.attachments import Extras
+    from hybridlog.query.pieces import Piece
     from hybridlog.query.query import Query
 
 _LOGS = formats_of("log")
@@ -162,6 +163,8 @@ def _remove_empty(directory: Path) -> None:
 
 
 def _write_files(query: Query, to: Destination, directory: Path, front: Front) -> None:
+    from hybridlog_storage.mongo.collection_names import collection_of
+
     suffix, topics = OUTPUTS[to.form].suffixes[0], [*query.topics]
     if OUTPUTS[to.form].content == "video":
         topics = _image_topics(query)
@@ -214,3 +217,46 @@ def _print_written(
             f"{latched(query.counters)}{beside}, "
             f"{output.size(sum(one.stat().st_size for one in files))}"
         )
+
+
+def pieces(
+    query: Query, how: str, target: Path, *, force: bool, is_directory: bool | None
+) -> Iterator[tuple[Path, Query]]:
+    """The parts of an answer that have messages, and where to write each; says which have none.
+
+    Args:
+        query: The whole question.
+        how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
+        target: The output.
+        force: Overwrite files.
+        is_directory: Each part is a directory with a file a message; None if the writer checks
+            its files.
+
+    Raises:
+        UsageError: A predicate of no topic, or a file exists.
+        WhereError: It cannot be parsed, or does not fit the fields.
+        TopicError: There is no such topic.
+    """
+    from hybridlog.query.pieces import pieces as split
+
+    there = [*split(query, how)]
+    if not there and how != "recording":
+        output.note("No mark." if how == "mark" else "No interval.")
+    found = [piece for piece in there if _has_messages(piece)]
+    if not found:
+        output.note("No messages, so no file.")
+    paths = [target.with_name(f"{target.stem}-{one.name}{target.suffix}") for one in found]
+    if is_directory is not None:
+        for path in paths:
+            check_room(path, force=force, is_directory=is_directory)
+    yield from zip(paths, (piece.query for piece in found), strict=True)
+
+
+def _has_messages(piece: Piece) -> bool:
+    try:
+        count = piece.query.count()
+    except TimeError:  # the range is outside
+        count = 0
+    if not count:
+        output.note(f"{piece.name}: no messages, so no file.")
+    return count > 0

@@ -137,7 +137,7 @@ def fetch_command(choices: _Choices) -> None:
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
-    from hybridlog.cli.split import pieces
+    from hybridlog.cli.export import pieces
 
     how = choices.split
     assert to.path is not None

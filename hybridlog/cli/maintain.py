@@ -1,24 +1,31 @@
-"""`hybridlog verify`, `repair` and `compact`."""
+"""`hybridlog verify`, `repair`, `compact` and `tables`."""
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet
+from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet, query_of
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, UsageError, WithoutMongoError
+from hybridlog_storage.errors import DatabaseError, TopicError, UsageError, WithoutMongoError
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from hybridlog.maintenance.report import CompactedTopic
     from hybridlog.maintenance.verify import Verification
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.store import Store
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,3 +181,79 @@ def _told(one: CompactedTopic, *, dry_run: bool) -> str:
     if one.kept:
         parts.append(f"{one.kept} without columns: {one.reason}")
     return f"{one.recording} {one.topic}: {'; '.join(parts)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tables(Choosing, InStore, AsJson):
+    topic: str = argument(
+        "Full name, or an unambiguous short one (scan).", "TOPIC", shell_complete=complete_topic
+    )
+
+
+@command(_Tables)
+def tables_command(given: _Tables) -> None:
+    """Show a topic's Parquet files, and SQL for DuckDB."""
+    from hybridlog.snapshot import UNFINISHED
+
+    with given.opened() as store:
+        channels = query_of(store, [given.topic], given.choice).channels()
+        ended = [one for one in channels if one.recording.status not in UNFINISHED]
+        for one in ended:  # made again where they are missing
+            store.session.table(one.recording, one.channel.topic)
+        store.mend(math.inf)
+        store.session.write_recordings_file()
+        found = _found(store, ended)
+        others = len({one.recording.id for one in channels}) - len(
+            {one.recording.id for one in ended}
+        )
+    if given.as_json:
+        output.print_json(found)
+        return
+    if not found:
+        raise TopicError(f"No chosen recording that has ended has a table of {given.topic}.")
+    for item in found:
+        for name in item["files"]:
+            output.say(name)
+        output.say()
+        output.say(f"{item['statement']};")
+        output.say()
+    if others:
+        left = output.counted(others, "unfinished recording")
+        output.note(f"Without {left}: rows are added when a recording ends.")
+
+
+def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
+    """Folders with rows of a topic in some recordings: files, rows, statement."""
+    from glob import escape
+
+    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.layout import type_prefix
+
+    topics = {one.channel.topic for one in channels}
+    recordings = {one.recording.id for one in channels}
+    schemas = [one.channel.schema for one in channels]
+    prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
+    (name,) = topics or {""}
+    folders: dict[Path, dict[str, Any]] = {}
+    others: set[Path] = set()
+    for file in files_of(store.directory.path, prefixes) if prefixes else ():
+        sections = [one for one in file.about.recordings if name in one.topics]
+        rows = sum(one.topics[name].rows for one in sections if one.id in recordings)
+        if not all(one.id in recordings for one in sections):
+            others.add(file.path.parent)
+        if rows:
+            folder = file.path.parent
+            found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
+            found["rows"] += rows
+            found["files"].append(str(file.path))
+    chosen = f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
+    for folder, found in folders.items():
+        files = _quoted(f"{escape(str(folder))}/*.parquet")
+        # The only texts in it are quoted, and nothing is run here.
+        statement = f"select * from {files} where topic = {_quoted(name)}"  # noqa: S608
+        found["statement"] = statement + (chosen if folder in others else "")
+    return list(folders.values())
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

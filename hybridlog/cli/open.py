@@ -1,28 +1,35 @@
-"""`hybridlog open`."""
+"""`hybridlog open`, `view` and `mcp`: recordings for programs beside this one."""
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import Filtered, Forced, Served
-from hybridlog.cli.serve import check_installed, play
-from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
+from hybridlog.cli.signals import SIGNALS, if_stopped
 from hybridlog.formats.slices import SliceCache
+from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from hybridlog.query.query import Query
     from hybridlog.store import Store
+    from hybridlog.view.playback.played import PlayedLog
+    from hybridlog.view.playback.server import PlaybackServer
 
 _WEBSOCKET: Final = "websocket"
 _PORT: Final = 8765
@@ -160,3 +167,204 @@ def _find(viewer: str) -> str:
             return found
     names = " or ".join(programs)
     raise MissingDependencyError(f"There is no program {names} on the PATH: {cure}.")
+
+
+_MAX_SHOWN = 5  # topics
+
+
+def check_installed() -> None:
+    """Refuse to play without the package for it.
+
+    Raises:
+        MissingDependencyError: It is missing.
+    """
+    try:
+        import hybridlog.view.playback.server  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            "open websocket needs websockets: pip install 'hybridlog[foxglove]'"
+        ) from error
+
+
+def play(
+    query: Query, names: Sequence[str], topics: Sequence[str], *, quiet: bool, **how: Any
+) -> None:
+    """Play a query to viewers, until a signal ends it.
+
+    Args:
+        query: The messages.
+        names: Of the recordings, as typed.
+        topics: As typed.
+        quiet: Only print the address.
+        how: Of `PlaybackOptions`.
+    """
+    import asyncio
+
+    from hybridlog.view.playback.played import PlayedLog
+    from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
+
+    log = PlayedLog(query)
+    name = " ".join(["hybridlog", *names])
+    server = PlaybackServer(log, name, PlaybackOptions(**how), output.note)
+    if not quiet:
+        print_remarks(query, topics, is_empty=False)
+        _print_undefined(log)
+    asyncio.run(_until_signal(server, quiet=quiet))
+
+
+async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
+    """Serve until a signal comes; a second one ends the process at once."""
+    import asyncio
+    import signal
+
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+
+    def end() -> None:
+        stop.set()
+        for number, handler in before.items():
+            loop.remove_signal_handler(number)
+            signal.signal(number, handler)
+
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            loop.add_signal_handler(number, end)
+    await server.run(stop, lambda port: _print_address(port, quiet=quiet))
+
+
+def _print_address(port: int, *, quiet: bool) -> None:
+    from urllib.parse import quote
+
+    address = f"ws://127.0.0.1:{port}"
+    output.say(address)
+    sys.stdout.flush()
+    if not quiet:
+        url = f"https://app.foxglove.dev/?ds=foxglove-websocket&ds.url={quote(address, safe='')}"
+        output.note(f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}")
+        output.note(f"In a browser: {url}")
+        output.note("Ctrl-C ends it.")
+
+
+def _print_undefined(log: PlayedLog) -> None:
+    """Print the topics that a viewer cannot show, since nothing defines their messages."""
+    topics = {
+        each.channel.topic
+        for each in log.channels
+        if each.channel.message_encoding != "json"
+        and (each.channel.schema is None or not each.channel.schema.data)
+    }
+    if topics:
+        output.note(
+            f"Viewers cannot show {listed(sorted(topics), _MAX_SHOWN)}: there is no definition."
+        )
+
+
+_MAX_FOLDERS = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class _View(InStore, AsJson, Served):
+    recording: str | None = one_recording(
+        "Show this one first; without, the list of recordings.", "[RECORDING]"
+    )
+    opens: bool = option("Open the page in the browser.", name="--open")
+    mcap: bool = option("Also serve selections as MCAP, to Foxglove and Lichtblick.")
+
+
+@command(_View)
+def view_command(given: _View) -> None:
+    """Look at recordings in the browser.
+
+    The page has a timeline, plots, pictures and scans, and takes questions. Only this computer
+    can open it, at an address with a secret token. The store is only read. Ctrl-C ends it.
+    """
+    import threading
+    import webbrowser
+    from urllib.parse import quote
+
+    try:
+        from hybridlog.view.server import ViewServer
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
+        ) from error
+    if given.store is None and not os.environ.get("HYBRIDLOG_STORE"):
+        given = replace(given, store=_only_store_near())
+    if given.origins and not given.mcap:
+        raise UsageError("--allow-origin is about --mcap: add that.")
+    with given.opened(is_lasting=True) as store:
+        server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
+        url = server.url
+        label = ""
+        if given.recording is not None:
+            (entry,) = store.select([given.recording])
+            label = quote(entry.label, safe="")
+            url += f"#recording={label}"
+        if given.as_json:
+            shown = {"url": url, "port": server.port}
+            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if given.mcap else {}))
+        else:
+            click.echo(url)
+            output.note("Open this address in a browser. Ctrl-C ends the server.")
+            if given.mcap:
+                _print_mcap(f"{server.url}mcap/", label)
+        sys.stdout.flush()
+        if given.opens:
+            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+        server.run()
+
+
+def _print_mcap(url: str, label: str) -> None:
+    """Print where other viewers find selections.
+
+    Args:
+        url: Address of all selections.
+        label: Label of a recording for the examples, as in a URL; empty without one.
+    """
+    from urllib.parse import quote
+
+    file = f"{url}slice.mcap?recording={label or 'RECORDING'}"
+    foxglove = f"https://app.foxglove.dev/?ds=remote-file&ds.url={quote(file, safe='')}"
+    output.note(f"MCAP file: {file}")
+    output.note(f"In Foxglove: {foxglove}")
+    output.note(f"For a remote data loader: {url}manifest")
+
+
+def _only_store_near() -> Path | None:
+    """The only store in the folders here and in theirs, where no other one is meant."""
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import NAME
+
+    if store_path().exists():
+        return None
+    folders = chain.from_iterable(
+        islice(Path().glob(depth), _MAX_FOLDERS) for depth in ("*", "*/*")
+    )
+    found = [folder for folder in folders if (folder / NAME).is_file()]
+    if len(found) != 1:
+        return None
+    output.note(f"Showing {found[0]}, the only store below this folder.")
+    return found[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Mcp(Place):
+    pass
+
+
+@command(_Mcp)
+def mcp_command(given: _Mcp) -> None:
+    """Answer the questions of an assistant, which starts it.
+
+    It speaks the Model Context Protocol over standard input and output. The store is only read;
+    answers are bounded and say what they lack.
+    """
+    try:
+        from hybridlog.view.tool_server import serve
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError("mcp needs: pip install 'hybridlog[mcp]'") from error
+    from hybridlog.store import open_store
+
+    with open_store(given.store, read_only=True) as opened:
+        serve(opened)

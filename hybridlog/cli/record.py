@@ -1,14 +1,15 @@
-"""`hybridlog record`."""
+"""`hybridlog record` and `demo`."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import click
 from click.core import ParameterSource
 
-from hybridlog.cli.binder import command
+from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.hints import Command
 from hybridlog.cli.record_choices import LiveOption, RecordChoices, check_choices
 
@@ -82,3 +83,24 @@ def _live_options() -> tuple[str, ...]:
         if isinstance(parameter, LiveOption)
         and context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Demo:
+    directory: Path = argument(
+        "Directory for the bag and the store of the demo.",
+        "[DIRECTORY]",
+        default=Path("hybridlog-demo"),
+    )
+    duration: float = option(
+        "Seconds of robot time.", "SECONDS", type=click.FloatRange(min=5), default=60.0
+    )
+    seed: int = option("Another number gives another drive.", "N", default=1)
+
+
+@command(_Demo)
+def demo_command(given: _Demo) -> int:
+    """Take a tour: simulate a robot, record it, query it."""
+    from hybridlog.demo import tour
+
+    return tour.run(given.directory, duration_s=given.duration, seed=given.seed)

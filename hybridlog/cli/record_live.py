@@ -1,4 +1,4 @@
-"""`hybridlog record` of a running robot."""
+"""Records a running robot until a signal, and tells a service manager how it is doing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import os
 import re
 import shutil
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,6 @@ from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.record_choices import opened_to_record
-from hybridlog.cli.service import notify_service
 from hybridlog.cli.signals import SIGNALS, restore_echo, write_note
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import Flag
@@ -211,3 +211,19 @@ class _Display:
             from hybridlog.live.recorder import summary_of
 
             output.print_json_line({"state": summary_of(state)})
+
+
+def notify_service(*assignments: str) -> None:
+    """Send assignments such as `READY=1` to the service manager; does nothing without one.
+
+    Args:
+        assignments: As `sd_notify(3)` describes them; no line breaks.
+    """
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if address[:1] not in {"/", "@"}:
+        return
+    # It is a help, and must not stop a recording.
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as connection:
+        connection.setblocking(False)
+        place = f"\0{address[1:]}" if address[0] == "@" else address
+        connection.sendto("\n".join(assignments).encode("utf-8", "replace"), place)

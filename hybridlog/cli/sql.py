@@ -1,15 +1,25 @@
-"""`hybridlog sql`."""
+"""`hybridlog sql`, and its prompt with history and completion of views, columns and fields."""
 
 from __future__ import annotations
 
+import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Self
 
-from hybridlog.cli.answers import Tabular, answer_sql
+from hybridlog.cli.answers import Destination, Tabular, answer_sql
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import InStore, Quiet, Strict
-from hybridlog.cli.output import notes, parse_size
+from hybridlog.cli.output import note, notes, parse_size, say
 from hybridlog.cli.signals import if_stopped
+from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.stopping import at_safe_points, postpone
+
+if TYPE_CHECKING:
+    from hybridlog.sql.engine import SqlConnection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +61,6 @@ def sql_command(given: _Given) -> None:
                 store.query(topics).completeness().check()
 
         if is_prompt:
-            from hybridlog.cli.sql_prompt import run_prompt
-
             run_prompt(connection, to, seconds, check)
             return
         with if_stopped("The query was stopped."), limited_memory(connection.memory):
@@ -62,3 +70,167 @@ def sql_command(given: _Given) -> None:
         sys.stdout.flush()
         if not given.quiet:
             notes(answer.sentences())
+
+
+_PROMPT: Final = "sql> "
+_MORE: Final = "...> "
+_ENDS: Final = frozenset({"exit", "quit", ".exit", ".quit", "\\q"})
+_HISTORY: Final = "sql_history"
+_MAX_HISTORY: Final = 1000
+
+
+def run_prompt(
+    connection: SqlConnection,
+    to: Destination,
+    timeout: float | None,
+    check: Callable[[str], None],
+) -> None:
+    """Read statements, which end with a semicolon, and print their answers.
+
+    Ctrl-C stops a query, or clears what was typed; Ctrl-D ends the prompt.
+
+    Args:
+        connection: Runs the statements.
+        to: Format and place of the answers.
+        timeout: Seconds that one may take; None for no limit.
+        check: Refuses a statement whose answer would not be complete.
+    """
+    from hybridlog.sql.duck import limited_memory
+
+    say("Statements end with a semicolon; `show tables;` lists views, Ctrl-D ends.")
+    completer = Completer(connection)
+    with _Keys() as keys, _line_editing(completer):
+        while (text := _statement(completer, keys)) is not None:
+            if not text.strip():
+                continue
+            try:
+                with keys.heard(), at_safe_points(), limited_memory(connection.memory):
+                    check(text)
+                    answer = connection.query(text, timeout=timeout)
+                    answer_sql(answer, to)
+                    sys.stdout.flush()
+                    notes(answer.sentences())
+            except HybridlogError as error:
+                for line in str(error).splitlines():
+                    note(line)
+            except KeyboardInterrupt:
+                note("The query was stopped.")
+
+
+def _statement(completer: Completer, keys: _Keys) -> str | None:
+    """The next statement; None at the end."""
+    lines: list[str] = []
+    while True:
+        completer.before = "\n".join(lines)
+        try:
+            with keys.heard():
+                line = input(_MORE if lines else _PROMPT)
+        except KeyboardInterrupt:
+            say()
+            lines.clear()
+            continue
+        except EOFError:
+            say()
+            return None
+        if not lines and line.strip().rstrip(";").lower() in _ENDS:
+            return None
+        lines.append(line)
+        if line.rstrip().endswith(";") or not any(map(str.strip, lines)):
+            return "\n".join(lines)
+
+
+class Completer:
+    """Candidates for the word before the cursor.
+
+    Args:
+        connection: Knows views and columns.
+
+    Attributes:
+        before: Lines of the statement before the current one.
+    """
+
+    def __init__(self, connection: SqlConnection) -> None:
+        self._connection = connection
+        self._found: list[str] = []
+        self.before = ""
+
+    def __call__(self, text: str, state: int) -> str | None:
+        """A candidate, as `readline` asks for it."""
+        if state == 0:
+            import readline
+
+            from hybridlog.sql.completion import candidates
+
+            self._found = []
+            with suppress(HybridlogError):
+                line = f"{self.before}\n{readline.get_line_buffer()}"
+                self._found = candidates(self._connection, line, text)
+        return self._found[state] if state < len(self._found) else None
+
+
+class _Keys:
+    """Ctrl-C stops a query or clears what was typed, and never ends the command.
+
+    It is heard in a block, and once: pressed again, or between two blocks, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._is_heard = False
+        self._before: Any = None
+
+    def __enter__(self) -> Self:
+        """Listen."""
+        self._before = signal.signal(signal.SIGINT, self._pressed)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Listen no longer."""
+        signal.signal(signal.SIGINT, self._before)
+
+    def _pressed(self, *_: object) -> None:
+        if self._is_heard:
+            self._is_heard = False
+            if not postpone(_interrupt):
+                raise KeyboardInterrupt
+
+    @contextmanager
+    def heard(self) -> Iterator[None]:
+        """A block in which Ctrl-C raises `KeyboardInterrupt`."""
+        try:
+            self._is_heard = True
+            yield
+        finally:
+            self._is_heard = False
+
+
+def _interrupt() -> NoReturn:
+    raise KeyboardInterrupt
+
+
+@contextmanager
+def _line_editing(completer: Completer) -> Iterator[None]:
+    """Line editing with history, where Python has it."""
+    try:
+        import readline
+    except ImportError:
+        yield
+        return
+    from hybridlog.index.consent import state_directory
+    from hybridlog.sql.completion import DELIMITERS
+
+    path: Path | None = None
+    with suppress(HybridlogError, OSError):
+        path = state_directory() / _HISTORY
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if path.exists():
+            readline.read_history_file(path)
+    readline.set_history_length(_MAX_HISTORY)
+    readline.set_completer_delims(DELIMITERS)
+    readline.set_completer(completer)
+    readline.parse_and_bind("tab: complete")
+    try:
+        yield
+    finally:
+        if path is not None:
+            with suppress(OSError):
+                readline.write_history_file(path)

@@ -10,7 +10,6 @@ from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Strict, Topics, Verbose, topics
 from hybridlog.cli.output import notes, print_table, short_duration
-from hybridlog.query.times import parse_duration, parse_range, parse_time
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
 
@@ -103,6 +102,8 @@ def _times(
 ) -> NDArray[np.int64]:
     """The times that are wanted, ns."""
     import numpy as np
+
+    from hybridlog.query.times import parse_duration, parse_range, parse_time
 
     start, end = tree.span
     if step is not None:

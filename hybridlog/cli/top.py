@@ -1,4 +1,4 @@
-"""`hybridlog top`."""
+"""`hybridlog top` and `trigger`: what is asked of a running recorder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.live_table import LiveTable, drawn
-from hybridlog.cli.options import AsJson, InStore
+from hybridlog.cli.options import AsJson, InStore, Running
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -191,3 +191,26 @@ def _state(raw: Mapping[str, Any]) -> RecorderState:
     from hybridlog.live.recorder import state_of
 
     return state_of(raw)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Trigger(Running):
+    name: str = argument("The reason, in a word.", "NAME")
+
+
+@command(_Trigger)
+def trigger_command(given: _Trigger) -> None:
+    """Make a recorder write its ring.
+
+    `hybridlog intervals --rehearse` says how often a trigger would have fired.
+    """
+    from hybridlog.live.control_server import choose, request
+    from hybridlog.store import store_path
+
+    if not given.name.strip():
+        raise UsageError("A trigger needs a name: give the reason in a word.")
+    path = store_path(given.store)
+    for recorder in choose(path, given.recording):
+        answer = request(path, recorder, "trigger", reason=given.name)
+        if not given.quiet:
+            output.note(f"{answer['recording']} writes a snapshot.")

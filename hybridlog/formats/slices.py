@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import SegmentError, UsageError
 
 if TYPE_CHECKING:
@@ -139,6 +138,8 @@ class SliceCache:
 
     def __init__(self, directory: Path | None = None, *, max_bytes: int = MAX_BYTES) -> None:
         if directory is None:
+            from hybridlog_storage.disk.files import user_directory
+
             directory = user_directory("XDG_CACHE_HOME", ".cache", "slices") / "slices"
         self._directory = directory
         self._max_bytes = max_bytes
