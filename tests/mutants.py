@@ -687,8 +687,8 @@ MAINTENANCE = [
         ),
         (
             "a-question-recovers-what-died",
-            "    if mends and not catalog.is_in_memory:\n        try:",
-            "    if not catalog.is_in_memory:\n        try:",
+            "_refresh(directory, catalog, summary.label, report)",
+            "_mended(directory, catalog, summary.label, report)",
             "tests/test_mending.py::test_a_question_about_a_recorder_that_died_writes_nothing",
         ),
         (

@@ -234,7 +234,7 @@ def _look_again(
         row = catalog.recording(summary.id)
         if row is not None and _is_current(directory, row[1], row[0], listing):
             return summary._replace(look=listing.look)
-    described = _refresh(directory, catalog, label, report, mends=mends)
+    described = (_mended if mends else _refresh)(directory, catalog, label, report)
     return described.summary if described is not None else None
 
 
@@ -282,50 +282,58 @@ def _is_current(
 
 
 def _refresh(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    label: str,
-    report: RepairReport,
-    *,
-    mends: bool = False,
+    directory: StoreDirectory, catalog: Catalog, label: str, report: RepairReport
 ) -> Described | None:
-    """Read a recording, and update its catalog row; None if it is gone.
+    """Read what is whole of a recording, keep it in memory, and note what to mend.
 
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        label: The recording.
-        report: Collects problems and repairs.
-        mends: Recover it first after a crash; otherwise it is noted, and answers from what is
-            whole.
+    None if the recording is gone.
     """
+    if _is_empty(directory, label):
+        return None
+    is_open = directory.is_recorded(label)
+    if not (is_open or catalog.is_in_memory):
+        report.noted.add(label)
+    return _describe(directory, catalog, label, is_open=is_open)
+
+
+def _is_empty(directory: StoreDirectory, label: str) -> bool:
     listing = directory.listing(label)
     is_empty = not (listing.journal or listing.sealed or listing.open)
     if is_empty and not _OURS.issuperset(listing.others):
         raise StoreError("it has neither a journal nor a segment, but other files")
-    if mends and not catalog.is_in_memory:
-        try:
-            with directory.writing(label):
-                is_new = is_empty and directory.is_beginning(label)
-                now = "" if is_new else recover(directory, label, report)
-                if not now:
-                    return None
-                described = describe_now(directory, catalog, now)
-                catalog.put(described)
-                return described
-        except HeldError:
-            if not directory.id_of(label):
-                return None  # a process is about to begin it
-        except TopicError:
-            return None
-    elif is_empty:
-        return None
-    is_open = directory.is_recorded(label)
+    return is_empty
+
+
+def _describe(
+    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool
+) -> Described:
     described = describe_now(directory, catalog, label, is_open=is_open)
-    if not (mends or is_open or catalog.is_in_memory):
-        report.noted.add(label)
     catalog.keep(described)
     return described
+
+
+def _mended(
+    directory: StoreDirectory, catalog: Catalog, label: str, report: RepairReport
+) -> Described | None:
+    """Recover a recording after a crash, and update its catalog row; None if it is gone."""
+    if catalog.is_in_memory:
+        return _refresh(directory, catalog, label, report)
+    is_empty = _is_empty(directory, label)
+    try:
+        with directory.writing(label):
+            is_new = is_empty and directory.is_beginning(label)
+            now = "" if is_new else recover(directory, label, report)
+            if not now:
+                return None
+            described = describe_now(directory, catalog, now)
+            catalog.put(described)
+            return described
+    except HeldError:
+        if not directory.id_of(label):
+            return None  # a process is about to begin it
+    except TopicError:
+        return None
+    return _describe(directory, catalog, label, is_open=directory.is_recorded(label))
 
 
 def mend(
@@ -352,7 +360,7 @@ def mend(
         report.noted.discard(label)
         report.unreadable.pop(label, None)
         try:
-            described = _refresh(directory, catalog, label, report, mends=True)
+            described = _mended(directory, catalog, label, report)
         except DiskFullError:
             raise
         except StoreError as error:
