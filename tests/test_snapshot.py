@@ -266,3 +266,29 @@ def test_a_recording_is_read_when_its_turn_comes(
     assert 1 <= len(read) < 6
     with pytest.raises(TopicError):
         store.entry("nothing")
+
+
+def test_topics_that_another_process_changes_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are looked for again: nothing is lost."""
+    path = tmp_path / "store"
+    with hl.open(path, create=True, mongo="none") as store:
+        for name in ("a", "b"):
+            with store.start(name) as recording:
+                recording.write(Channel(f"/{name}", "json", None, {}), b"{}", log_time=10**18)
+    with hl.open(path, mongo="none") as store, hl.open(path, mongo="none") as other:
+        assert len(store.recordings()) == 2
+        lines = Journal(path / "recordings" / "b")
+        lines.append(journal.event(journal.TAGGED, key="seen", value="yes"))
+        ask = store.catalog.recording
+
+        def asked(recording: str) -> Any:
+            monkeypatch.undo()
+            other.mark("a", "start", "a topic of its own")
+            store.catalog.summaries()
+            return ask(recording)
+
+        monkeypatch.setattr(store.catalog, "recording", asked)
+        store.session.invalidate()
+        assert [one.topic_count for one in store.summaries()] == [2, 1]

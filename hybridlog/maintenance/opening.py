@@ -29,6 +29,7 @@ from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK, REMOVED
 from hybridlog_storage.errors import (
+    CatalogError,
     DiskFullError,
     HeldError,
     StoreError,
@@ -88,6 +89,15 @@ def look_at_all(
         report: Collects problems and repairs.
         mends: Repair what a crash has left, as when a store is opened; otherwise it is noted.
     """
+    for _ in range(_TRIES):
+        with suppress(CatalogError):  # another process has changed topics of a recording meanwhile
+            return _look_at_all(directory, catalog, report, mends=mends)
+    return _look_at_all(directory, catalog, report, mends=mends)
+
+
+def _look_at_all(
+    directory: StoreDirectory, catalog: Catalog, report: RepairReport, *, mends: bool
+) -> Snapshot:
     from hybridlog.maintenance import tables
 
     mends = mends and not catalog.is_in_memory

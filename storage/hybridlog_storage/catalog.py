@@ -1017,7 +1017,7 @@ class Catalog:
         """A set of topics and their types, by its hash.
 
         Raises:
-            CatalogError: The catalog has lost it.
+            CatalogError: Another process has changed the recordings that had it.
         """
         with self._lock:
             for one in self._pending.values():
@@ -1026,10 +1026,7 @@ class Catalog:
             key = TOPICS, digest
             found = next((p.shared[key] for p in self._parts.values() if key in p.shared), "")
         if hash_of(found) != digest:
-            raise CatalogError(
-                f"The catalog {self.path} has lost the topics of recordings. "
-                "`hybridlog index rebuild` rebuilds it."
-            )
+            raise CatalogError(f"Topics in the catalog {self.path} change all the time. Ask again.")
         return topics_from_json(found)
 
     def _row(self, recording: str) -> dict[str, str]:
