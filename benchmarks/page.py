@@ -198,9 +198,11 @@ def conditions(results: Results) -> str:
     first, last = results.headers[0], results.headers[-1]
     revisions = list(dict.fromkeys(str(header["revision"]) for header in results.headers))
     machine = f"{last['cpu']}, {last['cores']} processors, {last['memory_gib']} GiB, {last['disk']}"
-    text = f"Revision {', then '.join(revisions)}, {str(first['started'])[:10]}, on {machine}."
+    named = revisions[0]
     if len(revisions) > 1:
-        text += " Figures are of more than one revision: the run was continued."
+        named = f"{revisions[0]} to {revisions[-1]}: figures are of {len(revisions)} revisions"
+    dates = list(dict.fromkeys(str(header["started"])[:10] for header in (first, last)))
+    text = f"Revision {named}; {' to '.join(dates)}, on {machine}."
     return escaped(text)
 
 
@@ -250,7 +252,7 @@ def _recording(results: Results) -> list[str]:
         columns.append({n: _shown(v, above=n in above) for n, v in values.items()})
     above = _above(results.speeds)
     speeds = _ceilings(results.speeds, lambda found: found.rate or 0.0)
-    columns.append({n: f"{_shown(v, above=n in above)}x" for n, v in speeds.items()})
+    columns.append({n: _shown(v, above=n in above) for n, v in speeds.items()})
     kept = results.spread("record", _kept, size=LARGEST, rate=record.START)
     columns.append({n: f"{_shown(v, of_hundred=True)} %" for n, v in kept.items()})
     costs = []
@@ -267,7 +269,7 @@ def _recording(results: Results) -> list[str]:
         "was found afterwards; how much faster than real time the log of a robot "
         f"({RATE} messages a second, with camera and laser) is kept whole; and what is kept of "
         "640 kB at 64 Hz a topic, 819 MB/s. ≥: the harness could not offer more.",
-        _by_backend(["system", *sizes, "a robot's log", "kept of 819 MB/s"], columns),
+        _by_backend(["system", *sizes, "a robot's log, times", "kept of 819 MB/s"], columns),
         "A trial is short, so part of a heavy stream may wait in memory: hybridlog within its "
         "budget, files in the cache of the system. ROS bag and MCAP index no fields; the ROS bag "
         "does not compress.",

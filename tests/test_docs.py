@@ -29,6 +29,8 @@ import click
 import pytest
 
 import hybridlog as hl
+from benchmarks import page
+from benchmarks.samples import Journal
 from hybridlog.cli.app import app
 from hybridlog.cli.main import EXIT_CODES
 from hybridlog.query import times, topics
@@ -484,61 +486,15 @@ def test_the_two_commands_stand_where_the_machine_reads_them() -> None:
     assert lines[1].endswith(".venv/bin/pytest -q")
 
 
-NO_DATABASES = ("hybridlog", "ROS bag", "plain MCAP", "harness")
-LOAD = ("Largest load without a loss", "Offered load")
-FIRST = ("Questions", "Milliseconds for the first time")
-AGAIN = ("Questions", "Milliseconds, asked again")
-READING = ("Reading", "Milliseconds")
-API = "hybridlog (its own API)"
-MEASURED = [
-    (("Streams", "Share of messages"), "640 kB", "hybridlog", max),
-    (LOAD, "5 kB", "hybridlog", max),
-    (LOAD, "40 kB", "hybridlog", max),
-    (LOAD, "640 kB", "hybridlog", max),
-    (("Logs", "Greatest speed"), "hcr1", "hybridlog", max),
-    (READING, "IMU to pandas", "hybridlog", min),
-    (READING, "scan at a time", "hybridlog", min),
-    (FIRST, "Q3", API, min),
-    (AGAIN, "Q2 positions", API, min),
-    (FIRST, "Q1", API, min),
-]
-"""The rows of the README's table: table of the results, column, our row, what is better."""
-
-
-def results(section: str, heading: str, column: str) -> dict[str, str]:
-    """A column of the results: the figure of each system, as it is written."""
-    text = sections(DOCS / "benchmarks.md", 2)[section]
-    lines = text[text.index(heading) :].splitlines()
-    begin = next(
-        n for n, line in enumerate(lines) if line.startswith("| backend") and f" {column} " in line
-    )
-    rows = []
-    for line in lines[begin:]:
-        if not line.startswith("|"):
-            break
-        rows.append([cell.strip() for cell in line.strip("|").split("|")])
-    place = rows[0].index(column)
-    found = ((cells[0], re.search(r"\d[\d.,]*", cells[place])) for cells in rows[2:])
-    return {system: match[0] for system, match in found if match is not None}
-
-
-def test_the_figures_shown_first_are_those_of_the_results() -> None:
-    text = (ROOT / "README.md").read_text("utf-8")
-    shown = text[text.index("<!-- measured -->") : text.index("<!-- /measured -->")]
-    lines = [line for line in shown.splitlines() if line.startswith("| ")][1:]
-    for line, (place, column, ours, best) in zip(lines, MEASURED, strict=True):
-        what, own, rival, bag = (cell.strip() for cell in line.strip("|").split("|"))
-        found = results(*place, column)
-        databases = {
-            system: float(figure.replace(",", ""))
-            for system, figure in found.items()
-            if not system.startswith(NO_DATABASES)
-        }
-        strongest = best(databases, key=databases.__getitem__)
-        assert rival.split()[0].rstrip("x") == found[strongest], what
-        assert rival.endswith(f"({strongest.split(' (')[0]})"), what
-        assert own.split()[0].rstrip("x") == found[ours], what
-        assert bag.split()[:1] in ([], [found.get("ROS bag", "")], [found.get("ROS bag", "") + "x"])
+def test_the_figures_shown_are_those_of_the_results() -> None:
+    """The page and the README's table are what `python -m benchmarks` makes of the samples."""
+    journal = Journal(DOCS / "benchmarks-results")
+    table = page.readme(journal)
+    assert table in (ROOT / "README.md").read_text("utf-8")
+    assert table.count("\n|") == 12
+    text = (DOCS / "benchmarks.md").read_text("utf-8")
+    assert text == page.page(journal)
+    assert len(text.splitlines()) < 150
 
 
 def test_the_changelog_has_this_version() -> None:

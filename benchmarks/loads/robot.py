@@ -1,4 +1,4 @@
-"""The log of a robot: 948 messages a second on eight topics, scans and camera included.
+"""The log of a robot: 547 messages a second on eight topics, scans and camera included.
 
 As messages of a load for the harness, and as an MCAP file to be recorded.
 """
@@ -126,8 +126,8 @@ def _mode(rows: Rows, seconds: Seconds, noise: np.random.Generator) -> None:
 
 Fill = Callable[[Rows, Seconds, np.random.Generator], None]
 TOPICS: dict[str, tuple[int, str, np.dtype[Any], Fill]] = {
-    "/imu/data": (500, "sensor_msgs/Imu", IMU, _imu),
-    "/tf": (200, "tf2_msgs/TFMessage", TF, _tf),
+    "/imu/data": (200, "sensor_msgs/Imu", IMU, _imu),
+    "/tf": (100, "tf2_msgs/TFMessage", TF, _tf),
     "/odom": (100, "nav_msgs/Odometry", ODOM, _odom),
     "/joint_states": (100, "sensor_msgs/JointState", JOINT_STATES, _joint_states),
     "/scan": (40, "sensor_msgs/LaserScan", SCAN, _scan),

@@ -122,7 +122,7 @@ def test_what_is_read_is_what_was_published(name: str, work: Path, tmp_path: Pat
     assert len(found) == len(tasks.TASKS) * 2
     by_task = {(s.case["task"], s.repetition): s.values for s in found}
     assert by_task["1 s of scans", 0]["answer"] != by_task["1 s of scans", 1]["answer"]
-    assert by_task["IMU to pandas", 0]["answer"][2] == 1000
+    assert by_task["IMU to pandas", 0]["answer"][2] == 400
     assert by_task["scan at a time", 0]["answer"][0] == tasks.MOMENTS
     assert all(v["total_ms"] >= v["ms"] > 0 and v["first_ms"] > 0 for v in by_task.values())
     assert not is_left(reading, asked)
