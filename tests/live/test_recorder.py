@@ -217,7 +217,7 @@ def test_a_full_disk_ends_it_and_what_comes_is_counted(
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(append_file.os, "pwritev", full)
-        patch.setattr("hybridlog_storage.disk.durability.os.writev", full)
+        patch.setattr("hybridlog_storage.disk.files.os.writev", full)
         for number in range(200):
             robot.speaker.say(channel, scan(number, 3_000_000))
             if robot.recorder.wait(0.01):

@@ -407,7 +407,7 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
 
     with monkeypatch.context() as patch:
         patch.setattr(append_file.os, "pwritev", full)
-        patch.setattr("hybridlog_storage.disk.durability.os.writev", full)
+        patch.setattr("hybridlog_storage.disk.files.os.writev", full)
 
         def until_refused() -> None:
             while True:
