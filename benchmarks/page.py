@@ -384,6 +384,11 @@ def _tasks(results: Results) -> list[str]:
             for name, values in windows["rows"].items()
         ]
         parts.append(_table(head, rows))
+    if bucket := results.group("remote"):
+        head = ["a store in a bucket", "requests", "bytes received", "bytes sent"]
+        names = ("requests", "received", "sent")
+        rows = [[row["step"], *(f"{row[name]:,}" for name in names)] for row in bucket["rows"]]
+        parts.append(_table(head, rows))
     return parts
 
 

@@ -1,6 +1,6 @@
-"""Requests and bytes of copies and of a store in a bucket: `python -m benchmarks.remote`.
+"""Requests and bytes of copies and of a store in a bucket.
 
-Records a scan and numbers of an arm in a temporary directory, and copies them to a directory and
+Records a scan and numbers of an arm in a directory, and copies them to a directory and
 to a bucket of moto, behind the proxy of the tests, which counts. Then the bucket is asked. What
 is counted does not depend on how busy the machine is; a request costs some 50 ms elsewhere.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import struct
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,16 +104,3 @@ def measure(place: Path) -> list[Cost]:
         proxy.close()
         moto.close()
     return costs
-
-
-def main() -> None:
-    with tempfile.TemporaryDirectory() as place:
-        for cost in measure(Path(place)):
-            print(
-                f"{cost.step}: {cost.requests} requests, {cost.received:,} bytes received, "
-                f"{cost.sent:,} sent"
-            )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,8 @@
-"""What a user does with a store, timed: commands, SQL, many recordings, the page, windows.
+"""What a user does with a store: commands, SQL, many recordings, the page, windows, buckets.
 
-All of it but `many` is about one recording of the robot's log. Each group runs in a process
-of its own; a figure is the median of several times after a first one, on the clock and of
-the processor (that of MongoDB is not counted).
+All of it but `many` and `remote` is about one recording of the robot's log. Each group runs
+in a process of its own; a figure is the median of several times after a first one, on the clock
+and of the processor (that of MongoDB is not counted).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -113,7 +114,7 @@ def run(context: Context, group: str) -> None:
     with context.progress.step(f"tasks: {group}"), run_directory(context.work) as directory:
         arguments = {"directory": str(directory), "seed": context.seed, **settings._asdict()}
         try:
-            if group != "many":
+            if group not in {"many", "remote"}:
                 arguments["store"] = str(robot_store(context, settings))
             side = f"{__name__}:{group}_side"
             values = run_side(side, arguments, directory, _TIMEOUT_S)
@@ -400,5 +401,12 @@ def windows_side(*, store: str, windows: int, seed: int, **_: Any) -> Values:
     return {"rows": rows}
 
 
-GROUPS = ("commands", "sql", "many", "page", "windows")
+def remote_side(*, directory: str, **_: Any) -> Values:
+    """Requests and bytes of a bucket."""
+    from benchmarks.remote import measure
+
+    return {"rows": [asdict(cost) for cost in measure(Path(directory))]}
+
+
+GROUPS = ("commands", "sql", "many", "page", "windows", "remote")
 """In their order; `<name>_side` does each."""

@@ -309,11 +309,15 @@ def test_the_tasks_on_our_stores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     """SQL, many recordings, the page, windows of pictures."""
     monkeypatch.setitem(tasks.SETTINGS, "tiny", tasks.Settings(5, 2, 1, 2))
     context = Context(tmp_path / "work", {}, Journal(tmp_path / "out"), "tiny")
-    for group in ("sql", "many", "page", "windows"):
+    for group in ("sql", "many", "page", "windows", "remote"):
         tasks.run(context, group)
     found = list(context.journal.samples.values())
-    assert [(s.status, s.reason) for s in found] == [("ok", "")] * 4
-    assert all(row["ms"] > 0 for s in found for row in s.values["rows"].values())
+    assert [(s.status, s.reason) for s in found] == [("ok", "")] * 5
+    *timed, bucket = found
+    assert all(row["ms"] > 0 for s in timed for row in s.values["rows"].values())
+    requests = {row["step"]: row["requests"] for row in bucket.values["rows"]}
+    assert 0 < requests["open"] <= 3
+    assert requests["a second of scan"] > requests["the same again"] == 0
 
 
 def test_ctrl_c_ends_a_real_run(tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ def samples() -> list[Sample]:
         "sql": {"rows": {"count": {**timed, "duckdb_ms": 1.1}}},
         "many": {"rows": {"`ls`": timed}},
         "page": {"rows": {"zoom": timed}, "memory_mb": 100.0},
+        "remote": {"rows": [{"step": "open", "requests": 3, "received": 5000, "sent": 0}]},
         "windows": {"rows": {"window of 16 pictures": {**timed, "preadv_ms": 0.4}}},
     }
     for name, measured in groups.items():
@@ -103,7 +104,7 @@ def test_the_page_has_every_part_within_three_screens(tmp_path: Path) -> None:
     text = page.page(journal(tmp_path, samples()))
     assert len(text.splitlines()) < 150
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
-    assert len(tables) == 10
+    assert len(tables) == 11
     for table in tables:
         assert len({line.count(" | ") for line in table.splitlines()}) == 1, table
     assert "A quick run" not in text
