@@ -80,7 +80,7 @@ def pieces() -> list[Piece]:
         return {"full": full, "quick": quick, "tiny": 0.1}
 
     def task(group: str) -> Piece:
-        times = {"commands": (5.0, 2.0), "many": (3.0, 2.5)}.get(group, (0.5, 0.3))
+        times = {"commands": (5.0, 2.0), "many": (2.5, 1.8)}.get(group, (0.5, 0.3))
         return Piece("tasks", group, minutes(*times), lambda context: tasks.run(context, group))
 
     def case(name: str) -> Piece:
