@@ -175,12 +175,16 @@ def _shared(a: Recordings, b: Recordings) -> _Shared | None:
         parts = (first, begin), (end, last)
         least = _LEAST_SHARE * max(lengths)
         told = [
-            f"+{format_duration(low - first)} to +{format_duration(high - first)}"
+            f"+{_to_ms(low - first)} to +{_to_ms(high - first)}"
             for low, high in parts
             if high - low > least
         ]
         others.append(", ".join(told))
     return _Shared((ranges[0], ranges[1]), (others[0], others[1])) if any(others) else None
+
+
+def _to_ms(duration: int) -> str:
+    return format_duration(round(duration / 1e6) * 10**6)
 
 
 def _of_fields(
