@@ -62,7 +62,7 @@ class Run:
         return self._mongod.replace("/?", f"/{self._name}?")
 
     def go(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        tell = RecordingWriter._tell
+        tell = RecordingWriter._publish
 
         def told(writer: RecordingWriter, chunk: object, stored: object) -> None:
             if not self.power.is_off:
@@ -71,7 +71,7 @@ class Run:
 
         with monkeypatch.context() as patch:
             patch.setattr(files, "system", self.power)
-            patch.setattr(RecordingWriter, "_tell", told)
+            patch.setattr(RecordingWriter, "_publish", told)
             store = hl.open(self.store, mongo=self._uri)
             try:
                 with suppress(HybridlogError, OSError):
