@@ -75,11 +75,14 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlaces
+    from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.chunk_table import ChunkTable
+    from hybridlog_storage.segments.segment_reader import ChunkPlace
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_NAMES = 5  # recordings in a message
 _MAX_OPEN_SEGMENTS = 256
+_ROW_BYTES = 44  # of a message's columns in a chunk
 _MAX_COLUMNS = 4096  # sets of chunks that are at hand
 _MAX_MEANINGS = 128  # topic patterns and predicates that are cached
 _TRIES = 5  # to connect, while the connection breaks; to find a recording, while it is renamed
@@ -1115,6 +1118,35 @@ class Session:
             raise StoreError(f"Payloads of {recording.label!r} were deleted meanwhile. Ask again.")
         return found
 
+    def chunk(
+        self,
+        recording: RecordingEntry,
+        segment: int,
+        place: ChunkPlace,
+        count: Callable[[StoredChunk], None],
+    ) -> StoredChunk:
+        """A chunk, from the cache if it is there. Its buffer is read-only.
+
+        Args:
+            recording: Its recording.
+            segment: Number of its segment.
+            place: Its position there.
+            count: Called with the chunk if it is read.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+
+        def read() -> StoredChunk:
+            chunk = self.segment(recording.id, segment).read_chunk(place)
+            # Arrays of messages share the buffer: changes to them must not change the cache.
+            chunk.batch.buffer = memoryview(chunk.batch.buffer).toreadonly()
+            count(chunk)
+            return chunk
+
+        key = recording.id, segment, place.number, recording.stored.get(str(segment), "")
+        return self.cache.made("chunk", *key, make=read, size_of=_size_of)
+
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a segment of a recording, by its id. Thread safe."""
         running = self._running.get(recording)
@@ -1356,6 +1388,10 @@ class Session:
 
 def _gone(recording: str) -> TopicError:
     return TopicError(f"Recording {recording!r} is no longer in the store.")
+
+
+def _size_of(chunk: StoredChunk) -> int:
+    return len(chunk.batch.buffer) + _ROW_BYTES * len(chunk.batch)
 
 
 def _make_room(opened: dict[Any, Any]) -> None:

@@ -7,7 +7,6 @@ same columns.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
@@ -39,11 +38,10 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+    from hybridlog_storage.segments.segment_reader import ChunkPlace
 
 _FIXED: Final = frozenset({"ros1", "cdr"})
 """Encodings whose definition fixes the fields."""
-_MAX_CHUNKS: Final = 4  # read chunks that are kept
 
 Paths = Collection[str] | None
 """Dotted paths of fields to read; None for all."""
@@ -69,6 +67,10 @@ class ScanCounts:
     def row_groups(self) -> int:
         """Number of row groups that were read."""
         return len(self.groups)
+
+    def add_chunk(self, _: StoredChunk) -> None:
+        """Count a chunk."""
+        self.chunks += 1
 
     def add_group(self, path: Path, group: int) -> None:
         """Count a row group."""
@@ -138,8 +140,6 @@ class TopicOfRecording:
         self.session = session
         self.entry = entry
         self.topic = topic
-        self._read: dict[tuple[int, int], StoredChunk] = {}
-        self._lock = threading.Lock()
 
     @lazy
     def channels(self) -> dict[int, RecordedChannel]:
@@ -212,10 +212,6 @@ class TopicOfRecording:
             found += [_FieldRows(self, fields, part) for part in fields.parts]
         return sorted(found, key=lambda one: (one.first is not None, one.first or 0))
 
-    def reader(self, segment: int) -> SegmentReader:
-        """The reader of a segment."""
-        return self.session.segment(self.entry.id, segment)
-
     @lazy
     def places(self) -> dict[tuple[int, int], ChunkPlace]:
         """Positions of its chunks, by segment and number."""
@@ -230,21 +226,10 @@ class TopicOfRecording:
         return _keys(*np.array(gone, np.int64).reshape(-1, 2).T)
 
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
-        """A chunk; those read last are at hand.
-
-        Raises:
-            SegmentError: it is damaged.
-        """
-        with self._lock:
-            found = self._read.get((segment, number))
-        if found is None:
-            found = self.reader(segment).read_chunk(self.places[segment, number])
-            counts.chunks += 1
-            with self._lock:
-                while len(self._read) >= _MAX_CHUNKS:
-                    del self._read[next(iter(self._read))]
-                self._read[segment, number] = found
-        return found
+        """A chunk; see `Session.chunk`."""
+        return self.session.chunk(
+            self.entry, segment, self.places[segment, number], counts.add_chunk
+        )
 
 
 def _keys(segment: NDArray[np.int64], chunk: NDArray[np.int64]) -> NDArray[np.int64]:

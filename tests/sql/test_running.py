@@ -60,6 +60,7 @@ def test_flushed_chunks_answer(reader: tuple[LiveRecording, hl.Store]) -> None:
     while not store.sql("select * from topics").rows():
         time.sleep(0.02)
     wait_for(store, "select count(*) from large", 300)
+    store.session.cache.drop("chunk")
     answer = store.sql(ROWS)
     assert answer.rows() == [(300, 300, 0, 99, 75.0)]
     assert (answer.counts.row_groups, answer.counts.chunks > 1) == (0, True)
@@ -89,6 +90,7 @@ def test_sealed_segments_answer_from_tables(reader: tuple[LiveRecording, hl.Stor
         time.sleep(0.02)
     while True:  # the tables follow the segments, and are seen with the next flush
         wait_for(store, "select count(*) from large", count)
+        store.session.cache.drop("chunk")
         answer = store.sql("select count(*), count(distinct seq), min(i8), max(i8) from large")
         assert answer.rows() == [(count, count, 0, 99)]
         if answer.counts.row_groups and answer.counts.chunks:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,9 +24,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
-
-
-_ROW_BYTES = 44  # of a message's columns
 
 
 def message_at(
@@ -101,18 +97,12 @@ def _last_of(
         if channel.channel.topic in wanted
     }
 
-    def load(entry: Chunk) -> StoredChunk:
-        chunk = session.segment(recording.id, entry.segment).read_chunk(entry.place)
+    def count(chunk: StoredChunk) -> None:
         counters.chunks_read += 1
         counters.bytes_read += chunk.length + chunk.trailer
-        # Arrays of messages share the buffer: changes to them must not change the cache.
-        chunk.batch.buffer = memoryview(chunk.batch.buffer).toreadonly()
-        return chunk
 
     def read(entry: Chunk) -> StoredChunk:
-        stored = recording.stored.get(str(entry.segment), "")
-        key = recording.id, entry.segment, entry.number, stored
-        return session.cache.made("chunk", *key, make=partial(load, entry), size_of=_size_of)
+        return session.chunk(recording, entry.segment, entry.place, count)
 
     chunks = session.chunks_before(recording, list(channels), span[1])
     found = last_message(chunks, channels, span[1], read)
@@ -193,7 +183,3 @@ def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> in
         return None
     # Rows are in order of arrival: of equal times, the last one is wanted.
     return int(rows[-1 - batch.log_time[rows][::-1].argmax()])
-
-
-def _size_of(chunk: StoredChunk) -> int:
-    return len(chunk.batch.buffer) + _ROW_BYTES * len(chunk.batch)
