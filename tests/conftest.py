@@ -13,6 +13,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests import by_uri, durations, real_peers
+from tests.calls import Calls
+from tests.limits import Limit
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in (
@@ -53,6 +55,18 @@ def signals_as_before() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    """Notes, delays or fails calls of functions."""
+    return Calls(monkeypatch)
+
+
+@pytest.fixture
+def limit(monkeypatch: pytest.MonkeyPatch) -> Limit:
+    """Sets limits of the product."""
+    return Limit(monkeypatch)
 
 
 EMBEDDED = (

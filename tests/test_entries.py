@@ -31,7 +31,7 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance.opening import current_entry, look_at_all
 from hybridlog.maintenance.report import RepairReport
-from hybridlog_storage import catalog, journal
+from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.catalog_parts import DiskFolder
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -40,6 +40,7 @@ from hybridlog_storage.journal import JOURNAL, Journal
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from tests.limits import Limit
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 TOPICS = [Channel(topic, "ros1", TEXT) for topic in ("/a", "/b", "/c")]
@@ -720,9 +721,9 @@ def test_the_catalog_may_go_while_the_store_is_open(made: Made) -> None:
 
 
 def test_another_process_may_keep_the_catalog_locked(
-    made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    made: Made, limit: Limit, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(catalog, "_BUSY_S", 0.05)
+    limit(catalog_busy_s=0.05)
     path = made.directory.path / "catalog"
     wanted = [payload(n) for n in range(80)]
     with hl.open(made.directory.path) as store:

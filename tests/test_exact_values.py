@@ -25,6 +25,7 @@ import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog_storage.errors import PayloadError, TopicError
 from hybridlog_storage.messages import Channel, Schema
+from tests.limits import Limit
 
 CASES = Path(__file__).parent / "cases"
 LOGS = [
@@ -217,12 +218,9 @@ def test_values_of_several_types_are_json_text(store: hl.Store) -> None:
     assert query.to_arrow().schema.field("v").type == pa.json_()
 
 
-def test_a_late_key_and_a_late_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hybridlog.formats import tables
-    from hybridlog.frames import answer
+def test_a_late_key_and_a_late_type(tmp_path: Path, limit: Limit) -> None:
 
-    monkeypatch.setattr(tables, "HELD_BYTES", 0)
-    monkeypatch.setattr(answer, "_BLOCK_ROWS", 1)
+    limit(output_held_bytes=0, frame_block_rows=1)
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("x") as recorder:
             for n in range(600):

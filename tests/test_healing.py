@@ -25,7 +25,6 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog import session as session_module
 from hybridlog.demo.write import write_bag
-from hybridlog.query import index_reader
 from hybridlog.query.counters import Counters
 from hybridlog.query.engines import MatchColumns
 from hybridlog.query.engines.payload_scan import PayloadScan
@@ -44,6 +43,7 @@ from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.mongod import find_mongod
 from tests.cli.running import run
 from tests.damage import WAYS
+from tests.limits import Limit
 
 TOPICS = ["/imu/data", "/base/scan", "/joint_states"]
 IMU, SCAN = TOPICS[:2]
@@ -230,10 +230,8 @@ def test_a_killed_mongod_is_started_again(store: Path) -> None:
         assert opened.session.places("A test") is not places
 
 
-def test_a_mongod_killed_in_the_middle_of_an_answer(
-    store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(index_reader, "_DOCUMENTS", 5)  # in one batch
+def test_a_mongod_killed_in_the_middle_of_an_answer(store: Path, limit: Limit) -> None:
+    limit(documents_at_once=5)
     with hl.open(store, require_database=True) as opened:
         want = [d["_id"] for d in opened.topic(*TOPICS).documents()]
         answer = opened.topic(*TOPICS).documents()

@@ -11,10 +11,10 @@ import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
-from hybridlog import store as store_module
 from hybridlog_storage.mongo import mongod_keeper
 from tests.cli.running import run
 from tests.faults import logs
+from tests.limits import Limit
 
 
 @pytest.fixture
@@ -30,10 +30,8 @@ def mongod(path: Path) -> psutil.Process:
     return psutil.Process(json.loads((path / "mongod" / "mongod.json").read_bytes())["mongod"])
 
 
-def test_a_server_stays_while_a_client_is_connected(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(store_module, "_CLIENTS_WAIT_S", 5.0)
+def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) -> None:
+    limit(clients_wait_s=5.0)
     with hl.open(path) as store:
         address = store.index_address()
         assert store.index_contents() == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]

@@ -19,6 +19,7 @@ from hybridlog_storage.errors import DatabaseError
 from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.topic_places import OWN_COLLECTIONS, SHARED, TOPICS
+from tests.limits import Limit
 from tests.many_topics import BASE, handles, mongod_of, topic, write_log
 
 FEW = 12
@@ -269,8 +270,10 @@ def commands_of(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return sent
 
 
-def test_a_store_of_a_thousand_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 100)
+def test_a_store_of_a_thousand_topics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
+) -> None:
+    limit(own_collections=100)
     log = write_log(tmp_path / "log.mcap", 1000)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         before = handles(store)
@@ -292,17 +295,17 @@ def test_a_store_of_a_thousand_topics(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("topics", "limit"), [(3000, 1024), (10_000, None)])
+@pytest.mark.parametrize(("topics", "handles_limit"), [(3000, 1024), (10_000, None)])
 def test_thousands_of_topics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topics: int, limit: int | None
+    tmp_path: Path, limit: Limit, topics: int, handles_limit: int | None
 ) -> None:
     """Recorded by a command, as a user does it; with a hard limit of handles."""
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", OWN_COLLECTIONS)
+    limit(own_collections=OWN_COLLECTIONS)
     log = write_log(tmp_path / "log.mcap", topics)
 
     def limited() -> None:
-        if limit is not None:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
+        if handles_limit is not None:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (handles_limit, handles_limit))
 
     command = [sys.executable, "-m", "hybridlog", "record", log, "--store", tmp_path / "store"]
     subprocess.run(
@@ -316,9 +319,9 @@ def test_thousands_of_topics(
         assert handles(store) < 1000
         memory = (mongod_of(store) / "status").read_text().partition("VmHWM:")[2].split()[0]
         assert int(memory) < 400_000  # kB
-        if limit is not None:
+        if handles_limit is not None:
             said = (mongod_of(store) / "limits").read_text()
-            assert f"Max open files            {limit}" in said
+            assert f"Max open files            {handles_limit}" in said
         assert store.all_topics().count() == 5 * topics
         assert store.topic(topic(topics - 1)).where(least(3)).count() == 2
         assert database_of(store).count(SHARED, {"_meta.seq": {"$gte": 0}}) == 5 * (

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.query import narrowing, planner
+from hybridlog.query import planner
 from hybridlog.query.planner import Planner
 from hybridlog.query.topics import matcher
 from hybridlog_storage.messages import Channel, Schema
+from tests.limits import Limit
 from tests.servers.commands import commands
 
 SECOND = 10**9
@@ -132,13 +133,13 @@ def test_one_command_and_a_look_at_what_has_changed(path: Path) -> None:
 
 
 def test_what_many_messages_satisfy_is_looked_at_in_part(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     asked = planned(monkeypatch)
     monkeypatch.setattr(planner, "within_bounds", lambda _session, _question, found: found)
     assert store.topic("/t").where("x >= 0").count() == 5 * MANY
     assert len(asked) == MANY
-    monkeypatch.setattr(narrowing, "_MIN_MATCHES", 10)
+    limit(min_matches=10)
     del asked[:]
     assert store.topic("/t").where("x >= 38").count() == 10
     assert len(asked) == 2

@@ -17,9 +17,9 @@ from hybridlog.query.topics import matcher
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.collection_names import collection_of
 from tests.cli.running import run
+from tests.limits import Limit
 from tests.many_topics import topic, write_log
 
 FOUR = [topic(number) for number in range(4)]
@@ -89,9 +89,9 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
 
 
 def test_what_has_no_documents_is_not_missing_among_those_of_others(
-    tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, log: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 1)
+    limit(own_collections=1)
     indexed: list[str] = []
     real = index.catch_up
 

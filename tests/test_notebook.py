@@ -20,6 +20,7 @@ from hybridlog.drawing.notebook import message_html, recordings_html, shown
 from hybridlog.drawing.pixels import SIDE, thumbnail
 from hybridlog.message import Message
 from hybridlog_storage.errors import TopicError
+from tests.limits import Limit
 from tests.test_snapshot import summary
 
 HOSTILE = "<script>alert('x')</script>&\"\x1b[31m"
@@ -185,8 +186,8 @@ def test_what_is_no_picture_has_none(store: hl.Store, topic: str) -> None:
     assert "sensor_msgs/Image" in parsed.text
 
 
-def test_a_large_image_is_not_decoded(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybridlog.message._MAX_SHOWN", 1000)
+def test_a_large_image_is_not_decoded(store: hl.Store, limit: Limit) -> None:
+    limit(shown_bytes=1000)
     assert Parsed(only(store, "/image")._repr_html_()).images == []
 
 

@@ -27,7 +27,6 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
-from hybridlog.query import chunk_scan
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.query import Query
@@ -47,6 +46,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
+from tests.limits import Limit
 from tests.other_user import User, open_place
 
 SECOND = 10**9
@@ -327,9 +327,7 @@ def test_tables_of_real_logs(store: hl.Store, name: str, topics: list[str]) -> N
         check_tables(query, want)
 
 
-def test_small_chunks_make_the_same_table_together(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_small_chunks_make_the_same_table_together(store: hl.Store, limit: Limit) -> None:
     query = store.topic("/base/scan").in_recording("robot")
     planner = Planner(store.session, query.question, Counters())
     chunks = [task.chunk for task in planner.plan(planner.parts()).tasks()]
@@ -339,8 +337,7 @@ def test_small_chunks_make_the_same_table_together(
     tables, pieces = [], []
     # Each by itself; the smaller half together, between larger ones; three; all.
     for small, most in ((0, 0), (half, whole * 9), (whole, whole * 3), (whole, sum(sizes))):
-        monkeypatch.setattr(chunk_scan, "_SMALL_CHUNK_BYTES", small)
-        monkeypatch.setattr(chunk_scan, "_MERGED_BYTES", most)
+        limit(small_chunk_bytes=small, merged_bytes=most)
         pieces.append(len(list(planner.unordered())))
         tables.append(query.to_arrow())
         assert query.counters.chunks_read == len(chunks)

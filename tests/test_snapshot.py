@@ -15,7 +15,6 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog import session
-from hybridlog.query import planner
 from hybridlog.snapshot import Snapshot
 from hybridlog_storage import journal
 from hybridlog_storage.errors import TopicError
@@ -28,6 +27,7 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
+from tests.limits import Limit
 
 TOPICS = [f"/{name}" for name in "abcd"]
 
@@ -206,9 +206,9 @@ def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.mark.parametrize("more", [1, 2, 64])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_messages_are_in_order_however_recordings_are_grouped(
-    overlapping: Any, monkeypatch: pytest.MonkeyPatch, more: int, backwards: bool
+    overlapping: Any, limit: Limit, more: int, backwards: bool
 ) -> None:
-    monkeypatch.setattr(planner, "_GROUP_GROWTH", more)
+    limit(planner_group_growth=more)
     store, times = overlapping
     wanted = sorted(
         (time, recording, n) for recording, own in times.items() for n, time in enumerate(own)

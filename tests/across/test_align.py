@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.across import align, topic_reader
+from hybridlog.across import topic_reader
 from hybridlog.across.match import UNKNOWN, interpolated, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
+from tests.limits import Limit
 
 from .conftest import BASE, MS, Logs, Said
 
@@ -29,13 +30,13 @@ TOLERANCE_MS = 7
 
 
 @pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
-def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
     """Topics are read in blocks of so many rows, also with messages of one time in two of them.
 
     Rows that would be large are made a few at a time, too.
     """
     read, size = topic_reader.TopicReader.tables, request.param
-    monkeypatch.setattr(align, "_PIECE_BYTES", size * 400)
+    limit(align_piece_bytes=size * 400)
 
     def tables(reader: topic_reader.TopicReader, *arguments: Any) -> Iterator[Any]:
         for times, table in read(reader, *arguments):
@@ -316,13 +317,11 @@ def test_only_what_belongs_to_the_range_is_read(logs: Logs) -> None:
             assert found.counters.bytes_read < whole.counters.bytes_read / 2
 
 
-def test_rows_with_large_messages_are_made_a_few_at_a_time(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_with_large_messages_are_made_a_few_at_a_time(logs: Logs, limit: Limit) -> None:
     """A message that is in many rows is copied into each of them."""
     aligned = logs.store.align(logs.store.topic("left/pose").in_recording("b"), ["right/pose"])
     whole, tables = aligned.to_arrow(), list(aligned.to_tables())
-    monkeypatch.setattr(align, "_PIECE_BYTES", 1000)
+    limit(align_piece_bytes=1000)
     pieces = list(aligned.to_tables())
     found = pa.concat_tables(pieces, promote_options="default")
     pd.testing.assert_frame_equal(found.to_pandas(), whole.to_pandas())

@@ -24,7 +24,6 @@ from hybridlog.drawing.density import gaps as silent
 from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.series import series
 from hybridlog.query import periods
-from hybridlog.query.answers import rates
 from hybridlog.query.answers.field_statistics import _Running
 from hybridlog.query.counters import Counters
 from hybridlog.query.engines import MatchColumns, Need
@@ -37,6 +36,7 @@ from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer as run
+from tests.limits import Limit
 
 from .conftest import BASE, MS, Logs
 
@@ -47,7 +47,7 @@ def ends(logs: Logs, label: str) -> tuple[int, int]:
 
 
 @pytest.fixture(params=["whole", "in blocks"])
-def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
     """Times come all at once, or a few at a time and are read again for a second look."""
     if request.param == "whole":
         return
@@ -59,7 +59,7 @@ def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
                 yield MatchColumns(*(column[begin : begin + 3] for column in one))
 
     monkeypatch.setattr(Planner, "outcomes", cut)
-    monkeypatch.setattr(rates, "_MAX_SECOND_LOOK", 4)
+    limit(max_second_look=4)
 
 
 def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
@@ -154,7 +154,7 @@ def test_a_mean_rate_of_some_messages(logs: Logs, blocks: None) -> None:
 
 
 def test_times_of_a_rare_topic_cost_no_payloads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     """Its messages lie in chunks full of others': these are not read for times."""
     settings = SegmentSettings(chunk_size=4096)
@@ -182,7 +182,7 @@ def test_times_of_a_rare_topic_cost_no_payloads(
         monkeypatch.setattr(
             periods, "usual_period", lambda steps: sizes.append(len(steps)) or usual(steps)
         )
-        monkeypatch.setattr(periods, "_SAMPLED", 20)
+        limit(sampled_periods=20)
         assert len(store.topic("loud").gaps(periods=1.5)) == 29
         assert all(5 < size <= 40 for size in sizes)
         assert sizes

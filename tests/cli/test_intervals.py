@@ -14,6 +14,7 @@ import pytest
 from hybridlog.cli import output
 from hybridlog.formats.jsonl import JsonWriter
 from tests.independent import Seen, read_bag
+from tests.limits import Limit
 
 from .running import run
 
@@ -78,9 +79,9 @@ def test_intervals_as_a_table(store: Path) -> None:
 
 
 def test_long_answers_are_printed_some_rows_at_a_time(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], limit: Limit
 ) -> None:
-    monkeypatch.setattr(output, "ROWS_AT_ONCE", 2)
+    limit(printed_rows_at_once=2)
     printed: list[str] = []
 
     def rows() -> Iterator[list[str]]:

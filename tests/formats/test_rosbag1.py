@@ -26,6 +26,7 @@ from hybridlog.formats.rosbag1.reader import Rosbag1Source
 from hybridlog.formats.rosbag1.records import RunReader, Stop
 from hybridlog_storage.errors import SourceError
 from tests.data import DATA, needs_data
+from tests.limits import Limit
 
 Messages = dict[tuple[str, str], list[tuple[int, bytes]]]
 
@@ -237,8 +238,8 @@ def test_many_small_messages_are_split(tmp_path: Path) -> None:
     assert damage == []
 
 
-def test_windows_smaller_than_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybridlog.formats.rosbag1.reader._WINDOW", 64)
+def test_windows_smaller_than_a_message(tmp_path: Path, limit: Limit) -> None:
+    limit(bag_window_bytes=64)
     expected = make(tmp_path / "a.bag", "none", chunk=3000, messages=200)
     found, damage = read(tmp_path / "a.bag")
     assert found == expected
@@ -527,8 +528,8 @@ def test_a_connection_id_that_changes_its_meaning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4"])
-def test_bomb(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybridlog.formats.rosbag1.reader._UNSTATED", 1 << 20)
+def test_bomb(compression: str, limit: Limit) -> None:
+    limit(unstated_bag_bytes=1 << 20)
     bomb = chunk(bytes(3 << 20), compression, size=5)
     good = chunk(connection(0) + message(0, 1, b"a"), compression)
     found, damage = read_bytes(bag(good, index(0, 1), bomb, index(0, 7), good, index(0, 1)))

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.formats import json_text, jsonl, tables
+from hybridlog.formats import jsonl, tables
 from hybridlog.formats.json_text import json_column
 from hybridlog.formats.jsonl import (
     JsonlWriter,
@@ -31,6 +31,7 @@ from hybridlog.formats.jsonl import (
 from hybridlog.formats.npz import NpzWriter
 from hybridlog.formats.tables import ArrowWriter, CsvWriter, ParquetWriter
 from hybridlog_storage.errors import UsageError
+from tests.limits import Limit
 
 T = 1_425_407_313_123_456_789
 
@@ -446,7 +447,9 @@ def test_npz_names_stay_in_their_place() -> None:
     assert not any("/" in entry or "\\" in entry for entry in entries)
 
 
-def test_long_rows_in_pieces_are_the_same_text(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_rows_in_pieces_are_the_same_text(
+    monkeypatch: pytest.MonkeyPatch, limit: Limit
+) -> None:
     rng = random.Random(0)
     rows = [
         {
@@ -475,8 +478,7 @@ def test_long_rows_in_pieces_are_the_same_text(monkeypatch: pytest.MonkeyPatch) 
     for module in (tables, jsonl):
         monkeypatch.setattr(module, "rows_within", lambda *_: 1)
     for size in (3, 30, 300):
-        monkeypatch.setattr(json_text, "PIECE_BYTES", size)
-        monkeypatch.setattr(tables, "PIECE_BYTES", size)
+        limit(json_text_piece_bytes=size, tables_piece_bytes=size)
         assert written() == whole
     long = {"a": [1, math.nan, "é"] * 3000, "b": [], "c": {"d": [None] * 5000}, "e": 2**70}
     assert "".join(object_line(long)) == json_line(long)

@@ -18,6 +18,7 @@ from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.limits import Limit
 from tests.live.test_recording import channel, text
 from tests.test_faults import wait_for
 
@@ -126,9 +127,9 @@ def test_no_chunk_takes_much_of_the_budget() -> None:
 
 
 @pytest.mark.usefixtures("pool")
-def test_no_chunk_becomes_larger_than_a_slab(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_chunk_becomes_larger_than_a_slab(limit: Limit) -> None:
     """What is at hand could not serve for it."""
-    monkeypatch.setattr(module, "_AHEAD_S", 0)
+    limit(ahead_s=0)
     with closing(MemoryReservation(SLAB // 2, 1 << 40)) as reservation:
         comes(reservation, 1e12)
         assert reservation.chunk_size == SLAB
@@ -155,10 +156,8 @@ def test_where_there_is_no_memory_it_is_asked_for_once(
         assert reservation.next_chunk_size() == 4 * SIZE
 
 
-def test_who_closes_does_not_wait_for_all_of_it(
-    pool: Buffers, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_BUFFER_PAUSE_RATIO", 1e9)
+def test_who_closes_does_not_wait_for_all_of_it(pool: Buffers, limit: Limit) -> None:
+    limit(buffer_pause_ratio=1e9)
     with closing(MemoryReservation(SIZE, 16 * SLAB)) as reservation:
         given = pool._given[SLAB]
         reservation.observe(1e12)
@@ -205,10 +204,10 @@ def test_usual_chunks_need_nothing(pool: Buffers) -> None:
 
 
 def test_a_recording_of_much_has_larger_chunks(
-    store: hl.Store, pool: Buffers, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, pool: Buffers, limit: Limit
 ) -> None:
     """And what is in them is what was written, in order."""
-    monkeypatch.setattr(module, "_MAX_CHUNKS_PER_S", 4)
+    limit(max_chunks_per_s=4)
     own = [channel(f"/talk{n}") for n in range(3)]
     sizes = [10, 20_000, 150_000, 300_000, COPIED_AT_ONCE]
     written: dict[Channel, list[bytes]] = {one: [] for one in own}

@@ -44,6 +44,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.limits import Limit
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
 from tests.test_faults import wait_for
 
@@ -408,9 +409,9 @@ def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
 
 @pytest.mark.parametrize("place", ["before the chunks", "before the disk"])
 def test_a_recorder_that_writes_nothing_is_stalled(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, place: str
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit, place: str
 ) -> None:
-    monkeypatch.setattr(recorder_module, "_SLOW_WRITE_S", 0.1)
+    limit(slow_write_s=0.1)
     robot = Running(store, RecorderOptions(reserve_bytes=0, flush_interval_s=0.05))
     wait_for(lambda: not robot.recorder.look().stalled_s)
     blocked = threading.Event()
@@ -641,10 +642,8 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     assert robot.recorder.stop() == []
 
 
-def test_what_is_expected_is_ready_before_its_first_message(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder_module, "_MAX_EXPECTED", 2)
+def test_what_is_expected_is_ready_before_its_first_message(store: hl.Store, limit: Limit) -> None:
+    limit(expected_topics=2)
     database = store.database_for("This")
     robot = Running(store)
     channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]

@@ -39,6 +39,7 @@ from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from tests.limits import Limit
 from tests.live.sources.heard import must_return
 from tests.test_faults import kill_mongod, wait_for
 
@@ -286,7 +287,7 @@ def test_a_batch_is_for_chunks_that_get_many_messages(
 
 
 def test_what_is_laid_down_together_keeps_its_order(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     """Of all topics, whatever the sizes are, and however much comes at one time."""
     sizes = [0, 10, 30_000, 200, 300_000, 10, COPIED_AT_ONCE]
@@ -298,7 +299,7 @@ def test_what_is_laid_down_together_keeps_its_order(
         batches.append(batch.payload_bytes)
         append(self, batch, channels)
 
-    monkeypatch.setattr(live, "_MAX_BATCH_BYTES", 9_000_000)
+    limit(laid_out_bytes=9_000_000)
     monkeypatch.setattr(RecordingWriter, "append", counted)
     payloads = [text(b"%5d" % n + bytes(sizes[n % 7])) for n in range(210)]
     with store.start("talk") as recording, recording._laying:
@@ -334,10 +335,9 @@ def test_the_index_falls_behind_and_catches_up(
 @pytest.mark.parametrize("size", [150_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_index_waits_while_messages_wait_for_their_turn(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, late: bool, size: int
+    store: hl.Store, limit: Limit, late: bool, size: int
 ) -> None:
-    monkeypatch.setattr(live, "_PRESSURE_HOLD_S", 3600)
-    monkeypatch.setattr(live, "_LATE_TIMES", 36_000 if late else 0)
+    limit(pressure_hold_s=3600, late_times=36_000 if late else 0)
     own = channel("/talk")
     with store.start("talk", flush_interval_s=0.2) as recording:
         thread = threading.Thread(target=recording.write, args=(own, text(os.urandom(size))))
@@ -426,7 +426,11 @@ def test_a_full_disk(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("processors", "side_by_side"), [(1, 1), (2, 1), (3, 2), (16, 3)])
 def test_a_processor_is_left_to_who_brings_messages(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, processors: int, side_by_side: int
+    store: hl.Store,
+    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
+    processors: int,
+    side_by_side: int,
 ) -> None:
     """By packing, which two threads do, and by making documents and columns together."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)), raising=False)
@@ -449,12 +453,12 @@ def test_a_processor_is_left_to_who_brings_messages(
 
         monkeypatch.setattr(of, name, watched)
 
-    monkeypatch.setattr(segment_writer, "_TURN_S", 30)
+    limit(compression_turn_s=30)
     slowly(segment_writer, "pack")
     slowly(ChunkIndexer, "documents_of")
     slowly(TableWriter, "add")
     payloads = [text(bytes([n]) * 2000) for n in range(30)]
-    monkeypatch.setattr(index_writer, "_GROUP_BYTES", 0)
+    limit(index_group_bytes=0)
     monkeypatch.setattr(live, "_index_interval_s", lambda _: 0.01)
     with store.start("talk", settings=SegmentSettings(chunk_size=2000)) as recording:
         for payload in payloads:

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import pytest
 
 import hybridlog as hl
-from hybridlog.live import recorder as recorder_module
 from hybridlog.live.clocks import clock_time
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
@@ -19,6 +18,7 @@ from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
+from tests.limits import Limit
 from tests.live.speaker import Speaker, text, text_channel
 
 SECOND = 1_000_000_000
@@ -149,10 +149,8 @@ def test_what_does_not_fit_before_the_clock_is_in_the_ledger(store: hl.Store) ->
     assert {t.topic: t.messages for t in state.topics} == {"/chatter": 11, "/clock": 1}
 
 
-def test_without_a_clock_everything_is_counted_as_lost(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder_module, "_CLOCK_WAIT_S", 0)
+def test_without_a_clock_everything_is_counted_as_lost(store: hl.Store, limit: Limit) -> None:
+    limit(clock_wait_s=0)
     simulation = Simulation(store)
     simulation.say("a")
     simulation.say("b")

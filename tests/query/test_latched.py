@@ -16,13 +16,13 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats.slices import Front
-from hybridlog.query import latching
 from hybridlog.query.latching import KEEP_ALL, LatchedFront, depth_of
 from hybridlog.query.query import Query
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.limits import Limit
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
@@ -312,10 +312,8 @@ def test_a_recorded_slice_without_latched_messages(store: hl.Store, log: Path) -
     assert (report.latched, report.latched_left_out) == (0, 0)
 
 
-def test_what_does_not_fit_in_memory_is_told(
-    store: hl.Store, log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(latching, "MAX_HELD", 1)
+def test_what_does_not_fit_in_memory_is_told(store: hl.Store, log: Path, limit: Limit) -> None:
+    limit(latched_held=1)
     begin = BEGIN + 45 * SECOND
     report = store.record(log, name="tight", between=(begin, begin + SECOND), again=True)
     # The last message of each publisher, and all of those who keep all.

@@ -12,9 +12,9 @@ from bson.int64 import Int64
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.schema import document
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings, take, top_level_names
 from hybridlog.schema.document import Bodies, TooLarge, bodies
+from tests.limits import Limit
 
 LIMIT = 4
 DTYPES = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]
@@ -317,8 +317,8 @@ def test_too_large_rows_are_named_and_the_others_are_made() -> None:
 
 
 @pytest.mark.parametrize("regular", [True, False])
-def test_bodies_are_made_in_slabs(monkeypatch: pytest.MonkeyPatch, regular: bool) -> None:
-    monkeypatch.setattr(document, "_SLAB", 1000)
+def test_bodies_are_made_in_slabs(limit: Limit, regular: bool) -> None:
+    limit(document_slab_bytes=1000)
     kind = (
         "message",
         {"s": ("string",), "u": ("list", ("number", "u1")), "m": ("list", ("message", {}))},

@@ -11,13 +11,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.index import index_writer
-from hybridlog.query import index_reader
 from hybridlog.query.choice import Choice
 from hybridlog.query.counters import Counters
 from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from tests.faults import logs
+from tests.limits import Limit
 from tests.servers.commands import Sent, commands
 
 MESSAGES = 12
@@ -113,11 +112,11 @@ def test_no_question_asks_once_a_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("is_large", [False, True])
 def test_a_large_recording_leaves_no_journal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_large: bool
+    tmp_path: Path, limit: Limit, *, is_large: bool
 ) -> None:
     """Its end asks the server for one checkpoint; that of a small one does not."""
     if is_large:
-        monkeypatch.setattr(index_writer, "_CHECKPOINT_BYTES", 1)
+        limit(index_checkpoint_bytes=1)
     log = logs.write(tmp_path / "one.mcap", logs.content(0, MESSAGES))
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         with commands() as sent:
@@ -128,14 +127,12 @@ def test_a_large_recording_leaves_no_journal(
 
 
 @pytest.mark.parametrize("most", [1, 100])
-def test_some_of_many_recordings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_some_of_many_recordings(tmp_path: Path, limit: Limit, most: int) -> None:
     """Ranges of time are joined, where no recording that is not asked about lies between."""
     path = tmp_path / "store"
     add(path, range(7))
     with hl.open(path, require_database=True) as store:
-        monkeypatch.setattr(index_reader, "_MAX_RANGES", most)
+        limit(index_ranges=most)
         for chosen, apart in (([0, 1, 2, 4, 6], 3), ([6], 1), ([0, 3], 2), (range(7), 1)):
             query = store.topic("/number").in_recording(*(f"log {n}" for n in chosen))
             there = [n * GAP + k for n in chosen for k in range(MESSAGES)]

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.query import index_reader
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.faults import logs
+from tests.limits import Limit
 from tests.servers.commands import commands
 from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set
 
@@ -120,7 +120,7 @@ def test_questions_go_on(
     members: ReplicaSet,
     store: hl.Store,
     log: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
 ) -> None:
     store.record(log)
     query = store.topic("/number").where({"$expr": {"$gte": ["$n", 100]}})
@@ -129,7 +129,7 @@ def test_questions_go_on(
     assert query.count() == MESSAGES - 100
     members.heal()
     # In the middle of an answer.
-    monkeypatch.setattr(index_reader, "_DOCUMENTS", 500)
+    limit(documents_at_once=500)
     documents = query.documents()
     database = store.database
     found = [next(documents)["n"] for _ in range(10)]

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.query import index_reader
 from hybridlog_storage.errors import DatabaseError
 from tests.faults import logs
+from tests.limits import Limit
 from tests.servers.mongods import Mongod
 from tests.servers.proxy import Proxy
 
@@ -42,9 +42,9 @@ RAW = {"$expr": {"$gte": ["$n", 10]}}
 
 
 @pytest.fixture(autouse=True)
-def in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def in_parts(limit: Limit) -> None:
     """Let answers come in several parts."""
-    monkeypatch.setattr(index_reader, "_DOCUMENTS", 100)
+    limit(documents_at_once=100)
 
 
 def test_answers_go_on_behind_a_reset(way: Proxy, uri: str, log: Path, tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import table_writer as writer
 from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
@@ -29,6 +28,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
+from tests.limits import Limit
 from tests.sql.conftest import LARGE, SCANS
 
 ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
@@ -210,10 +210,8 @@ def large_file(store: hl.Store) -> Path:
     return path
 
 
-def test_missing_and_damaged_tables_are_made_again(
-    own: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writer, "LONG_ROWS", 1000)
+def test_missing_and_damaged_tables_are_made_again(own: hl.Store, limit: Limit) -> None:
+    limit(long_table_rows=1000)
     query = "select count(*), sum(i8), sum(covariance_summary.n) from large"
     wanted = own.sql(query).rows()
     path = large_file(own)
@@ -247,7 +245,9 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
         own.sql("select max(ranges[1]) from scan").rows()
 
 
-def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_query_is_parsed_once(
+    own: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
+) -> None:
     query = "select count(*) from scan where angle < 3"
     found = own.sql(query).rows()
     trees = own.sql_engine._trees
@@ -257,11 +257,11 @@ def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(duckdb.Error):
         own.sql(f"{query} and angle > 1")
     monkeypatch.undo()
-    monkeypatch.setattr(engine, "_MAX_TREES", 2)
+    limit(sql_trees=2)
     for limit in range(5):
         assert len(own.sql(f"select angle from scan limit {limit}").rows()) == limit
     assert list(trees) == [f"select angle from scan limit {limit}" for limit in (3, 4)]
-    monkeypatch.setattr(engine, "_MAX_TREE", 10)
+    limit(sql_tree_size=10)
     own.sql("select t from scan").rows()
     assert len(trees) == 2
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import table_writer as writer
 from hybridlog.live import LiveRecording
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_reader import SegmentReader, places_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.limits import Limit
 from tests.sql.conftest import SCAN, scan
 from tests.tables.logs import BASE, STATE, payload
 
@@ -29,11 +29,9 @@ ROWS = "select count(*), count(distinct seq), min(i8), max(i8), sum(covariance[1
 
 
 @pytest.fixture
-def reader(
-    tmp_path: Path, server: str, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[LiveRecording, hl.Store]]:
+def reader(tmp_path: Path, server: str, limit: Limit) -> Iterator[tuple[LiveRecording, hl.Store]]:
     """A recording that goes on, and the store opened a second time."""
-    monkeypatch.setattr(writer, "LONG_ROWS", 1000)
+    limit(long_table_rows=1000)
     folder = tmp_path / "store"
     mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
     with hl.open(folder, create=True, mongo=mongo) as store:

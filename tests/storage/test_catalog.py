@@ -26,7 +26,6 @@ from hypothesis import strategies as st
 
 from hybridlog.entries import summary_of, topic_types
 from hybridlog.query.chunk_columns import ChunkColumns
-from hybridlog_storage import catalog as module
 from hybridlog_storage.catalog import (
     CATALOG,
     Catalog,
@@ -56,6 +55,7 @@ from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.chunk_table import CHUNK, OTHER, PART, ChunkTable
 from tests.imports import ROOT
+from tests.limits import Limit
 
 STORE = "5" * 32
 CHANNELS = range(1, 6)
@@ -847,10 +847,10 @@ def test_a_symlink_to_the_store_is_no_hindrance(tmp_path: Path, model: Model) ->
 
 
 def test_one_in_memory_takes_the_place_of_a_locked_one(
-    tmp_path: Path, model: Model, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, model: Model, limit: Limit
 ) -> None:
     """Somebody writes for longer than one waits: that is told, and nothing is deleted."""
-    monkeypatch.setattr(module, "_BUSY_S", 0.05)
+    limit(catalog_busy_s=0.05)
     other = Model(2, "other")
     with closing(Catalog(tmp_path, STORE)) as made:
         model.put(made)

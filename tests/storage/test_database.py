@@ -34,6 +34,7 @@ from hybridlog_storage.mongo.database import (
     without_secrets,
 )
 from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
+from tests.limits import Limit
 
 NUMBERS = count()
 
@@ -276,10 +277,10 @@ def test_many_questions_at_once(database: Database, name: str) -> None:
 
 
 def test_large_questions_go_in_several_commands(
-    database: Database, name: str, monkeypatch: pytest.MonkeyPatch
+    database: Database, name: str, limit: Limit
 ) -> None:
     database.insert_raw(name, b"".join(encoded(5)), 5)
-    monkeypatch.setattr(module, "_MAX_COMMAND_BYTES", 2000)
+    limit(inserted_bytes_together=2000)
     long = [(name, {"x": {"$in": [n, *range(-200, 0)]}}) for n in range(7)]
     assert database.count_each(long) == [1, 1, 1, 1, 1, 0, 0]
 

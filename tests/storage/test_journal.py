@@ -45,6 +45,7 @@ from hybridlog_storage.journal import (
     parse,
 )
 from tests import odd_values
+from tests.limits import Limit
 from tests.storage.steps import Steps, name_of, through
 
 ID = "0123456789abcdef" * 2
@@ -632,11 +633,11 @@ def test_only_an_ordinary_file_is_a_journal(folder: Path, tmp_path: Path, kind: 
     assert elsewhere.read_bytes() == DATA
 
 
-def test_one_that_is_too_large_is_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_is_too_large_is_not_read(folder: Path, limit: Limit) -> None:
     (folder / JOURNAL).write_bytes(DATA)
-    monkeypatch.setattr(journal, "MAX_JOURNAL", len(DATA))
+    limit(max_journal=len(DATA))
     assert journal.read(folder) is not None
-    monkeypatch.setattr(journal, "MAX_JOURNAL", len(DATA) - 1)
+    limit(max_journal=len(DATA) - 1)
     with pytest.raises(StoreError, match="too large"):
         journal.read(folder)
 

@@ -27,8 +27,8 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.mongo import mongod as module
 from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
+from tests.limits import Limit
 from tests.some import in_turn
 
 LINGER_S = 0.2
@@ -483,11 +483,11 @@ def test_a_program_that_is_none(
 
 
 def test_a_mongod_that_never_answers(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     fake = fake_mongod(tmp_path / "fake", "exec sleep 60")
     monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake))
-    monkeypatch.setattr(module, "SILENCE_LIMIT_S", 1.0)
+    limit(mongod_silence_s=1.0)
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
     wait_for(lambda: not (directory / "mongod.json").exists(), "the keeper's end")
@@ -575,12 +575,12 @@ def test_a_mongod_that_cannot_start_at_all_is_no_damage(
 
 
 def test_damaged_data_files_are_removed_at_once_if_room_is_short(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     seen = tmp_path / "seen"
     script = f"""ls {directory} > {seen}; echo '{{"s":"F","msg":"oh"}}'; kill -6 $$"""
     monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
-    monkeypatch.setattr(module, "_ROOM", 1 << 62)
+    limit(mongod_room_bytes=1 << 62)
     data = marked(directory)
     with pytest.raises(DatabaseError):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()

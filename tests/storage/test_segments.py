@@ -29,7 +29,6 @@ from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
-from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.segments.compression import Compressor, FilePart
@@ -53,6 +52,7 @@ from hybridlog_storage.segments.segment_format import (
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, postpone
+from tests.limits import Limit
 from tests.storage.steps import Steps, through
 
 RECORDING = {
@@ -279,7 +279,7 @@ def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("spare", "hurried"), [(1, False), (1, True), (2, False)])
 def test_no_more_threads_pack_than_may_but_in_a_hurry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spare: int, hurried: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, spare: int, hurried: bool
 ) -> None:
     is_alone = spare == 1 and not hurried
     side_by_side = threading.Barrier(2)
@@ -295,7 +295,7 @@ def test_no_more_threads_pack_than_may_but_in_a_hurry(
         return "", bytes(data)
 
     monkeypatch.setattr(Compressor, "compress", compress)
-    monkeypatch.setattr(segment_writer, "_TURN_S", 30)
+    limit(compression_turn_s=30)
     writer = RecordingWriter(
         tmp_path,
         RECORDING,
@@ -401,11 +401,9 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     assert [data for _, _, data in messages_in(path)] == payloads
 
 
-def test_a_segment_has_no_more_chunks_than_a_summary_should(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_segment_has_no_more_chunks_than_a_summary_should(tmp_path: Path, limit: Limit) -> None:
     """However well they shrink."""
-    monkeypatch.setattr(segment_writer, "_MAX_CHUNKS", 10)
+    limit(segment_chunks=10)
     writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None, SegmentSettings(chunk_size=2000))
     payloads = [bytes([n]) * 1500 for n in range(200)]
     for n, payload in enumerate(payloads):
@@ -923,12 +921,9 @@ def test_a_recovered_segment_is_on_the_disk_before_it_gets_its_name(tmp_path: Pa
         recovered.path.unlink()
 
 
-def test_long_segments_are_synced_as_they_grow(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_segments_are_synced_as_they_grow(tmp_path: Path, limit: Limit) -> None:
     """Where writes go through the page cache; so sealing takes no time."""
-    monkeypatch.setattr(segment_writer, "_SYNC_STRIDE", 1000)
-    monkeypatch.setattr("hybridlog_storage.disk.append_file.DIRECT", 0)
+    limit(sync_stride_bytes=1000, direct_flag=0)
     steps = Steps()
     with through(steps):
         writer = small_writer(tmp_path / "rec", steps, "seal")
@@ -1521,11 +1516,9 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
     assert all(have[c.segment, c.number] == content_of(c) for c in chunks)
 
 
-def test_channels_of_all_chunks_are_bounded_in_a_segment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_channels_of_all_chunks_are_bounded_in_a_segment(tmp_path: Path, limit: Limit) -> None:
     """However many topics share a chunk."""
-    monkeypatch.setattr(segment_writer, "_MAX_PARTS", 20)
+    limit(segment_parts=20)
     topics = [Channel(f"/{n}", "json", None) for n in range(10)]
     writer = RecordingWriter(tmp_path, RECORDING, lambda *_: None)
     for n in range(6):

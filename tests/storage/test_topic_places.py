@@ -18,6 +18,7 @@ from hybridlog_storage.mongo.index_documents import key_bound, recording_key, wi
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.mongo.topic_places import SHARED, TOPICS, TopicPlace, TopicPlaces
+from tests.limits import Limit
 
 ONE, OTHER = "1" * 16, "2" * 16
 
@@ -29,8 +30,8 @@ def uri(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture
-def database(uri: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Database]:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 2)
+def database(uri: str, limit: Limit) -> Iterator[Database]:
+    limit(own_collections=2)
     with Database.connect(uri, f"places-{os.urandom(4).hex()}") as connected:
         yield connected
         connected.drop_all()
@@ -125,10 +126,8 @@ def test_few_commands_place_many_topics(
 NAMES = ("/a", "a", "/A", "/a b", "/\udc80", "/\udc81", "")
 
 
-def test_topics_stay_apart_in_a_shared_collection(
-    database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 0)
+def test_topics_stay_apart_in_a_shared_collection(database: Database, limit: Limit) -> None:
+    limit(own_collections=0)
     places = TopicPlaces(database).assigned(NAMES)
     assert {place.collection for place in places.values()} == {SHARED}
     assert len({place.prefix for place in places.values()}) == len(NAMES)
@@ -142,8 +141,8 @@ def test_topics_stay_apart_in_a_shared_collection(
         assert times(database, place, at + 3) == [at + 3]
 
 
-def test_names_of_one_hash_stay_apart(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 0)
+def test_names_of_one_hash_stay_apart(database: Database, limit: Limit) -> None:
+    limit(own_collections=0)
     places = TopicPlaces(database).assigned(["/a", "/b"])
     for place in places.values():
         place.__dict__["prefix"] = b"8 bytes."
@@ -153,10 +152,8 @@ def test_names_of_one_hash_stay_apart(database: Database, monkeypatch: pytest.Mo
     assert times(database, places["/b"], 0, 9) == [3, 4]
 
 
-def test_clearing_in_a_shared_collection(
-    database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 1)
+def test_clearing_in_a_shared_collection(database: Database, limit: Limit) -> None:
+    limit(own_collections=1)
     places = TopicPlaces(database).assigned(["/a", "/b", "/c"])
     for place in places.values():
         put(database, place, ONE, range(4))
@@ -184,10 +181,8 @@ def test_documents_with_and_without_a_prefix() -> None:
         assert keys.recording.tolist() == [int(ONE, 16)] * 2
 
 
-def test_an_index_holds_one_topic_of_a_shared_collection(
-    database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(topic_places, "OWN_COLLECTIONS", 0)
+def test_an_index_holds_one_topic_of_a_shared_collection(database: Database, limit: Limit) -> None:
+    limit(own_collections=0)
     places = TopicPlaces(database).assigned(["/a", "/b"])
     for place in places.values():
         for _ in range(2):

@@ -11,9 +11,9 @@ import duckdb
 import pyarrow.parquet as pq
 
 import hybridlog as hl
-from hybridlog.columns import table_writer as writing
 from hybridlog.columns.tables import Tables
 from hybridlog_storage.messages import Schema
+from tests.limits import Limit
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import BASE, write_log
 
@@ -66,11 +66,9 @@ def test_json_of_mixed_types(store: hl.Store, tmp_path: Path) -> None:
     assert [row["a"] and json.loads(row["a"]) for row in found] == [1, "x", {"b": 2}, None]
 
 
-def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, monkeypatch: Any) -> None:
+def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
     """A file has one type: what comes later goes to another one, and all is one table."""
-    monkeypatch.setattr(writing, "_PENDING", 1)
-    monkeypatch.setattr(writing, "_LEFT", 0)
-    monkeypatch.setattr(writing, "_ARENA", 1)
+    limit(table_pending_bytes=1, table_left_bytes=0, table_arena_bytes=1)
     values = [{"a": n} if n < 1000 else {"a": n, "b": str(n)} for n in range(2000)]
     record(store, tmp_path, values)
     assert len(list((store.directory.path / "tables").glob("any~*"))) == 2
@@ -79,11 +77,9 @@ def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, monkeypatc
 
 
 def test_json_whose_types_change_has_files_and_no_answer(
-    store: hl.Store, tmp_path: Path, monkeypatch: Any
+    store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    monkeypatch.setattr(writing, "_PENDING", 1)
-    monkeypatch.setattr(writing, "_LEFT", 0)
-    monkeypatch.setattr(writing, "_ARENA", 1)
+    limit(table_pending_bytes=1, table_left_bytes=0, table_arena_bytes=1)
     record(store, tmp_path, [{"a": n if n < 1000 else str(n)} for n in range(2000)])
     files = list((store.directory.path / "tables").glob("any~*/*.parquet"))
     assert sum(pq.read_metadata(path).num_rows for path in files) == 2000

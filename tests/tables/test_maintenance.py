@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import table_writer as writing
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import PARTS, TABLES
 from hybridlog.columns.parquet_file import ParquetFileReader
@@ -21,6 +20,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.faults import logs
+from tests.limits import Limit
 from tests.tables.logs import BASE, channel, varied, write_log
 from tests.tables.test_writer import compare, topics_of
 
@@ -170,10 +170,8 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     assert not unfinished(few)
 
 
-def test_only_what_is_missing_is_made(
-    few: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writing, "LONG_ROWS", 1000)
+def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limit) -> None:
+    limit(long_table_rows=1000)
     said = [(BASE + n, f"/{n % 2}", varied(n)) for n in range(2400)]
     entry = few.record(write_log(tmp_path / "two.mcap", said), name="two").entry
     assert making.missing(few.directory, entry) == set()
@@ -320,10 +318,10 @@ def killed_at(step: int, work: Callable[[], object]) -> bool:
 @pytest.mark.parametrize("stride", [11, pytest.param(1, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("what", ["make", "make again", "remove"])
 def test_killed_at_each_step(
-    few: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str, stride: int
+    few: hl.Store, tmp_path: Path, limit: Limit, what: str, stride: int
 ) -> None:
     """At every step: what is there is whole, and what is missing is made by the next one."""
-    monkeypatch.setattr(writing, "LONG_ROWS", 300)
+    limit(long_table_rows=300)
     said = [(BASE + n, "/large", varied(n)) for n in range(1100)]
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 16)
     entry = few.record(write_log(tmp_path / "l.mcap", said), name="l", settings=settings).entry

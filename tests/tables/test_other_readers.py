@@ -20,11 +20,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import table_writer as writing
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.settings import NONE
 from tests.cli.within import answer
 from tests.data import DATA, needs_data
+from tests.limits import Limit
 from tests.tables.logs import (
     BASE,
     SECOND,
@@ -169,9 +169,9 @@ KINDS = {
 
 
 @pytest.fixture
-def many(store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> hl.Store:
+def many(store: hl.Store, tmp_path: Path, limit: Limit) -> hl.Store:
     """Recordings with large and small topics, changed types, odd messages."""
-    monkeypatch.setattr(writing, "LONG_ROWS", 500)
+    limit(long_table_rows=500)
     other = Schema("x/Other", "ros1msg", b"float32 x\n")
     definitions = (b"float64 a\n", b"float64 a\nint32 b\n")
     for number in range(4):

@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import parquet_file
 from hybridlog.columns.layout import (
     About,
     Section,
@@ -22,6 +21,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.parquet_file import ParquetFileReader, ParquetFileWriter, leaves
 from hybridlog_storage.errors import StoreError
+from tests.limits import Limit
 
 ROWS = 20_000
 
@@ -201,10 +201,9 @@ def test_encodings(recorded: hl.Store) -> None:
 
 
 def test_bytes_that_share_a_checksum_may_be_of_any_number(
-    path: Path, table: pa.Table, monkeypatch: pytest.MonkeyPatch
+    path: Path, table: pa.Table, limit: Limit
 ) -> None:
-    monkeypatch.setattr(parquet_file, "BLOCK", 100)
-    monkeypatch.setattr(parquet_file, "_WRITTEN", 7)
+    limit(parquet_block_bytes=100, parquet_write_bytes=7)
     write(path, table)
     ParquetFileReader(path).check()
 

@@ -26,6 +26,7 @@ from hybridlog.columns.topic_table import TopicTable, _merged
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
+from tests.limits import Limit
 from tests.some import in_turn
 from tests.tables import ask
 from tests.tables.conftest import SMALL_CHUNKS
@@ -115,12 +116,10 @@ def test_ranges_of_time(recorded: hl.Store, topic: str, bounds: list[int]) -> No
 
 
 def test_row_groups_out_of_range_are_not_read(
-    recorded: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recorded: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
-    from hybridlog.columns import table_writer as writer
 
-    monkeypatch.setattr(writer, "GROUP_ROWS", 100)
-    monkeypatch.setattr(writer, "LONG_ROWS", 1000)
+    limit(table_group_rows=100, long_table_rows=1000)
     (entry,) = recorded.recordings()
     making.make(recorded.directory, entry, ["/large"])
     table = table_of(recorded)

@@ -12,8 +12,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.columns import column_file, folders, parquet_file
-from hybridlog.columns import table_writer as writing
+from hybridlog.columns import folders, parquet_file
 from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
@@ -21,6 +20,7 @@ from hybridlog.query.predicate import to_mask as deciding
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Schema
+from tests.limits import Limit
 from tests.tables.logs import BASE, SECOND, STATE, varied, write_log
 from tests.tables.test_writer import compare, files_of
 
@@ -99,13 +99,13 @@ def test_long_arrays_of_another_recording_change_no_count(
 
 
 def test_more_files_than_may_be_open(
-    several: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    several: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     """A file is closed, but what is known of it stays."""
-    monkeypatch.setattr(writing, "LONG_ROWS", 20)
+    limit(long_table_rows=20)
     for number in range(COUNT, COUNT + 6):
         record(several, tmp_path, number, 60)
-    monkeypatch.setattr(column_file, "_OPEN_FILES", 4)
+    limit(column_file_open_files=4)
     several.refresh()
     assert len(files_of(several)) == 13
     query = several.query(["/a", "/b"]).where("i8 > 0")
@@ -126,10 +126,8 @@ def test_a_closed_file_that_was_replaced_is_not_believed(several: hl.Store, tmp_
         file.table()
 
 
-def test_a_full_file_gets_no_more_rows(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(folders, "MAX_SHARED_ROWS", 70)
+def test_a_full_file_gets_no_more_rows(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
+    limit(shared_file_rows=70)
     for number in range(5):
         record(store, tmp_path, number)
     rows = [pq.read_metadata(path).num_rows for path in files_of(store)]
@@ -143,9 +141,9 @@ def test_a_full_file_gets_no_more_rows(
 
 
 @pytest.fixture
-def apart(store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> hl.Store:
+def apart(store: hl.Store, tmp_path: Path, limit: Limit) -> hl.Store:
     """A store of nine recordings, in three shared files."""
-    monkeypatch.setattr(folders, "MAX_SHARED_ROWS", 100)
+    limit(shared_file_rows=100)
     for number in range(9):
         record(store, tmp_path, number)
     assert len(files_of(store)) == 3
@@ -202,11 +200,11 @@ def test_lists_go_with_their_folders(several: hl.Store) -> None:
 
 
 def test_folders_are_read_once_for_all_recordings_without_tables(
-    several: hl.Store, monkeypatch: pytest.MonkeyPatch
+    several: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
     (path,) = files_of(several)
     path.unlink()
-    monkeypatch.setattr(folders, "_STABLE_NS", -1)
+    limit(settled_ns=-1)
     entries = list(several.recordings())
     read: list[int] = []
     real = files.names_in

@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import table_writer as writing
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
 from hybridlog.columns.table_writer import TableWriter
@@ -28,6 +27,7 @@ from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
+from tests.limits import Limit
 from tests.some import each
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import (
@@ -146,17 +146,19 @@ def test_tables_of_real_logs_are_what_the_messages_say(store: hl.Store, name: st
 def test_tables_are_what_the_messages_say(
     store: hl.Store,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
     arena: int,
     enough: int,
     rows: int,
     pending: int,
 ) -> None:
-    monkeypatch.setattr(writing, "_ARENA", arena)
-    monkeypatch.setattr(writing, "_MIN_IN_PLACE_BYTES", enough)
-    monkeypatch.setattr(writing, "_ROWS", rows)
-    monkeypatch.setattr(writing, "_PENDING", pending)
-    monkeypatch.setattr(writing, "_LEFT", pending // 4)
+    limit(
+        table_arena_bytes=arena,
+        table_in_place_bytes=enough,
+        table_collected_rows=rows,
+        table_pending_bytes=pending,
+        table_left_bytes=pending // 4,
+    )
     said = [(BASE + n * 7 % 41, f"/{'abc'[n % 3]}", varied(n)) for n in range(300)]
     write_log(tmp_path / "log.mcap", said)
     store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
@@ -198,11 +200,9 @@ def test_names_of_ours_and_twins_get_other_names(recorded: hl.Store) -> None:
     assert schema.field("u64").type == pa.uint64()
 
 
-def test_a_segment_has_its_tables_once_it_is_sealed(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store, limit: Limit) -> None:
     """Below the unfinished tables, until the recording has ended."""
-    monkeypatch.setattr(writing, "LONG_ROWS", 300)
+    limit(long_table_rows=300)
     settings = SegmentSettings(chunk_size=4096, segment_size=300_000)
     # Chunks are flushed when they are full: partly filled ones make segments of few rows.
     with store.start("live", settings=settings, flush_interval_s=60) as recording:
@@ -226,11 +226,9 @@ def test_a_segment_has_its_tables_once_it_is_sealed(
     assert store.verify().findings == []
 
 
-def test_few_rows_a_segment_wait_for_more(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_rows_a_segment_wait_for_more(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
     """A topic of one message a second has no file a segment."""
-    monkeypatch.setattr(writing, "LONG_ROWS", 1000)
+    limit(long_table_rows=1000)
     said = [(BASE + n, "/slow" if n % 20 == 0 else "/fast", varied(n)) for n in range(12_000)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 18)
@@ -244,9 +242,9 @@ def test_few_rows_a_segment_wait_for_more(
 
 
 def test_a_topic_with_files_shares_one_for_its_last_rows(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    monkeypatch.setattr(writing, "LONG_ROWS", 1000)
+    limit(long_table_rows=1000)
     said = [(BASE + n, "/a" if n < 1100 else "/b", varied(n)) for n in range(3000)]
     said += [(BASE + 3000 + n, "/a", varied(n)) for n in range(5)]
     write_log(tmp_path / "log.mcap", said)
@@ -328,11 +326,9 @@ def chunks_of(store: hl.Store, entry: RecordingEntry) -> list[Any]:
 
 
 def test_memory_does_not_grow_with_the_recording(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    monkeypatch.setattr(writing, "_PENDING", 200_000)
-    monkeypatch.setattr(writing, "_LEFT", 50_000)
-    monkeypatch.setattr(writing, "_ARENA", 20_000)
+    limit(table_pending_bytes=200_000, table_left_bytes=50_000, table_arena_bytes=20_000)
     most = []
     for count in (2000, 8000):
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
@@ -352,11 +348,9 @@ def test_memory_does_not_grow_with_the_recording(
 
 
 def test_chunks_that_come_late_are_put_in_their_place(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    monkeypatch.setattr(writing, "_PENDING", 100_000)
-    monkeypatch.setattr(writing, "_LEFT", 20_000)
-    monkeypatch.setattr(writing, "_ARENA", 20_000)
+    limit(table_pending_bytes=100_000, table_left_bytes=20_000, table_arena_bytes=20_000)
     said = [(BASE + n, "/a" if n % 9 else "/b", varied(n)) for n in range(4000)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
@@ -386,10 +380,8 @@ def test_chunks_that_come_late_are_put_in_their_place(
     assert found.tolist() == want
 
 
-def test_the_last_room_is_the_segments_alone(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(writing, "_RESERVE", 1 << 62)
+def test_the_last_room_is_the_segments_alone(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
+    limit(table_reserve_bytes=1 << 62)
     write_log(tmp_path / "log.mcap", [(BASE, "/state", varied(1))])
     assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
     assert not list(store.directory.path.glob("**/*.parquet"))
@@ -440,11 +432,10 @@ class FullDisk(files.System):
 
 @pytest.mark.parametrize("room", [0, *each(4_000, 36_000), 24_000])
 def test_a_disk_that_fills_up(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, room: int
 ) -> None:
     monkeypatch.setattr(files, "system", FullDisk(room))
-    monkeypatch.setattr(writing, "_PENDING", 80_000)
-    monkeypatch.setattr(writing, "_LEFT", 20_000)
+    limit(table_pending_bytes=80_000, table_left_bytes=20_000)
     said = [(BASE + n, f"/{n % 4}", varied(n)) for n in range(2400)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
@@ -460,12 +451,9 @@ def test_a_disk_that_fills_up(
 
 
 def test_too_many_topics_for_the_files_of_a_process(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
-    monkeypatch.setattr(writing, "_PENDING", 1)
-    monkeypatch.setattr(writing, "_LEFT", 0)
-    monkeypatch.setattr(writing, "_OPEN_FILES", 3)
-    monkeypatch.setattr(writing, "_ARENA", 1)
+    limit(table_pending_bytes=1, table_left_bytes=0, table_open_files=3, table_arena_bytes=1)
     said = [(BASE + n, f"/{n % 10}", varied(n)) for n in range(200)]
     write_log(tmp_path / "log.mcap", said)
     entry = store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS).entry

@@ -26,6 +26,7 @@ from hybridlog.view.routes import ask, export
 from hybridlog.view.server import make_app
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.limits import Limit
 
 from .conftest import PORT, TOKEN
 
@@ -188,13 +189,13 @@ def test_sql_gives_rows_that_lead_to_their_time(client: TestClient, demo_store: 
     assert sql(client, alone).json()["at"] == exact
 
 
-def test_sql_is_bounded(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sql_is_bounded(client: TestClient, limit: Limit) -> None:
     answer = sql(client, "select range from range(100000)").json()
     assert (len(answer["rows"]), answer["more"], answer["at"]) == (ask.SQL_ROWS, True, [])
     wide = "select " + ", ".join(f"{n} as c{n}" for n in range(300))
     answer = sql(client, wide).json()
     assert (len(answer["columns"]), answer["columns_left_out"]) == (200, 100)
-    monkeypatch.setattr(ask, "SQL_SECONDS", 0.2)
+    limit(sql_seconds=0.2)
     answer = sql(client, ENDLESS)
     assert "stopped after 0.2 s" in answer.json()["error"]
 
@@ -360,8 +361,10 @@ def test_observed_fields_are_offered(
     assert answer["candidates"][0] == ["`odd.name`", "field", "integer"]
 
 
-def test_a_file_is_made_while_it_is_sent(odd: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(export, "PIECE", 1)
+def test_a_file_is_made_while_it_is_sent(
+    odd: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
+) -> None:
+    limit(export_piece_bytes=1)
     made: list[int] = []
     ended: list[bool] = []
     pieces_of = export.pieces_of

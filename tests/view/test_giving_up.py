@@ -15,13 +15,13 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
-from hybridlog.query import chunk_scan
 from hybridlog.view import context
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
 from hybridlog_storage.messages import Channel
+from tests.limits import Limit
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
 
@@ -95,10 +95,10 @@ def assert_stops(
 
 @pytest.mark.parametrize("is_compact", [False, True])
 def test_reading_payloads_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_compact: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, *, is_compact: bool
 ) -> None:
     """By threads that read ahead, and from columns of payloads."""
-    monkeypatch.setattr(chunk_scan, "_MIN_THREADED_BYTES", 0)
+    limit(min_threaded_bytes=0)
     write_bag(tmp_path / "robot.bag", duration_s=5, config=ROBOT)
     with hl.open(tmp_path / "store", create=True) as store:
         store.record(tmp_path / "robot.bag", name="robot")

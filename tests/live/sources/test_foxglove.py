@@ -27,6 +27,7 @@ from hybridlog.live.sources.foxglove.protocol import PeerError, parse_channel
 from hybridlog.live.sources.foxglove.source import FoxgloveSource
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 from hybridlog_storage.messages import Schema
+from tests.limits import Limit
 from tests.live.sources.heard import DEADLINE_S, Heard, must_return
 
 pytest.importorskip(
@@ -194,11 +195,11 @@ class Server:
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _quick(monkeypatch: pytest.MonkeyPatch, limit: Limit) -> Iterator[None]:
     """Look more often and try again sooner; and nothing is left behind."""
     for module in (foxglove_handshake, foxglove_connection):
         monkeypatch.setattr(module, "TICK_S", 0.02)
-    monkeypatch.setattr(foxglove_client, "_PAUSES_S", (0.02, 0.05))
+    limit(foxglove_pauses_s=(0.02, 0.05))
     yield
     assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
 
@@ -476,8 +477,8 @@ def test_a_channel_that_is_offered_too_soon_is_asked_for_again(words: str) -> No
     assert heard.said == []
 
 
-def test_a_channel_that_is_offered_and_never_sent_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foxglove_session, "_RETRY_S", 0.0)
+def test_a_channel_that_is_offered_and_never_sent_is_told(limit: Limit) -> None:
+    limit(foxglove_retry_s=0.0)
 
     def script(peer: Peer) -> None:
         peer.offer(channel(7))
@@ -551,8 +552,8 @@ def test_who_gives_reason_to_complain_for_ever_is_not_listened_to_for_ever() -> 
     assert len(heard.said) == 101
 
 
-def test_channels_without_end_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foxglove_session, "_MAX_CHANNELS", 10)
+def test_channels_without_end_are_bounded(limit: Limit) -> None:
+    limit(foxglove_channels=10)
 
     def script(peer: Peer) -> None:
         found = peer.offer(*(channel(at, f"/{at}") for at in range(50)))
@@ -677,10 +678,9 @@ def test_the_first_address_of_a_host_that_answers_is_taken() -> None:
 
 
 def test_a_server_that_falls_silent_is_asked_and_then_left(
-    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
 ) -> None:
-    monkeypatch.setattr(foxglove_connection, "_PING_S", 0.1)
-    monkeypatch.setattr(foxglove_connection, "_SILENT_S", 0.3)
+    limit(foxglove_ping_s=0.1, foxglove_silent_s=0.3)
     asked: list[Opcode] = []
 
     def first(peer: Peer) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from hybridlog.live.sources import replay, replay_order
+from hybridlog.live.sources import replay
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.replay import ReplaySource
 from hybridlog.live.sources.replay_order import Lookahead, Rows
@@ -21,6 +21,7 @@ from hybridlog_storage.errors import SourceError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from tests import independent
 from tests.data import DATA, needs_data
+from tests.limits import Limit
 from tests.live.sources.heard import Heard, must_return
 
 BEGIN = 1_700_000_000_000_000_000
@@ -244,9 +245,8 @@ def payloads(rows: Rows | None) -> list[bytes]:
     return [] if rows is None else list(rows.payloads())
 
 
-def test_looking_ahead_is_bounded_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_order, "_WINDOW", 10_000)
-    monkeypatch.setattr(replay_order, "_WINDOW_ROWS", 300)
+def test_looking_ahead_is_bounded_and_loses_nothing(limit: Limit) -> None:
+    limit(replay_window_bytes=10_000, replay_window_rows=300)
     lookahead = Lookahead()
     dice = random.Random(2)
     times = [*range(2000, 4000), *range(2000)]  # the second half is late
@@ -274,17 +274,15 @@ def test_looking_ahead_is_bounded_and_loses_nothing(monkeypatch: pytest.MonkeyPa
     assert payloads(lookahead.rest()) == []
 
 
-def test_a_message_larger_than_what_is_looked_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_order, "_WINDOW", 100)
+def test_a_message_larger_than_what_is_looked_ahead(limit: Limit) -> None:
+    limit(replay_window_bytes=100)
     lookahead = Lookahead()
     assert len(payloads(lookahead.add(batch([5], 1000)))) == 1
     assert lookahead.rest() is None
 
 
-def test_a_late_part_of_a_log_is_sent_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(replay_order, "_WINDOW", 2000)
+def test_a_late_part_of_a_log_is_sent_at_once(tmp_path: Path, limit: Limit) -> None:
+    limit(replay_window_bytes=2000)
     second_first = [*range(1000, 2000), *range(1000)]
     log = [("/a", BEGIN + at * 3600 * SECOND, b"%0100d" % at) for at in second_first]
     path = write(tmp_path / "a.mcap", log)
@@ -320,9 +318,8 @@ def test_only_what_is_wanted_is_played(tmp_path: Path) -> None:
     assert heard.topics == [("/b", "T", 1), ("/b",)]
 
 
-def test_falling_behind_is_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay, "_LATE_S", 0.0)
-    monkeypatch.setattr(replay, "_MAX_MESSAGES", 10)
+def test_falling_behind_is_said_once(tmp_path: Path, limit: Limit) -> None:
+    limit(replay_late_s=0.0, replay_messages=10)
     path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"x") for at in range(100)])
     heard = Heard()
     play(path, heard)

@@ -15,9 +15,9 @@ import psutil
 import pytest
 
 from hybridlog.live.sources.base import Cause
-from hybridlog.live.sources.ros1 import subscription
 from hybridlog.live.sources.ros1.source import Ros1Source
 from hybridlog_storage.errors import UsageError
+from tests.limits import Limit
 from tests.live.sources.heard import must_return
 from tests.live.sources.ros1_peers import (
     Collector,
@@ -33,8 +33,8 @@ Script = Callable[[socket.socket], None]
 
 
 @pytest.fixture(autouse=True)
-def _quiet_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subscription, "_QUIET_S", 0.1)
+def _quiet_environment(monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
+    limit(ros1_quiet_s=0.1)
     for name in ("ROS_MASTER_URI", "ROS_HOSTNAME", "ROS_IP", "ROS_IPV6"):
         monkeypatch.delenv(name, raising=False)
 
@@ -503,10 +503,10 @@ def test_a_publisher_that_is_not_there() -> None:
 
 
 def test_a_dead_node_is_told_of_once_and_its_topics_do_not_come(
-    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
 ) -> None:
     # The master in Python lets some of many callers wait for a second.
-    monkeypatch.setattr(subscription, "_QUIET_S", 1.5)
+    limit(ros1_quiet_s=1.5)
     with FakeMaster() as master, Ros1Source(master.uri, poll_s=0.05) as source:
         assert not source.was_reached
         uri = f"http://127.0.0.1:{_free_port()}/"

@@ -12,21 +12,20 @@ from pathlib import Path
 import pytest
 
 from hybridlog.live.sources.base import Cause, one_line
-from hybridlog.live.sources.ros2 import process as ros2_process
-from hybridlog.live.sources.ros2 import source as ros2
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.live.sources.ros2.process import PYTHON_VARIABLE, candidates, environment_for
 from hybridlog.live.sources.ros2.source import Ros2Source
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
+from tests.limits import Limit
 from tests.live.sources.heard import must_return
 from tests.live.sources.ros2_peers import Memory, fake_child, is_alive, starts, wait_until
 
 
 @pytest.fixture(autouse=True)
-def _no_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_ros(monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
     for name in (PYTHON_VARIABLE, "ROS_DISTRO", "AMENT_PREFIX_PATH", "ROS_DOMAIN_ID"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(ros2, "_PAUSE_S", 0.01)
+    limit(ros2_pause_s=0.01)
 
 
 def _files() -> set[str]:
@@ -118,11 +117,8 @@ def test_stop_twice_and_without_start(tmp_path: Path) -> None:
     other.stop()
 
 
-def test_a_child_that_does_not_listen_is_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ros2, "_HAND_OVER_S", 0.1)
-    monkeypatch.setattr(ros2, "_TERM_S", 0.1)
+def test_a_child_that_does_not_listen_is_ended(tmp_path: Path, limit: Limit) -> None:
+    limit(ros2_hand_over_s=0.1, ros2_term_s=0.1)
     child = fake_child(
         tmp_path,
         """
@@ -141,8 +137,8 @@ def test_a_child_that_does_not_listen_is_ended(
     assert not is_alive(starts(tmp_path)[0])
 
 
-def test_a_child_that_floods_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros2, "_HAND_OVER_S", 0.1)
+def test_a_child_that_floods_is_ended(tmp_path: Path, limit: Limit) -> None:
+    limit(ros2_hand_over_s=0.1)
     child = fake_child(
         tmp_path,
         """
@@ -356,8 +352,8 @@ def test_ros_that_does_not_come_up(tmp_path: Path, body: str, reason: str) -> No
         Ros2Source(fake_child(tmp_path, body + "\nwait()")).start(Memory())
 
 
-def test_a_child_that_never_greets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros2_process, "HELLO_S", 0.3)
+def test_a_child_that_never_greets(tmp_path: Path, limit: Limit) -> None:
+    limit(ros2_hello_s=0.3)
     with pytest.raises(SourceError, match="did not load rclpy within"):
         Ros2Source(fake_child(tmp_path, 'peer.sendall(b"\\1")\nwait()')).start(Memory())
 

@@ -14,7 +14,6 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from hybridlog.live.sources.ros2.child import outbox as ros2_outbox
 from hybridlog.live.sources.ros2.child.child import Child
 from hybridlog.live.sources.ros2.child.definitions import (
     Definitions,
@@ -53,6 +52,7 @@ from hybridlog.live.sources.ros2.receiver import Receiver
 from hybridlog.schema.definition import parse_definition
 from hybridlog_storage.messages import Schema
 from tests.imports import ROOT, imports_of
+from tests.limits import Limit
 from tests.live.sources.ros2_peers import Memory
 
 CHILD = "hybridlog.live.sources.ros2.child"
@@ -484,9 +484,9 @@ def test_a_message_larger_than_the_budget_goes_when_nothing_waits() -> None:
         assert not outbox.refused
 
 
-def test_a_message_too_large_for_the_wire_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_message_too_large_for_the_wire_is_refused(limit: Limit) -> None:
     assert MAX_PAYLOAD < 1 << 32
-    monkeypatch.setattr(ros2_outbox, "MAX_PAYLOAD", 10)
+    limit(outbox_payload_bytes=10)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         outbox = Outbox(theirs)

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from hybridlog.live.sources.base import Cause
-from hybridlog.live.sources.ros2 import source as ros2
 from hybridlog.live.sources.ros2.child.definitions import Definitions
 from hybridlog.live.sources.ros2.source import Ros2Source
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.definition import parse_definition
 from hybridlog.schema.index_bodies import index_fields
 from hybridlog_storage.messages import Schema
+from tests.limits import Limit
 from tests.live.sources.ros2_peers import (
     Memory,
     Robot,
@@ -46,10 +46,10 @@ def python() -> str:
 
 
 @pytest.fixture(autouse=True)
-def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def _alone(monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
     for name, value in domain().items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(ros2, "_PAUSE_S", 0.01)
+    limit(ros2_pause_s=0.01)
 
 
 @pytest.fixture

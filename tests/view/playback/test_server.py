@@ -21,10 +21,10 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import hybridlog as hl
-from hybridlog.view.playback import server
 from hybridlog.view.playback.played import Covered, PlaybackClock, PlayedLog
 from hybridlog_storage.errors import TimeError, UsageError
 from tests.independent import Seen, read_mcap
+from tests.limits import Limit
 from tests.view.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
 
 S = 10**9
@@ -207,11 +207,9 @@ def test_subscriptions_may_change_while_it_plays(one: PlayedLog, seen: list[Seen
     assert [Seen(*m) for m in found] == [m for m in seen if m.topic == "/tf"]
 
 
-def test_messages_of_the_same_time_stay_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_of_the_same_time_stay_together(tmp_path: Path, limit: Limit) -> None:
     """A request that comes in the middle of them waits: behind it, all later ones are read."""
-    monkeypatch.setattr(server, "_MAX_SENT", 1)
+    limit(playback_sent=1)
     with (tmp_path / "same.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()

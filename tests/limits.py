@@ -1,0 +1,108 @@
+"""Sizes, waits and costs of the product that tests make smaller, each named once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+PLACES = {
+    "align_piece_bytes": "hybridlog.across.align._PIECE_BYTES",
+    "printed_rows_at_once": "hybridlog.cli.output.ROWS_AT_ONCE",
+    "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
+    "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
+    "settled_ns": "hybridlog.columns.folders._STABLE_NS",
+    "parquet_block_bytes": "hybridlog.columns.parquet_file.BLOCK",
+    "parquet_write_bytes": "hybridlog.columns.parquet_file._WRITTEN",
+    "table_group_rows": "hybridlog.columns.table_writer.GROUP_ROWS",
+    "long_table_rows": "hybridlog.columns.table_writer.LONG_ROWS",
+    "table_arena_bytes": "hybridlog.columns.table_writer._ARENA",
+    "table_left_bytes": "hybridlog.columns.table_writer._LEFT",
+    "table_in_place_bytes": "hybridlog.columns.table_writer._MIN_IN_PLACE_BYTES",
+    "table_open_files": "hybridlog.columns.table_writer._OPEN_FILES",
+    "table_pending_bytes": "hybridlog.columns.table_writer._PENDING",
+    "table_reserve_bytes": "hybridlog.columns.table_writer._RESERVE",
+    "table_collected_rows": "hybridlog.columns.table_writer._ROWS",
+    "json_text_piece_bytes": "hybridlog.formats.json_text.PIECE_BYTES",
+    "unstated_bag_bytes": "hybridlog.formats.rosbag1.reader._UNSTATED",
+    "bag_window_bytes": "hybridlog.formats.rosbag1.reader._WINDOW",
+    "output_held_bytes": "hybridlog.formats.tables.HELD_BYTES",
+    "tables_piece_bytes": "hybridlog.formats.tables.PIECE_BYTES",
+    "frame_block_rows": "hybridlog.frames.answer._BLOCK_ROWS",
+    "index_checkpoint_bytes": "hybridlog.index.index_writer._CHECKPOINT_BYTES",
+    "index_group_bytes": "hybridlog.index.index_writer._GROUP_BYTES",
+    "ahead_s": "hybridlog.live.memory._AHEAD_S",
+    "buffer_pause_ratio": "hybridlog.live.memory._BUFFER_PAUSE_RATIO",
+    "max_chunks_per_s": "hybridlog.live.memory._MAX_CHUNKS_PER_S",
+    "clock_wait_s": "hybridlog.live.recorder._CLOCK_WAIT_S",
+    "expected_topics": "hybridlog.live.recorder._MAX_EXPECTED",
+    "slow_write_s": "hybridlog.live.recorder._SLOW_WRITE_S",
+    "late_times": "hybridlog.live.recording._LATE_TIMES",
+    "laid_out_bytes": "hybridlog.live.recording._MAX_BATCH_BYTES",
+    "pressure_hold_s": "hybridlog.live.recording._PRESSURE_HOLD_S",
+    "foxglove_ping_s": "hybridlog.live.sources.foxglove.connection._PING_S",
+    "foxglove_silent_s": "hybridlog.live.sources.foxglove.connection._SILENT_S",
+    "foxglove_channels": "hybridlog.live.sources.foxglove.session._MAX_CHANNELS",
+    "foxglove_pauses_s": "hybridlog.live.sources.foxglove.session._PAUSES_S",
+    "foxglove_retry_s": "hybridlog.live.sources.foxglove.session._RETRY_S",
+    "replay_late_s": "hybridlog.live.sources.replay._LATE_S",
+    "replay_messages": "hybridlog.live.sources.replay._MAX_MESSAGES",
+    "replay_window_bytes": "hybridlog.live.sources.replay_order._WINDOW",
+    "replay_window_rows": "hybridlog.live.sources.replay_order._WINDOW_ROWS",
+    "ros1_quiet_s": "hybridlog.live.sources.ros1.subscription._QUIET_S",
+    "outbox_payload_bytes": "hybridlog.live.sources.ros2.child.outbox.MAX_PAYLOAD",
+    "ros2_hello_s": "hybridlog.live.sources.ros2.process.HELLO_S",
+    "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
+    "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
+    "ros2_term_s": "hybridlog.live.sources.ros2.source._TERM_S",
+    "shown_bytes": "hybridlog.message._MAX_SHOWN",
+    "max_second_look": "hybridlog.query.answers.rates._MAX_SECOND_LOOK",
+    "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",
+    "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
+    "small_chunk_bytes": "hybridlog.query.chunk_scan._SMALL_CHUNK_BYTES",
+    "documents_at_once": "hybridlog.query.index_reader._DOCUMENTS",
+    "index_ranges": "hybridlog.query.index_reader._MAX_RANGES",
+    "latched_held": "hybridlog.query.latching.MAX_HELD",
+    "min_matches": "hybridlog.query.narrowing._MIN_MATCHES",
+    "sampled_periods": "hybridlog.query.periods._SAMPLED",
+    "planner_group_growth": "hybridlog.query.planner._GROUP_GROWTH",
+    "document_slab_bytes": "hybridlog.schema.document._SLAB",
+    "sql_tree_size": "hybridlog.sql.engine._MAX_TREE",
+    "sql_trees": "hybridlog.sql.engine._MAX_TREES",
+    "clients_wait_s": "hybridlog.store._CLIENTS_WAIT_S",
+    "playback_sent": "hybridlog.view.playback.server._MAX_SENT",
+    "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",
+    "export_piece_bytes": "hybridlog.view.routes.export.PIECE",
+    "catalog_busy_s": "hybridlog_storage.catalog._BUSY_S",
+    "direct_flag": "hybridlog_storage.disk.append_file.DIRECT",
+    "max_journal": "hybridlog_storage.journal.MAX_JOURNAL",
+    "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
+    "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",
+    "mongod_room_bytes": "hybridlog_storage.mongo.mongod._ROOM",
+    "own_collections": "hybridlog_storage.mongo.topic_places.OWN_COLLECTIONS",
+    "segment_chunks": "hybridlog_storage.segments.segment_writer._MAX_CHUNKS",
+    "segment_parts": "hybridlog_storage.segments.segment_writer._MAX_PARTS",
+    "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",
+    "compression_turn_s": "hybridlog_storage.segments.segment_writer._TURN_S",
+}
+
+
+class Limit:
+    """Sets limits until the end of a test: `limit(long_table_rows=1000)`."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._patch = patch
+
+    def __call__(self, **values: Any) -> None:
+        for name, value in values.items():
+            self._patch.setattr(PLACES[name], value)
+
+
+@contextmanager
+def limits(**values: Any) -> Iterator[None]:
+    """Set limits for a while."""
+    with pytest.MonkeyPatch.context() as patch:
+        Limit(patch)(**values)
+        yield
