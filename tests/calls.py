@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from hybridlog_storage.disk import files
+
 
 class Calls:
     """Stands in front of functions until the end of a test."""
@@ -39,6 +41,15 @@ class Calls:
         self._patch.setattr(owner, name, staticmethod(noted) if is_bound else noted)
         return made
 
+    def change(self, owner: Any, name: str, change: Callable[..., Any]) -> None:
+        """Let a function return what `change` makes of its result and its arguments."""
+        real = getattr(owner, name)
+
+        def changed(*arguments: Any, **options: Any) -> Any:
+            return change(real(*arguments, **options), *arguments, **options)
+
+        self._patch.setattr(owner, name, changed)
+
     def fail(self, owner: Any, name: str, error: BaseException | type[BaseException]) -> None:
         """Let each call of a function fail from now on."""
 
@@ -46,6 +57,10 @@ class Calls:
             raise error
 
         self._patch.setattr(owner, name, failing)
+
+    def system(self, system: files.System) -> None:
+        """Have another file system from now on."""
+        self._patch.setattr(files, "system", system)
 
     def missing(self, package: str) -> None:
         """Let a package not be installed."""

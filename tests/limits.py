@@ -86,6 +86,22 @@ PLACES = {
     "segment_parts": "hybridlog_storage.segments.segment_writer._MAX_PARTS",
     "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",
     "compression_turn_s": "hybridlog_storage.segments.segment_writer._TURN_S",
+    "foxglove_handshake_tick_s": "hybridlog.live.sources.foxglove.handshake.TICK_S",
+    "foxglove_tick_s": "hybridlog.live.sources.foxglove.connection.TICK_S",
+    "bucket_unlisted_days": "hybridlog_storage.remote.bucket.UNLISTED_DAYS",
+    "bucket_whole_bytes": "hybridlog_storage.remote.bucket.PART_BYTES",
+    "bucket_part_bytes": "hybridlog_storage.remote.bucket._PART",
+    "bucket_retry_s": "hybridlog_storage.remote.bucket._RETRY_S",
+    "sync": "hybridlog_storage.disk.files.System.sync",
+    "edit_lock_wait_s": "hybridlog.maintenance.edit.LOCK_WAIT_S",
+    "compact_lock_wait_s": "hybridlog.maintenance.compact.LOCK_WAIT_S",
+    "connection_patience_s": "hybridlog.view.server.BoundedConnection.patience_s",
+    "directory_is_writable": "hybridlog_storage.disk.directory.StoreDirectory.is_writable",
+    "index_interval": "hybridlog.live.recording._index_interval_s",
+    "index_interval_bytes": "hybridlog.index.index_writer._INTERVAL_BYTES",
+    "recording_filled": "hybridlog.live.recording.LiveRecording.filled",
+    "recording_is_under_pressure": "hybridlog.live.recording.LiveRecording._is_under_pressure",
+    "tables_cost": "hybridlog.query.engines.tables.TablesEngine.cost",
 }
 
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import builtins
 import io
 import struct
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ from PIL import Image as Pillow
 
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
+from tests.calls import Calls
 from tests.data import DATA, needs_data
 
 
@@ -211,15 +211,8 @@ def test_picture_that_claims_to_be_huge() -> None:
         to_numpy("sensor_msgs/CompressedImage", compressed("png", bytes(raw)))
 
 
-def test_without_pillow(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def refusing(name: str, *others: Any, **more: Any) -> Any:
-        if name.split(".", maxsplit=1)[0] == "PIL":
-            raise ImportError(name)
-        return real(name, *others, **more)
-
-    monkeypatch.setattr(builtins, "__import__", refusing)
+def test_without_pillow(calls: Calls) -> None:
+    calls.missing("PIL")
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[images\]'"):
         to_numpy("sensor_msgs/CompressedImage", compressed("png", b"x"))
 

@@ -38,6 +38,7 @@ from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent
+from tests.calls import Calls
 from tests.cli import running
 from tests.some import in_turn
 from tests.storage.chunk_entries import chunk_entries
@@ -1073,20 +1074,17 @@ def test_a_running_recording_cannot_be_removed(path: Path, robot: Path) -> None:
 
 
 def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
-    path: Path, short: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, short: Path, calls: Calls
 ) -> None:
     """Another process opens the store after the directory is made, before it is locked."""
     from hybridlog_storage.disk.directory import StoreDirectory
 
-    make = StoreDirectory.new_recording
-
-    def made(self: StoreDirectory, name: str) -> str:
-        recording = make(self, name)
+    def made(recording: str, *_: object) -> str:
         with hl.open(path, require_database=True) as other:
             assert other.recordings() == []
         return recording
 
-    monkeypatch.setattr(StoreDirectory, "new_recording", made)
+    calls.change(StoreDirectory, "new_recording", made)
     with hl.open(path, require_database=True) as store:
         store.record(short)
         assert store.verify().findings == []

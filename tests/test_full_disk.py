@@ -13,11 +13,11 @@ import pytest
 
 import hybridlog as hl
 from hybridlog import session
-from hybridlog.maintenance.opening import look_at_all
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Channel
+from tests.calls import Calls
 from tests.cli.within import answer
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
@@ -65,19 +65,16 @@ def test_a_crash_on_a_full_disk_waits_for_room(
         assert (entry.label, entry.status, entry.messages) == ("crash", "recovered", 50)
 
 
-def test_nothing_is_said_to_have_crashed_on_a_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_said_to_have_crashed_on_a_full_disk(tmp_path: Path, calls: Calls) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("whole") as recording:
             recording.write(Channel("/a", "json", None, {}), b'{"n": 1}')
 
-    def full(directory: Any, catalog: Any, report: Any, *, mends: bool = False) -> Any:
+    def full(_: Any, catalog: Any, *__: Any, **___: Any) -> None:
         if not catalog.is_in_memory:
             raise DiskFullError("No space left while writing the catalog.")
-        return look_at_all(directory, catalog, report, mends=mends)
 
-    monkeypatch.setattr(session, "look_at_all", full)
+    calls(session, "look_at_all", full)
     done = answer("fetch", "-t", "/a", "--count", store=tmp_path / "store")
     assert done.out == "1\n"
     assert "The disk of the store is full, so nothing in it is repaired or noted." in done.err

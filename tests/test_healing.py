@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -41,6 +40,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.mongod import find_mongod
+from tests.calls import Calls
 from tests.cli.running import run
 from tests.damage import WAYS
 from tests.limits import Limit
@@ -242,16 +242,9 @@ def test_a_mongod_killed_in_the_middle_of_an_answer(store: Path, limit: Limit) -
 
 
 def test_an_unreachable_server_is_not_waited_for_by_each_question(
-    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
-    tried: list[str] = []
-    connect = Database.connect.__func__  # type: ignore[attr-defined]
-
-    def counted(cls: type[Database], uri: str, **options: float) -> Database:
-        tried.append(uri)
-        return connect(cls, uri, **options)
-
-    monkeypatch.setattr(Database, "connect", classmethod(counted))
+    tried = calls(Database, "connect")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -293,24 +286,19 @@ def test_another_engine_goes_on_where_one_fails(
 
 @pytest.mark.parametrize("error", [ConnectionLostError, IndexChangedError])
 def test_what_only_mongodb_knows_is_asked_once_more(
-    store: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+    store: Path, calls: Calls, error: type[Exception]
 ) -> None:
-    holding = IndexReader._holding
-    calls: list[int] = []
-
-    def breaking(reader: IndexReader, *asked: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 1:
+    def breaking(*_: object) -> None:
+        if len(read) == 1:
             raise error("gone")
-        return holding(reader, *asked)
 
     with hl.open(store, require_database=True) as opened:
         asked = opened.topic(IMU).where({"header.seq": {"$mod": [7, 0]}})
         want = [(m.recording, m.seq) for m in asked]
         assert len(want) > 20
-        monkeypatch.setattr(IndexReader, "_holding", breaking)
+        read = calls(IndexReader, "_holding", breaking)
         assert [(m.recording, m.seq) for m in asked] == want
-        assert len(calls) == 3  # two groups of recordings, one of them twice
+        assert len(read) == 3  # two groups of recordings, one of them twice
 
 
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])
@@ -502,15 +490,13 @@ def test_too_few_handles_are_told_as_that(store: Path) -> None:
     assert run("verify", store=store).err == ""
 
 
-def test_a_mongod_that_cannot_accept_for_lack_of_handles(
-    store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mongod_that_cannot_accept_for_lack_of_handles(store: Path, calls: Calls) -> None:
     def refused(uri: str, **_: float) -> Database:
         with (store / "mongod" / "mongod.log").open("a") as log:
             log.write('{"s":"W","msg":"Error accepting","attr":"Too many open files"}\n')
         raise ConnectionLostError("connection reset")
 
-    monkeypatch.setattr(Database, "connect", refused)
+    calls(Database, "connect", refused)
     with hl.open(store) as opened, pytest.raises(DatabaseError, match="ran out of file handles"):
         documents(opened)
 

@@ -21,7 +21,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.columns.folders import files_of
-from hybridlog.maintenance import compact, copying, edit
+from hybridlog.maintenance import copying
 from hybridlog.maintenance.copying import CopyReport
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
@@ -43,7 +43,9 @@ from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.faults import logs
+from tests.limits import Limit
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 COUNT = 60
@@ -512,10 +514,11 @@ def test_a_command_changes_the_recording_that_was_chosen(
     two: tuple[Path, str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
 ) -> None:
     base, one, other = two
     others = content_of(base, other)
-    monkeypatch.setattr(files.System, "sync", lambda *_: None)
+    limit(sync=lambda *_: None)
     monkeypatch.setattr(Session, "database", None)
     changes = [(swap, False), (swap, True), (replace, False), (remove, True)]
     for first, (change, after) in enumerate(changes):
@@ -548,11 +551,15 @@ def test_a_command_changes_the_recording_that_was_chosen(
 
 @pytest.mark.parametrize("stride", SOME_OR_EACH)
 def test_a_command_finds_a_recording_whose_label_goes_around(
-    stride: int, two: tuple[Path, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stride: int,
+    two: tuple[Path, str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
 ) -> None:
     base, one, other = two
     others = content_of(base, other)
-    monkeypatch.setattr(files.System, "sync", lambda *_: None)
+    limit(sync=lambda *_: None)
     for step in range(0, 12, 2 * stride):
         for again in count(step + 1, stride):
             place = tmp_path / "store"
@@ -572,7 +579,7 @@ def test_a_command_finds_a_recording_whose_label_goes_around(
 
 
 def test_twenty_commands_at_once_wait_for_each_other(
-    two: tuple[Path, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two: tuple[Path, str, str], tmp_path: Path, calls: Calls, limit: Limit
 ) -> None:
     base, one, _ = two
     path = tmp_path / "store"
@@ -586,13 +593,8 @@ def test_twenty_commands_at_once_wait_for_each_other(
     ]
     waiting: set[int] = set()
 
-    def pause(seconds: float) -> None:
-        waiting.add(threading.get_ident())
-        time.sleep(seconds)
-
-    monkeypatch.setattr(directory_module, "pause", pause)
-    for module in (edit, compact):
-        monkeypatch.setattr(module, "LOCK_WAIT_S", 250)  # however slow the machine is
+    calls(directory_module, "pause", lambda _: waiting.add(threading.get_ident()))
+    limit(edit_lock_wait_s=250, compact_lock_wait_s=250)  # however slow the machine is
 
     def run(command: Callable[[hl.Store], object]) -> None:
         with hl.open(path, mongo=NOWHERE) as store:
@@ -624,9 +626,10 @@ def test_an_import_takes_the_recording_that_was_chosen(
     two: tuple[Path, str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
 ) -> None:
     base, one, _ = two
-    monkeypatch.setattr(files.System, "sync", lambda *_: None)
+    limit(sync=lambda *_: None)
     for step in count(0, stride):
         place, target = tmp_path / "store", tmp_path / "target"
         shutil.rmtree(place, ignore_errors=True)

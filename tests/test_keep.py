@@ -25,6 +25,7 @@ from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError, TimeError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import answer
 from tests.power import PowerCut
@@ -398,7 +399,10 @@ def pinned(tmp_path_factory: pytest.TempPathFactory, recorded: Path) -> tuple[Pa
 
 @pytest.mark.parametrize("share", CUTS)
 def test_a_cut_costs_no_pinned_byte_and_no_count(
-    tmp_path: Path, pinned: tuple[Path, int], share: float, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    pinned: tuple[Path, int],
+    share: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kept, calls = pinned
     assert calls > 100
@@ -430,9 +434,7 @@ class Counting(files.System):
         return super().open(name, flags, mode, folder=folder)
 
 
-def test_a_plan_opens_each_journal_once(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plan_opens_each_journal_once(recorded: Path, tmp_path: Path, calls: Calls) -> None:
     with hl.open(tmp_path / "many", mongo="none", create=True) as store:
         directory = store.directory
     data = (recorded / "recordings" / "run" / "journal").read_bytes()
@@ -444,7 +446,7 @@ def test_a_plan_opens_each_journal_once(
     keeper = Keeper(directory, lambda _: None)
     rules = Rules.of({"max-age": "0s"})
     counting = Counting()
-    monkeypatch.setattr(files, "system", counting)
+    calls.system(counting)
     assert len(keeper.plan(rules).steps) == 1000
     assert counting.opened == ["journal"] * 1000
     counting.opened.clear()

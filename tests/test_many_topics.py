@@ -19,6 +19,7 @@ from hybridlog_storage.errors import DatabaseError
 from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.topic_places import OWN_COLLECTIONS, SHARED, TOPICS
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.many_topics import BASE, handles, mongod_of, topic, write_log
 
@@ -107,11 +108,11 @@ def test_reindex_and_verify(store: hl.Store) -> None:
     assert store.all_topics().where(least(3)).count() == 3 * FEW
 
 
-def test_few_commands_verify_many_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_commands_verify_many_topics(tmp_path: Path, calls: Calls) -> None:
     log = write_log(tmp_path / "log.mcap", 200)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         store.record(log)
-        sent = commands_of(monkeypatch)
+        sent = commands_of(calls)
         assert store.verify().findings == []
         assert store.verify(["log"]).findings == []
         assert sent.total() <= 40, sent
@@ -177,21 +178,19 @@ def test_a_lost_list_of_topics_makes_no_wrong_answer(store: hl.Store) -> None:
 
 
 def test_an_interrupted_recording_is_indexed_where_it_was_begun(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
     """It is killed when its topics are listed, but no document is written."""
-    real = Database.insert_raw
 
-    def killed(self: Database, collection: str, *args: Any, **options: Any) -> int:
-        if collection == TOPICS:
-            return real(self, collection, *args, **options)
-        raise KeyboardInterrupt
+    def killed(_: Database, collection: str, *__: Any, **___: Any) -> None:
+        if collection != TOPICS:
+            raise KeyboardInterrupt
 
     log = write_log(tmp_path / "three.mcap", 4, start=BASE + 10**10, prefix="/new")
-    monkeypatch.setattr(Database, "insert_raw", killed)
+    calls(Database, "insert_raw", killed)
     with pytest.raises(KeyboardInterrupt):
         store.record(log)
-    monkeypatch.setattr(Database, "insert_raw", real)
+    monkeypatch.undo()
     assert database_of(store).count(TOPICS, {"topic": {"$regex": "^/new"}}) == 4
     store.record(log)
     assert documents(store) == {**ALL, "shared three": 20}
@@ -254,30 +253,20 @@ def test_no_question_about_all_topics_walks_through_them_once_a_topic(tmp_path: 
         assert channels.walks < 10
 
 
-def commands_of(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+def commands_of(calls: Calls) -> Counter[str]:
     """Counts the inserts and the questions sent to MongoDB, by method."""
     sent: Counter[str] = Counter()
     for method in ("_insert_batch", "ensure_collection", "find_raw", "find", "aggregate", "count"):
-        real = getattr(Database, method)
-
-        def counted(
-            self: Database, *args: Any, of: Any = real, name: str = method, **options: Any
-        ) -> Any:
-            sent[name] += 1
-            return of(self, *args, **options)
-
-        monkeypatch.setattr(Database, method, counted)
+        calls(Database, method, lambda *_, name=method, **__: sent.update([name]))
     return sent
 
 
-def test_a_store_of_a_thousand_topics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
-) -> None:
+def test_a_store_of_a_thousand_topics(tmp_path: Path, calls: Calls, limit: Limit) -> None:
     limit(own_collections=100)
     log = write_log(tmp_path / "log.mcap", 1000)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         before = handles(store)
-        sent = commands_of(monkeypatch)
+        sent = commands_of(calls)
         store.record(log)
         # One for each collection in each parcel, the chunks, the topics.
         assert sent["_insert_batch"] < 300

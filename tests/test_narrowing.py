@@ -13,6 +13,7 @@ from hybridlog.query import planner
 from hybridlog.query.planner import Planner
 from hybridlog.query.topics import matcher
 from hybridlog_storage.messages import Channel, Schema
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.servers.commands import commands
 
@@ -71,22 +72,16 @@ def store(path: Path) -> Iterator[hl.Store]:
         yield opened
 
 
-def planned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def planned(calls: Calls) -> list[str]:
     """Ids of the recordings that are asked."""
     asked: list[str] = []
-    parts_in = Planner.parts_in
-
-    def counted(self: Planner, summary: hl.RecordingSummary, *rest: object) -> object:  # type: ignore[name-defined]
-        asked.append(summary.id)
-        return parts_in(self, summary, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Planner, "parts_in", counted)
+    calls(Planner, "parts_in", lambda _, summary, *__: asked.append(summary.id))
     return asked
 
 
 @pytest.mark.parametrize("condition", [*CONDITIONS, *NOT_NARROWED])
 def test_the_same_answers_with_and_without(
-    path: Path, store: hl.Store, monkeypatch: pytest.MonkeyPatch, condition: str
+    path: Path, store: hl.Store, calls: Calls, condition: str
 ) -> None:
     ways: dict[str, Callable[[hl.Store], object]] = {
         "count": lambda s: s.topic("/t").where(condition).count(),
@@ -103,7 +98,7 @@ def test_the_same_answers_with_and_without(
         # Now bounds leave recordings out.
         assert {name: ask(alone) for name, ask in ways.items()} == want
         assert alone.session.connected is None
-    asked = planned(monkeypatch)
+    asked = planned(calls)
     assert store.topic("/t").where(condition).count() == want["count"]
     if condition in CONDITIONS:
         assert len(asked) <= MANY / 2
@@ -133,9 +128,9 @@ def test_one_command_and_a_look_at_what_has_changed(path: Path) -> None:
 
 
 def test_what_many_messages_satisfy_is_looked_at_in_part(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, calls: Calls, limit: Limit
 ) -> None:
-    asked = planned(monkeypatch)
+    asked = planned(calls)
     monkeypatch.setattr(planner, "within_bounds", lambda _session, _question, found: found)
     assert store.topic("/t").where("x >= 0").count() == 5 * MANY
     assert len(asked) == MANY
@@ -148,9 +143,7 @@ def test_what_many_messages_satisfy_is_looked_at_in_part(
     assert len(asked) == MANY
 
 
-def test_recordings_whose_documents_may_not_tell_are_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recordings_whose_documents_may_not_tell_are_asked(tmp_path: Path, calls: Calls) -> None:
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         for n in range(20):
             record(store, n)
@@ -160,7 +153,7 @@ def test_recordings_whose_documents_may_not_tell_are_asked(
     with hl.open(tmp_path / "store", require_database=True) as store:
         running = store.start("running", flush_interval_s=0.05)
         running.write(CHANNEL, thing(22, 0), log_time=2200 * SECOND)
-        asked = planned(monkeypatch)
+        asked = planned(calls)
         query = store.topic("/t").where("x >= 19")
         for _ in range(100):
             if query.count() == 16:

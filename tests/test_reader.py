@@ -13,7 +13,7 @@ import sys
 import threading
 import tracemalloc
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.data import DATA, needs_data
 from tests.limits import Limit
 from tests.other_user import User, open_place
@@ -1002,22 +1003,14 @@ def test_words_mean_what_is_in_the_store_now(tmp_path: Path) -> None:
             assert store.topic("/a/talk").where("data == 'seven'").count() == 1
 
 
-def test_a_schema_of_many_recordings_is_asked_for_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_schema_of_many_recordings_is_asked_for_once(tmp_path: Path, calls: Calls) -> None:
     asked = []
-    schemas = Catalog.schemas
-
-    def counted(self: Catalog, hashes: Collection[str]) -> dict[str, Schema]:
-        asked.append(len(hashes))
-        return schemas(self, hashes)
-
     with hl.open(tmp_path / "store", create=True) as store:
         for number in range(5):
             own = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
             with store.start(f"run-{number}") as recording:
                 recording.write(Channel("/talk", "ros1", own), struct.pack("<i", number))
-    monkeypatch.setattr(Catalog, "schemas", counted)
+    calls(Catalog, "schemas", lambda _, hashes: asked.append(len(hashes)))
     with hl.open(tmp_path / "store") as store:
         assert [store.topic("talk").where(f"data == {n}").count() for n in range(5)] == [1] * 5
         assert asked == [1]

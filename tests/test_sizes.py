@@ -17,6 +17,7 @@ from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.database import CollectionStats, Database
 from hybridlog_storage.mongo.topic_places import SHARED
+from tests.calls import Calls
 from tests.cli.running import run
 from tests.many_topics import BASE
 
@@ -152,29 +153,19 @@ def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> 
     assert by_name(store.sizes(["one"]).rows)["one", "/a"].index_bytes == 16_000
 
 
-def test_the_cost_does_not_depend_on_the_number_of_messages(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: Counter[str] = Counter()
+def test_the_cost_does_not_depend_on_the_number_of_messages(store: hl.Store, calls: Calls) -> None:
+    made: Counter[str] = Counter()
     for thing, methods in ((Catalog, ("table",)), (Database, ("stats", "find", "aggregate"))):
         for method in methods:
-            real = getattr(thing, method)
-
-            def counted(
-                self: Any, *args: Any, of: Any = real, name: str = method, **options: Any
-            ) -> Any:
-                calls[name] += 1
-                return of(self, *args, **options)
-
-            monkeypatch.setattr(thing, method, counted)
-    monkeypatch.setattr(hl.Query, "__iter__", None)
+            calls(thing, method, lambda *_, name=method, **__: made.update([name]))
+    calls.fail(hl.Query, "__iter__", AssertionError)
     store.connect()
     store.sizes(["mute"])  # knows the places of the topics
     found = []
     for recording in ("one", "two"):
-        calls.clear()
+        made.clear()
         store.sizes([recording])
-        found.append(dict(calls))
+        found.append(dict(made))
     assert found == [{"table": 1, "stats": 2}] * 2
 
 

@@ -27,6 +27,7 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
+from tests.calls import Calls
 from tests.limits import Limit
 
 TOPICS = [f"/{name}" for name in "abcd"]
@@ -249,18 +250,9 @@ def test_a_journal_that_has_grown_is_read_at_the_opening(tmp_path: Path) -> None
     assert now.tags == {"place": "hall"}
 
 
-def test_a_recording_is_read_when_its_turn_comes(
-    overlapping: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_is_read_when_its_turn_comes(overlapping: Any, calls: Calls) -> None:
     store, _ = overlapping
-    read = []
-    real = session.current_entry
-
-    def counted(*arguments: Any) -> Any:
-        read.append(arguments[2].label)
-        return real(*arguments)
-
-    monkeypatch.setattr(session, "current_entry", counted)
+    read = calls(session, "current_entry")
     store.refresh()
     next(iter(store.topic("/n")))
     assert 1 <= len(read) < 6

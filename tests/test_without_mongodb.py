@@ -28,6 +28,7 @@ from hybridlog_storage.settings import (
     read_settings,
     write_settings,
 )
+from tests.calls import Calls
 from tests.cli.within import answer
 from tests.running.running import NO_MONGODB
 from tests.storage.test_mongod import fake_mongod
@@ -177,22 +178,18 @@ def test_a_server_that_is_away_gets_its_index_later(bag: Path, tmp_path: Path) -
         assert store.verify().findings == []
 
 
-def test_a_live_recording_while_the_server_comes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -> None:
     from hybridlog.live import LiveOptions
     from tests.running.sequence import CHANNELS, messages
 
     with hl.open(tmp_path / "store", create=True) as store:
-        real = store.session.connection.another
         away = True
 
-        def another() -> Any:
+        def another() -> None:
             if away:
                 raise ConnectionLostError("MongoDB does not answer")
-            return real()
 
-        monkeypatch.setattr(store.session.connection, "another", another)
+        calls(store.session.connection, "another", another)
         with store.start("live", LiveOptions(flush_interval_s=0.1)) as recording:
             for one in messages(0, 50, 0):
                 recording.write(CHANNELS[one.topic], one.raw, log_time=one.log_time)

@@ -21,6 +21,7 @@ from hybridlog.across.match import UNKNOWN, interpolated, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.cli.within import answer as run
 from tests.limits import Limit
 
@@ -30,20 +31,20 @@ TOLERANCE_MS = 7
 
 
 @pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
-def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
+def _blocks(request: pytest.FixtureRequest, limit: Limit, calls: Calls) -> None:
     """Topics are read in blocks of so many rows, also with messages of one time in two of them.
 
     Rows that would be large are made a few at a time, too.
     """
-    read, size = topic_reader.TopicReader.tables, request.param
+    size = request.param
     limit(align_piece_bytes=size * 400)
 
-    def tables(reader: topic_reader.TopicReader, *arguments: Any) -> Iterator[Any]:
-        for times, table in read(reader, *arguments):
+    def tables(found: Iterator[Any], *_: Any) -> Iterator[Any]:
+        for times, table in found:
             for begin in range(0, len(times), size):
                 yield times[begin : begin + size], table.slice(begin, size)
 
-    monkeypatch.setattr(topic_reader.TopicReader, "tables", tables)
+    calls.change(topic_reader.TopicReader, "tables", tables)
 
 
 def naive(

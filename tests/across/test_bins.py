@@ -18,22 +18,23 @@ import hybridlog as hl
 from hybridlog.across import topic_reader
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import UsageError
+from tests.calls import Calls
 from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs, Said
 
 
 @pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
-def _blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def _blocks(request: pytest.FixtureRequest, calls: Calls) -> None:
     """Topics are read in blocks of so many rows, so that bins lie in several."""
-    read, size = topic_reader.TopicReader.tables, request.param
+    size = request.param
 
-    def tables(reader: topic_reader.TopicReader, *arguments: Any) -> Iterator[Any]:
-        for times, table in read(reader, *arguments):
+    def tables(found: Iterator[Any], *_: Any) -> Iterator[Any]:
+        for times, table in found:
             for begin in range(0, len(times), size):
                 yield times[begin : begin + size], table.slice(begin, size)
 
-    monkeypatch.setattr(topic_reader.TopicReader, "tables", tables)
+    calls.change(topic_reader.TopicReader, "tables", tables)
 
 
 def bins(begin: int, end: int, step: int, messages: list[Said]) -> Iterator[tuple[int, list[Said]]]:

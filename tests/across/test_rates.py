@@ -31,10 +31,10 @@ from hybridlog.query.engines.chunk_index import ChunkIndex
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.planner import Planner
-from hybridlog.query.question import Part
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.cli.within import answer as run
 from tests.limits import Limit
 
@@ -47,18 +47,17 @@ def ends(logs: Logs, label: str) -> tuple[int, int]:
 
 
 @pytest.fixture(params=["whole", "in blocks"])
-def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, limit: Limit) -> None:
+def blocks(request: pytest.FixtureRequest, limit: Limit, calls: Calls) -> None:
     """Times come all at once, or a few at a time and are read again for a second look."""
     if request.param == "whole":
         return
-    outcomes = Planner.outcomes
 
-    def cut(planner: Planner, part: Part) -> Iterator[MatchColumns]:
-        for one in outcomes(planner, part):
+    def cut(found: Iterator[MatchColumns], *_: object) -> Iterator[MatchColumns]:
+        for one in found:
             for begin in range(0, len(one.log_time), 3):
                 yield MatchColumns(*(column[begin : begin + 3] for column in one))
 
-    monkeypatch.setattr(Planner, "outcomes", cut)
+    calls.change(Planner, "outcomes", cut)
     limit(max_second_look=4)
 
 
@@ -153,9 +152,7 @@ def test_a_mean_rate_of_some_messages(logs: Logs, blocks: None) -> None:
         assert row["messages"] == len(times)
 
 
-def test_times_of_a_rare_topic_cost_no_payloads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
-) -> None:
+def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path, calls: Calls, limit: Limit) -> None:
     """Its messages lie in chunks full of others': these are not read for times."""
     settings = SegmentSettings(chunk_size=4096)
     with hl.open(tmp_path / "store", create=True) as store:
@@ -178,10 +175,7 @@ def test_times_of_a_rare_topic_cost_no_payloads(
 
         # Of very many messages, a share says what the usual period is.
         sizes: list[int] = []
-        usual = periods.usual_period
-        monkeypatch.setattr(
-            periods, "usual_period", lambda steps: sizes.append(len(steps)) or usual(steps)
-        )
+        calls(periods, "usual_period", lambda steps: sizes.append(len(steps)))
         limit(sampled_periods=20)
         assert len(store.topic("loud").gaps(periods=1.5)) == 29
         assert all(5 < size <= 40 for size in sizes)

@@ -16,6 +16,7 @@ from hybridlog.cli import record_watch
 from hybridlog.cli.app import app
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import HybridlogError
+from tests.calls import Calls
 from tests.formats.test_find import METADATA, mcap
 
 from .running import COMMAND, environment
@@ -191,18 +192,16 @@ def test_a_watched_bag_grows(tmp_path: Path, store: Path, looks: Callable[..., N
 
 
 def test_a_watch_goes_on_after_errors(
-    top: Path, store: Path, looks: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    top: Path, store: Path, looks: Callable[..., None], calls: Calls
 ) -> None:
     (top / "bad.db3").write_bytes(b"SQLite format 3\0" + bytes(84))
     away = iter([True, False])
-    real = hl.Store.record
 
-    def sometimes(self: hl.Store, *arguments: object, **options: object) -> object:
+    def sometimes(*_: object, **__: object) -> None:
         if next(away, False):
             raise record_watch.DatabaseError("MongoDB is on holiday.")
-        return real(self, *arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(hl.Store, "record", sometimes)
+    calls(hl.Store, "record", sometimes)
     looks(nothing, nothing, nothing)
     code, _, err = record(store, top, "--watch", "--settle", "0s")
     assert code == 6

@@ -17,6 +17,7 @@ import pytest
 
 from hybridlog.cli.signals import SIGNALS
 from hybridlog_storage.mongo.mongod import find_mongod
+from tests.calls import Calls
 from tests.independent import read_bag
 
 from .running import (
@@ -392,11 +393,8 @@ def test_two_record_into_one_store(logs: Path, tmp_path: Path) -> None:
 
 
 def test_too_little_memory_is_no_mistake_of_ours(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    calls: Calls, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def starve(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("hybridlog.cli.app.app.make_context", starve)
+    calls.fail(import_module("hybridlog.cli.app").app, "make_context", MemoryError)
     assert import_module("hybridlog.cli.main")._run() == 1
     assert "not enough memory" in capsys.readouterr().err

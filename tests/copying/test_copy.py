@@ -20,6 +20,7 @@ from hybridlog.maintenance.places import CopiedFile, Place
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import DiskFullError, HeldError, StoreError, UsageError
+from tests.calls import Calls
 from tests.copying.conftest import (
     STATES,
     Disturbed,
@@ -372,7 +373,7 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
 
 
 def test_a_full_disk_there_keeps_what_arrived(
-    robots: Path, tmp_path: Path, place_at: PlaceAt, monkeypatch: pytest.MonkeyPatch
+    robots: Path, tmp_path: Path, place_at: PlaceAt, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
     class Full(files.System):
         left = 20_000
@@ -384,7 +385,7 @@ def test_a_full_disk_there_keeps_what_arrived(
                 raise OSError(errno.ENOSPC, "full")
             return super().writev(fd, parts)
 
-    monkeypatch.setattr(files, "system", Full())
+    calls.system(Full())
     with place_at(tmp_path / "lab") as place, pytest.raises(DiskFullError):
         copied(robots, place, "recorded", piece=1000)
     monkeypatch.undo()

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 from hybridlog.demo.robot import Robot
-from hybridlog.demo.topics import TOPICS, RobotConfig, Types
+from hybridlog.demo.topics import TOPICS, RobotConfig, Topic, Types
 from hybridlog.demo.write import BagSummary, write_bag
 from hybridlog_storage.errors import DiskFullError, TopicError, UsageError
+from tests.calls import Calls
 
 DURATION = 17.0
 SMALL = RobotConfig(image_size=(48, 32), cloud_columns=40, scan_beams=180)
@@ -310,15 +311,12 @@ def test_unknown_topics_and_taken_names_are_refused(tmp_path: Path) -> None:
 )
 def test_nothing_half_made_is_left(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    calls: Calls,
     ros: Any,
     fault: BaseException,
     raised: type[BaseException],
 ) -> None:
-    def fail(*_arguments: object) -> None:
-        raise fault
-
-    monkeypatch.setattr("hybridlog.demo.topics.Topic.log_times", fail)
+    calls.fail(Topic, "log_times", fault)
     with pytest.raises(raised):
         write_bag(tmp_path / "x", duration_s=2, ros=ros, topics=["/odom"])
     assert list(tmp_path.iterdir()) == []

@@ -27,8 +27,9 @@ from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.open_segment import Flushed
-from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 
 MS = 10**6
 BASE = 1_748_937_600 * 10**9
@@ -160,28 +161,18 @@ def test_what_is_added_to_an_estimate_is_one() -> None:
 class Reads:
     """Counts the chunks whose message indexes are read; nothing else may be read of a chunk."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.chunks = 0
-        read = SegmentReader.read_times
-
-        def counting(reader: SegmentReader, place: ChunkPlace) -> object:
-            self.chunks += 1
-            return read(reader, place)
-
-        def refuse(*_: object) -> None:
-            raise AssertionError("a payload was read")
-
-        monkeypatch.setattr(SegmentReader, "read_times", counting)
-        monkeypatch.setattr(SegmentReader, "read_chunk", refuse)
+    def __init__(self, calls: Calls) -> None:
+        self.read = calls(SegmentReader, "read_times")
+        calls.fail(SegmentReader, "read_chunk", AssertionError("a payload was read"))
 
     def of(self, cache: DensityCache, store: hl.Store, span: tuple[int, int]) -> int:
-        before = self.chunks
+        self.read.clear()
         cache.density(store.entry("a"), span, 100, ["/steady", "/rare"])
-        return self.chunks - before
+        return len(self.read)
 
 
-def test_the_cost_is_that_of_the_span(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads = Reads(monkeypatch)
+def test_the_cost_is_that_of_the_span(store: hl.Store, calls: Calls) -> None:
+    reads = Reads(calls)
     cache = DensityCache(store.session)
     store.session.cache.drop("recording")  # of other tests
     store.session.cache.drop("density")
@@ -197,12 +188,10 @@ def test_the_cost_is_that_of_the_span(store: hl.Store, monkeypatch: pytest.Monke
         assert reads.of(cache, store, (BASE, BASE + (LENGTH >> steps))) == 0
 
 
-def test_chunks_within_a_pixel_are_not_read(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reads = Reads(monkeypatch)
+def test_chunks_within_a_pixel_are_not_read(store: hl.Store, calls: Calls) -> None:
+    reads = Reads(calls)
     found = density(store.session, store.entry("a"), (BASE - LENGTH, BASE + 2 * LENGTH), 1)
-    assert (reads.chunks, found.counts.sum()) == (0, sum(map(len, TIMES.values())))
+    assert (len(reads.read), found.counts.sum()) == (0, sum(map(len, TIMES.values())))
 
 
 def test_usual_periods(store: hl.Store) -> None:
@@ -325,9 +314,7 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert (ask() == found).all()
 
 
-def test_a_segment_that_was_written_again_is_counted_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_segment_that_was_written_again_is_counted_again(tmp_path: Path) -> None:
     """On a full disk a writer takes back what it wrote last."""
     with hl.open(tmp_path / "store", create=True) as store:
         table = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import io
 import struct
 from types import SimpleNamespace
@@ -17,6 +16,7 @@ from hybridlog.arrays.message_arrays import IMAGES, VIDEOS, to_numpy
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.drawing.pixels import pixels, png, thumbnail
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
+from tests.calls import Calls
 
 RNG = np.random.default_rng(3)
 GREY = RNG.integers(0, 256, (5, 7), np.uint8)
@@ -319,15 +319,8 @@ def test_jpeg() -> None:
         picture(raw("mono8", np.zeros((1, 70_000), np.uint8)), form="jpg")
 
 
-def test_jpeg_without_pillow(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def refusing(name: str, *others: Any, **more: Any) -> Any:
-        if name.split(".", maxsplit=1)[0] == "PIL":
-            raise ImportError(name)
-        return real(name, *others, **more)
-
-    monkeypatch.setattr(builtins, "__import__", refusing)
+def test_jpeg_without_pillow(calls: Calls) -> None:
+    calls.missing("PIL")
     assert picture(raw("mono8", GREY)).suffix == ".png"
     assert picture(compressed("", b"\xff\xd8\xff")).suffix == ".jpg"
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[images\]'"):

@@ -23,6 +23,7 @@ from hybridlog.formats.writing import Sink
 from hybridlog.maintenance.expiry import expire
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
+from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import answer
 from tests.odd_messages import ros_channel
@@ -317,7 +318,7 @@ def test_frames_of_another_size_or_format(tmp_path: Path) -> None:
 
 
 def test_files_that_are_not_completed(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
     """Aborted, stopped, or on a full disk: nothing stays, and nothing is said twice."""
     messages = [*store.query(["/odd"], ["images"])]
@@ -327,25 +328,15 @@ def test_files_that_are_not_completed(
     writer.abort()
     assert not list(tmp_path.iterdir())
 
-    def stop(*_: object) -> int:
-        raise KeyboardInterrupt
-
-    def full(*_: object) -> int:
-        raise DiskFullError("no space left")
-
     query = store.query(["/cam"], ["h264"])
-    for raising, error in ((stop, KeyboardInterrupt), (full, DiskFullError)):
-        monkeypatch.setattr(Sink, "write", raising)
+    for error in (KeyboardInterrupt, DiskFullError):
+        calls.fail(Sink, "write", error("no space left"))
         with pytest.raises(error):
             to_mp4(query, tmp_path / "out.mp4")
         assert not list(tmp_path.iterdir())
     assert not list(tmp_path.iterdir())
     monkeypatch.undo()
-
-    def fails(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", fails)
+    calls.fail(os, "fsync", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     with pytest.raises(DiskFullError):
         to_mp4(query, tmp_path / "out.mp4")
     assert not list(tmp_path.iterdir())

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import builtins
 import io
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +19,7 @@ from hybridlog.query.answers.lost import lost_parts
 from hybridlog.record.losses import Cause
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import MissingDependencyError, TopicError, UsageError
+from tests.calls import Calls
 from tests.cli.within import Answer, answer
 
 from .conftest import BASE, Drive
@@ -226,15 +225,8 @@ def test_columns_of_text() -> None:
     assert made([5], [3]).series.by_column(5).tolist() == [3]
 
 
-def test_without_matplotlib(drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def refusing(name: str, *others: Any, **more: Any) -> Any:
-        if name.split(".", maxsplit=1)[0] == "matplotlib":
-            raise ImportError(name)
-        return real(name, *others, **more)
-
-    monkeypatch.setattr(builtins, "__import__", refusing)
+def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
+    calls.missing("matplotlib")
     ask = ("-t", "drive", "--fields", "y")
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[plot\]'"):
         drive.store.topic("drive").plot("y")

@@ -14,6 +14,7 @@ from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import IndexChangedError, TopicError
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.chunk_table import TableBuilder
+from tests.calls import Calls
 from tests.faults.cases import Bench
 from tests.faults.scenarios import scenario
 from tests.faults.stores import Case, look
@@ -25,48 +26,40 @@ def case(bench: Bench) -> Iterator[Case]:
         yield copy
 
 
-def once(
-    action: Callable[[], object], monkeypatch: pytest.MonkeyPatch, looking: str = "looks"
-) -> None:
+def once(action: Callable[[], object], calls: Calls, looking: str = "looks") -> None:
     """Have something happen after all recordings were looked at."""
-    look_at = getattr(StoreDirectory, looking)
     done: list[object] = []
 
-    def looked(self: StoreDirectory, *arguments: object) -> object:
-        found = look_at(self, *arguments)
+    def looked(found: object, *_: object) -> object:
         if not done:
             done.append(action())
         return found
 
-    monkeypatch.setattr(StoreDirectory, looking, looked)
+    calls.change(StoreDirectory, looking, looked)
 
 
 def renaming(path: Path) -> Callable[[], object]:
     return lambda: (path / "recordings" / "a").rename(path / "recordings" / "new")
 
 
-def test_a_recording_that_is_renamed_is_not_missed(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    once(renaming(case.path), monkeypatch)
+def test_a_recording_that_is_renamed_is_not_missed(case: Case, calls: Calls) -> None:
+    once(renaming(case.path), calls)
     with case.open() as store:
         assert {entry.label for entry in store.recordings()} == {"new", "b"}
         assert not store.repairs.unreadable
 
 
-def test_a_recording_that_is_renamed_stays_in_the_index(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_that_is_renamed_stays_in_the_index(case: Case, calls: Calls) -> None:
     directory = StoreDirectory(case.path)
     before = ids_present(directory)
     assert before is not None
     assert len(before) == 2
-    once(renaming(case.path), monkeypatch, "labels")
+    once(renaming(case.path), calls, "labels")
     assert ids_present(directory) == before
 
 
 def test_labels_that_are_exchanged_hide_no_recording(
-    case: Case, monkeypatch: pytest.MonkeyPatch
+    case: Case, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
     directory, path = StoreDirectory(case.path), case.path / "recordings"
     before = ids_present(directory)
@@ -76,17 +69,17 @@ def test_labels_that_are_exchanged_hide_no_recording(
         for old, new in (("a", ".x"), ("b", "a"), (".x", "b")):
             (path / old).rename(path / new)
 
-    once(exchange, monkeypatch, "id_of")
+    once(exchange, calls, "id_of")
     assert ids_present(directory) == before
     monkeypatch.undo()
-    once(exchange, monkeypatch, "id_of")
+    once(exchange, calls, "id_of")
     assert directory.labels_of(recording) == ["a"]
 
 
 def test_a_recording_that_is_removed_is_no_unreadable_one(
-    case: Case, monkeypatch: pytest.MonkeyPatch
+    case: Case, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
-    once(lambda: StoreDirectory(case.path).hide("a"), monkeypatch)
+    once(lambda: StoreDirectory(case.path).hide("a"), calls)
     with case.open() as store:
         assert {entry.label for entry in store.recordings()} == {"b"}
         assert not store.repairs.unreadable
@@ -130,24 +123,16 @@ def test_a_count_is_refused_while_documents_go(case: Case) -> None:
         assert store.topic("/number").where("n >= 0").count() == whole
 
 
-def test_what_goes_while_it_is_counted_is_noticed(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_goes_while_it_is_counted_is_noticed(case: Case, calls: Calls) -> None:
     from hybridlog_storage.mongo.database import Database
 
     with case.open() as store, case.open() as other:
         store.connect()
         other.connect()
         query = store.query(["/number"], ["a"]).where({"$expr": {"$gte": ["$n", 0]}})
-        find, removed = Database.find_each, []
-
-        def found(self: Database, *args: object) -> Iterator[bytes]:
-            if not removed:
-                removed.append(True)
-                other.remove("a")
-            return find(self, *args)  # type: ignore[arg-type]
-
-        monkeypatch.setattr(Database, "find_each", found)
+        asked: list[tuple[object, ...]] = calls(
+            Database, "find_each", lambda *_: other.remove("a") if len(asked) == 1 else None
+        )
         with pytest.raises(IndexChangedError, match="removed"):
             query.count()
         with pytest.raises(TopicError):

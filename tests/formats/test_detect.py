@@ -13,6 +13,7 @@ import zstandard
 
 from hybridlog.formats.detect import UNKNOWN, open_source, sniff
 from hybridlog_storage.errors import SourceError
+from tests.calls import Calls
 from tests.data import DATA, needs_data
 from tests.other_user import User, needs_root, open_place
 
@@ -126,14 +127,10 @@ def test_permission_of_another_user() -> None:
         assert "permission denied" not in User(place).python("-c", script, file).out
 
 
-def test_permission_as_the_system_says_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_permission_as_the_system_says_it(tmp_path: Path, calls: Calls) -> None:
     file = tmp_path / "a.bag"
     file.write_bytes(b"#ROSBAG V2.0\n")
-
-    def refuse(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "open", refuse)
+    calls.fail(Path, "open", PermissionError(13, "Permission denied"))
     with pytest.raises(SourceError, match=r"permission denied; .*chmod"):
         open_source(file)
 

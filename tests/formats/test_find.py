@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from hybridlog.formats import find
 from hybridlog.formats.detect import grouped_parts, open_parts
 from hybridlog.formats.find import Found, Watch, find_logs
 from hybridlog_storage.errors import SourceError
+from tests.calls import Calls
 
 METADATA = """rosbag2_bagfile_information:
   relative_file_paths: [{files}]
@@ -106,17 +106,15 @@ def test_symlinks_lead_to_each_directory_once(tmp_path: Path) -> None:
     assert paths(find_logs(top), top) == ["out", "a/one.mcap", "twice/two.mcap"]
 
 
-def test_what_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_read_is_told(tmp_path: Path, calls: Calls) -> None:
     mcap(tmp_path / "a" / "one.mcap")
     mcap(tmp_path / "b" / "two.mcap")
-    scandir = os.scandir
 
-    def refuse(path: Path) -> object:
+    def refuse(path: Path) -> None:
         if Path(path).name == "a":
             raise PermissionError(13, "Permission denied", str(path))
-        return scandir(path)
 
-    monkeypatch.setattr(find.os, "scandir", refuse)
+    calls(find.os, "scandir", refuse)
     found = find_logs(tmp_path)
     assert paths(found, tmp_path) == ["b/two.mcap"]
     (problem,) = found.problems
@@ -231,9 +229,7 @@ def _zstd(data: bytes) -> bytes:
     return zstandard.compress(data)
 
 
-def test_a_look_at_unchanged_files_opens_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_look_at_unchanged_files_opens_none(tmp_path: Path, calls: Calls) -> None:
     for number in range(300):
         mcap(tmp_path / f"{number % 3}" / f"log{number}.mcap")
         (tmp_path / f"{number % 3}" / f"picture{number}.png").write_bytes(b"png")
@@ -242,18 +238,11 @@ def test_a_look_at_unchanged_files_opens_none(
     watch = Watch(tmp_path)
     watch.look()
     assert len(watch.look().logs) == 300
-    opened: list[Path] = []
-    true_open: Callable[..., object] = Path.open
-
-    def count(self: Path, *arguments: object) -> object:
-        opened.append(self)
-        return true_open(self, *arguments)
-
-    monkeypatch.setattr(Path, "open", count)
+    opened = calls(Path, "open")
     assert watch.look().logs == []
-    assert [path.name for path in opened] == ["torn.mcap"]  # whether it ends by now
+    assert [path.name for path, *_ in opened] == ["torn.mcap"]  # whether it ends by now
     mcap(tmp_path / "1" / "new.mcap")
     opened.clear()
     watch.look()
     assert len(watch.look().logs) == 1
-    assert {path.name for path in opened} == {"torn.mcap", "new.mcap"}
+    assert {path.name for path, *_ in opened} == {"torn.mcap", "new.mcap"}

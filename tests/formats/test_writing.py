@@ -29,6 +29,7 @@ from hybridlog_storage.disk.unfinished import (
     undone,
 )
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from tests.calls import Calls
 from tests.formats.batches import clouds, many, ros1_channels
 
 WRITERS = formats_of("lines", "table", "log", "payloads")
@@ -108,15 +109,10 @@ def test_a_full_disk(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_disk_that_fills_up_at_the_end(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+def test_a_disk_that_fills_up_at_the_end(name: str, tmp_path: Path, calls: Calls) -> None:
     writer = fill(name, tmp_path / "out")
-    monkeypatch.setattr(os, "fsync", full)
-    monkeypatch.setattr(os, "sync", full)
+    for sync in ("fsync", "sync"):
+        calls.fail(os, sync, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     with pytest.raises(DiskFullError):
         writer.close()  # type: ignore[attr-defined]
     assert list(tmp_path.iterdir()) == []
@@ -184,12 +180,9 @@ def test_a_broken_pipe_stays_one() -> None:
     stream.close()
 
 
-def test_other_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
+def test_other_failures(tmp_path: Path, calls: Calls) -> None:
     sink = Sink(tmp_path / "out")
-    monkeypatch.setattr(os, "fsync", fails)
+    calls.fail(os, "fsync", OSError(errno.EIO, os.strerror(errno.EIO)))
     with pytest.raises(HybridlogError, match="Input/output"):
         sink.commit()
     sink.abort()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import mmap
 import threading
 import time
 from contextlib import closing
@@ -18,6 +17,7 @@ from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.test_recording import channel, text
 from tests.test_faults import wait_for
@@ -138,19 +138,12 @@ def test_no_chunk_becomes_larger_than_a_slab(limit: Limit) -> None:
         assert reservation.chunk_size == 2 * SLAB
 
 
-def test_where_there_is_no_memory_it_is_asked_for_once(
-    pool: Buffers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_there_is_no_memory_it_is_asked_for_once(pool: Buffers, calls: Calls) -> None:
     with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        asked = []
-
-        def refuse(size: int) -> mmap.mmap:
-            asked.append(size)
-            raise OSError(errno.ENOMEM, "no memory")
-
-        monkeypatch.setattr(pool_module, "new_memory", refuse)
+        calls.fail(pool_module, "new_memory", OSError(errno.ENOMEM, "no memory"))
+        asked = calls(pool_module, "new_memory")
         comes(reservation, 1e12, looks=10)
-        assert asked == [SLAB]
+        assert asked == [(SLAB,)]
         assert pool.take(SIZE).size == SIZE
         # What is there does for large chunks as well.
         assert reservation.next_chunk_size() == 4 * SIZE

@@ -44,6 +44,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
 from tests.test_faults import wait_for
@@ -70,16 +71,10 @@ class Running:
         return found
 
 
-def block_writing(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+def block_writing(calls: Calls) -> threading.Event:
     """Nothing is laid into chunks until the event is set."""
     blocked = threading.Event()
-    lay_down = LiveRecording._append_batch
-
-    def slow(self: LiveRecording, group: object) -> int:
-        blocked.wait()
-        return lay_down(self, group)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(LiveRecording, "_append_batch", slow)
+    calls(LiveRecording, "_append_batch", lambda *_: blocked.wait())
     return blocked
 
 
@@ -119,11 +114,9 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     assert [m.decode().data for m in store.topic("/chatter")] == [str(n) for n in range(100)]
 
 
-def test_payloads_step_down_and_fields_stay(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_payloads_step_down_and_fields_stay(store: hl.Store, limit: Limit) -> None:
     filled = [0.0]
-    monkeypatch.setattr(LiveRecording, "filled", property(lambda _: filled[0]))
+    limit(recording_filled=property(lambda _: filled[0]))
     options = RecorderOptions(
         reserve_bytes=0, priorities=[priority_rule("/lidar", "high"), priority_rule("/cam", "low")]
     )
@@ -159,15 +152,13 @@ def test_payloads_step_down_and_fields_stay(
     store.verify()
 
 
-def test_a_reduced_message_says_what_it_was(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(LiveRecording, "filled", 0.99)
+def test_a_reduced_message_says_what_it_was(store: hl.Store, limit: Limit, tmp_path: Path) -> None:
+    limit(recording_filled=0.99)
     robot = Running(store)
     channel, payload = scan_channel(), scan(5, 9000)
     robot.speaker.say(channel, payload, SECOND)
     robot.speaker.say(channel, payload[:5000], 2 * SECOND)  # does not fit its definition
-    monkeypatch.setattr(LiveRecording, "filled", 0.0)
+    limit(recording_filled=0.0)
     robot.speaker.say(channel, payload, 3 * SECOND)
     robot.rows()
     query = store.topic("/scan")
@@ -191,10 +182,8 @@ def test_a_reduced_message_says_what_it_was(
     assert store.topic("/scan").fields("near").to_pandas()["near"].dropna().tolist() == [2.5, 2.5]
 
 
-def test_when_the_budget_is_spent_the_rest_is_counted(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    blocked = block_writing(monkeypatch)
+def test_when_the_budget_is_spent_the_rest_is_counted(store: hl.Store, calls: Calls) -> None:
+    blocked = block_writing(calls)
     robot = Running(store, RecorderOptions(reserve_bytes=0, budget_bytes=1 << 20))
     channel = text_channel()
     for number in range(1000):
@@ -206,9 +195,7 @@ def test_when_the_budget_is_spent_the_rest_is_counted(
     assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
 
 
-def test_a_full_disk_ends_it_and_what_comes_is_counted(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_it_and_what_comes_is_counted(store: hl.Store) -> None:
     robot = Running(store)
     channel = scan_channel()
     robot.speaker.say(channel, scan(1, 3_000_000))
@@ -409,7 +396,7 @@ def test_the_same_words_are_said_once_and_not_for_ever(store: hl.Store) -> None:
 
 @pytest.mark.parametrize("place", ["before the chunks", "before the disk"])
 def test_a_recorder_that_writes_nothing_is_stalled(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit, place: str
+    store: hl.Store, calls: Calls, limit: Limit, place: str
 ) -> None:
     limit(slow_write_s=0.1)
     robot = Running(store, RecorderOptions(reserve_bytes=0, flush_interval_s=0.05))
@@ -418,13 +405,7 @@ def test_a_recorder_that_writes_nothing_is_stalled(
     owner, name = LiveRecording, "_append_batch"
     if place == "before the disk":
         owner, name = append_file.AppendFile, "append"
-    work = getattr(owner, name)
-
-    def slow(*arguments: object) -> object:
-        blocked.wait()
-        return work(*arguments)
-
-    monkeypatch.setattr(owner, name, slow)
+    calls(owner, name, lambda *_: blocked.wait())
     for number in range(30):
         robot.speaker.say(text_channel(), text(str(number)))
     wait_for(lambda: robot.recorder.look().stalled_s)
@@ -579,11 +560,9 @@ def test_a_killed_recorder_loses_no_more_rows_than_messages(tmp_path: Path) -> N
         assert running(path) == []
 
 
-def test_fields_land_when_no_payload_finds_room(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:
     """Whatever their priority: three large messages are more than the budget."""
-    blocked = block_writing(monkeypatch)
+    blocked = block_writing(calls)
     rules = [priority_rule(f"/{word}", word) for word in ("low", "normal", "high")]
     options = RecorderOptions(reserve_bytes=0, budget_bytes=4 << 20, priorities=rules)
     robot = Running(store, options)
@@ -621,9 +600,9 @@ def test_the_bytes_wanted_are_counted_as_they_come(store: hl.Store) -> None:
 
 
 def test_the_reserve_holds_for_what_waits_in_memory(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
 ) -> None:
-    monkeypatch.setattr(LiveRecording, "filled", 0.5)
+    limit(recording_filled=0.5)
     disk = shutil.disk_usage("/")._replace(free=150 << 20)
     monkeypatch.setattr(recorder_module.shutil, "disk_usage", lambda _: disk)
     robot = Running(store, RecorderOptions(reserve_bytes=100 << 20, budget_bytes=64 << 20))

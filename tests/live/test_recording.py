@@ -24,7 +24,6 @@ import hybridlog as hl
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.demo.write import write_bag
-from hybridlog.index import index_writer
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
@@ -36,9 +35,9 @@ from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import NOTHING, IndexState
 from hybridlog_storage.segments import segment_writer
-from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import must_return
 from tests.test_faults import kill_mongod, wait_for
@@ -102,16 +101,10 @@ def test_many_threads_one_recording(store: hl.Store) -> None:
 
 @pytest.mark.parametrize("size", [100_000, 10_000])
 def test_while_the_disk_stands_still_the_budget_is_still_taken(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, size: int
+    store: hl.Store, calls: Calls, size: int
 ) -> None:
     go_on = threading.Event()
-    append_chunks = SegmentFile.append_chunks
-
-    def wait(segment: SegmentFile, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
-        assert go_on.wait(60)
-        return append_chunks(segment, chunks, end)
-
-    monkeypatch.setattr(SegmentFile, "append_chunks", wait)
+    calls(SegmentFile, "append_chunks", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
     budget, settings = 8 << 20, SegmentSettings(chunk_size=1 << 19)
     # Closed chunks that are on their way come on top, and one open one a topic.
     room = budget + AT_WORK * settings.chunk_size
@@ -287,35 +280,26 @@ def test_a_batch_is_for_chunks_that_get_many_messages(
 
 
 def test_what_is_laid_down_together_keeps_its_order(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    store: hl.Store, calls: Calls, limit: Limit
 ) -> None:
     """Of all topics, whatever the sizes are, and however much comes at one time."""
     sizes = [0, 10, 30_000, 200, 300_000, 10, COPIED_AT_ONCE]
     own = [channel(f"/talk{n}") for n in range(3)]
-    batches: list[int] = []
-    append = RecordingWriter.append
-
-    def counted(self: RecordingWriter, batch: LooseBatch, channels: Sequence[Channel]) -> None:
-        batches.append(batch.payload_bytes)
-        append(self, batch, channels)
-
     limit(laid_out_bytes=9_000_000)
-    monkeypatch.setattr(RecordingWriter, "append", counted)
+    appended = calls(RecordingWriter, "append")
     payloads = [text(b"%5d" % n + bytes(sizes[n % 7])) for n in range(210)]
     with store.start("talk") as recording, recording._laying:
         for n, payload in enumerate(payloads):
             recording.write(own[n % 2 if n % 5 else 2], payload, log_time=5, sequence=n)
     # What is left behind them are too few for a batch.
-    assert len(batches) == 4
-    assert sum(batches) == sum(map(len, payloads[:196]))
+    assert len(appended) == 4
+    assert sum(batch.payload_bytes for _, batch, _ in appended) == sum(map(len, payloads[:196]))
     assert [m.raw for m in store.query([one.topic for one in own])] == payloads
 
 
-def test_the_index_falls_behind_and_catches_up(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_index_falls_behind_and_catches_up(store: hl.Store, limit: Limit) -> None:
     busy = True
-    monkeypatch.setattr(LiveRecording, "_is_under_pressure", lambda *_: busy)
+    limit(recording_is_under_pressure=lambda *_: busy)
     own = channel("/talk")
     payloads = [text(os.urandom(50_000)) for _ in range(40)]
     settings = SegmentSettings(chunk_size=100_000, segment_size=1_000_000)
@@ -459,7 +443,7 @@ def test_a_processor_is_left_to_who_brings_messages(
     slowly(TableWriter, "add")
     payloads = [text(bytes([n]) * 2000) for n in range(30)]
     limit(index_group_bytes=0)
-    monkeypatch.setattr(live, "_index_interval_s", lambda _: 0.01)
+    limit(index_interval=lambda _: 0.01)
     with store.start("talk", settings=SegmentSettings(chunk_size=2000)) as recording:
         for payload in payloads:
             recording.write(channel("/talk"), payload)
@@ -468,13 +452,10 @@ def test_a_processor_is_left_to_who_brings_messages(
     assert [m.raw for m in store.topic("/talk")] == payloads
 
 
-def test_no_mistake_of_ours_is_silent(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ZeroDivisionError
-
+def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
     recording = store.start("talk", budget_bytes=1 << 20)
     for name in ("append", "place_one"):
-        monkeypatch.setattr(RecordingWriter, name, broken)
+        calls.fail(RecordingWriter, name, ZeroDivisionError)
     own = channel("/talk")
 
     def until_refused() -> None:
@@ -503,25 +484,16 @@ with hl.open(sys.argv[1], create=True) as store:
 """
 
 
-def test_chunks_are_flushed_within_the_interval(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -> None:
     """The age at which they are, and the pause between two looks, are no more together."""
-    ages: list[float] = []
-    real = RecordingWriter.flush_older
-
-    def seen(self: RecordingWriter, seconds: float) -> None:
-        ages.append(seconds)
-        real(self, seconds)
-
-    monkeypatch.setattr(RecordingWriter, "flush_older", seen)
+    flushed = calls(RecordingWriter, "flush_older")
     for interval in (0.05, 0.4):
-        ages.clear()
+        flushed.clear()
         with store.start("talk", flush_interval_s=interval) as recording:
             recording.write(channel("/talk"), text(b"x"))
             wait_for(lambda: recording._capture.writer.totals.chunks == 1)
         tick = min(live._TICK_S, interval / 10)
-        assert {0 < age <= interval - 2 * tick for age in ages} == {True}
+        assert {0 < age <= interval - 2 * tick for _, age in flushed} == {True}
 
 
 def test_kill_costs_no_more_than_the_flush_interval(tmp_path: Path) -> None:
@@ -754,24 +726,18 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
 
 
 @pytest.fixture
-def inserted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+def inserted(calls: Calls) -> Counter[str]:
     """Number of inserts, by collection."""
     found: Counter[str] = Counter()
-    real = Database.insert_raw
-
-    def counted(self: Database, collection: str, *args: Any, **given: Any) -> int:
-        found[collection] += 1
-        return real(self, collection, *args, **given)
-
-    monkeypatch.setattr(Database, "insert_raw", counted)
+    calls(Database, "insert_raw", lambda _, collection, *__, **___: found.update([collection]))
     return found
 
 
 def test_documents_of_many_chunks_are_sent_together(
-    store: hl.Store, inserted: Counter[str], monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, inserted: Counter[str], limit: Limit
 ) -> None:
     """Each topic has a chunk a flush, and one insert for all of an interval."""
-    monkeypatch.setattr(live, "_index_interval_s", lambda _: 1e6)
+    limit(index_interval=lambda _: 1e6)
     topics = [channel(f"/topic{number}") for number in range(3)]
     with store.start("talk", flush_interval_s=0.05) as recording:
         totals = recording._capture.writer.totals
@@ -790,13 +756,13 @@ def test_documents_of_many_chunks_are_sent_together(
 
 @pytest.mark.parametrize("bound", ["_INTERVAL_BYTES", "a segment"])
 def test_the_index_does_not_wait_for_the_interval(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, bound: str
+    store: hl.Store, limit: Limit, bound: str
 ) -> None:
     """When many bytes were flushed, or a segment was sealed."""
-    monkeypatch.setattr(live, "_index_interval_s", lambda _: 1e6)
+    limit(index_interval=lambda _: 1e6)
     settings = SegmentSettings(segment_size=20_000)
     if bound == "_INTERVAL_BYTES":
-        monkeypatch.setattr(index_writer, bound, 20_000)
+        limit(index_interval_bytes=20_000)
         settings = SegmentSettings()
     own = channel("/talk")
     with store.start("talk", flush_interval_s=0.05, settings=settings) as recording:
@@ -809,10 +775,10 @@ def test_the_index_does_not_wait_for_the_interval(
     assert store.verify().findings == []
 
 
-def test_memory_has_no_chunks_that_wait(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_has_no_chunks_that_wait(store: hl.Store, limit: Limit) -> None:
     """However far the index is behind; of sealed segments not even their places."""
     busy = True
-    monkeypatch.setattr(LiveRecording, "_is_under_pressure", lambda *_: busy)
+    limit(recording_is_under_pressure=lambda *_: busy)
     own = channel("/talk")
     payloads = [text(os.urandom(20_000)) for _ in range(60)]
     settings = SegmentSettings(chunk_size=20_000, segment_size=200_000)
@@ -831,17 +797,8 @@ def test_memory_has_no_chunks_that_wait(store: hl.Store, monkeypatch: pytest.Mon
     assert store.verify().findings == []
 
 
-def test_tables_get_chunks_in_the_order_of_the_file(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    added: list[int] = []
-    real = TableWriter.add
-
-    def seen(self: TableWriter, chunk: StoredChunk, *args: Any) -> None:
-        added.append(chunk.offset)
-        real(self, chunk, *args)
-
-    monkeypatch.setattr(TableWriter, "add", seen)
+def test_tables_get_chunks_in_the_order_of_the_file(store: hl.Store, calls: Calls) -> None:
+    added = calls(TableWriter, "add")
     slow, large = channel("/slow"), channel("/large")
     with store.start("talk", flush_interval_s=0.05) as recording:
         totals = recording._capture.writer.totals
@@ -851,7 +808,8 @@ def test_tables_get_chunks_in_the_order_of_the_file(
             recording.write(own, text(b"y" * size))
             wait_for(lambda before=before: totals.chunks == before + 1)
     assert len(added) == 4
-    assert added == sorted(set(added))
+    offsets = [chunk.offset for _, chunk, *_ in added]
+    assert offsets == sorted(set(offsets))
     (entry,) = store.recordings()
     tables = Tables(store.directory.path)
     assert all(tables.of(entry, own.topic) for own in (slow, large))

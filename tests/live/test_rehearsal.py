@@ -22,6 +22,7 @@ from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger
 from hybridlog.record.losses import Ledger
 from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel
+from tests.calls import Calls
 from tests.cli.within import answer as run
 
 MS = 10**6
@@ -117,18 +118,17 @@ def recorded(trigger: str, name: str, before_s: float, after_s: float) -> list[t
 
 
 @pytest.fixture(params=["whole", "in blocks"])
-def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def blocks(request: pytest.FixtureRequest, calls: Calls) -> None:
     """Sizes of messages come all at once, or a few at a time."""
     if request.param == "whole":
         return
-    from_table = rehearsal._from_table
 
-    def cut(*arguments: Any) -> Iterator[rehearsal._Sizes]:
-        for one in from_table(*arguments):
+    def cut(found: Iterator[rehearsal._Sizes], *_: Any) -> Iterator[rehearsal._Sizes]:
+        for one in found:
             for begin in range(0, len(one.time), 3):
                 yield rehearsal._Sizes(*(column[begin : begin + 3] for column in one))
 
-    monkeypatch.setattr(rehearsal, "_from_table", cut)
+    calls.change(rehearsal, "_from_table", cut)
 
 
 @pytest.mark.usefixtures("blocks")

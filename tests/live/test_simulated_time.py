@@ -18,6 +18,7 @@ from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.speaker import Speaker, text, text_channel
 
@@ -206,21 +207,19 @@ def test_marks_and_throttles_go_by_the_clock(store: hl.Store) -> None:
 
 
 def test_messages_that_come_while_the_held_ones_are_passed_on_stay_behind_them(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+    store: hl.Store, calls: Calls
 ) -> None:
     simulation = Simulation(store)
     for number in range(3):
         simulation.say(f"held {number}")
-    take = simulation.recorder.take
 
-    def slow(channel: Channel, payload: bytes, **times: int) -> None:
+    def slow(_: Channel, payload: bytes, **__: int) -> None:
         if payload == text("held 0"):
             other = threading.Thread(target=simulation.say, args=("new",))
             other.start()
             other.join()
-        take(channel, payload, **times)
 
-    monkeypatch.setattr(simulation.recorder, "take", slow)
+    calls(simulation.recorder, "take", slow)
     simulation.tick(1)
     found, _ = simulation.end()
     assert [word for word, _ in found] == ["held 0", "held 1", "held 2", "new"]

@@ -11,6 +11,7 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.errors import IncompleteError
 from tests.cli.running import run
+from tests.limits import Limit
 from tests.live.robot import robot
 from tests.live.speaker import text, text_channel
 from tests.live.test_follow import NOWHERE, wait_until_flushed
@@ -158,10 +159,8 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
         query.completeness().check()
 
 
-def test_what_the_index_lacks_is_told_where_mongodb_answers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hybridlog.live.recording._index_interval_s", lambda _: 3600.0)
+def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limit: Limit) -> None:
+    limit(index_interval=lambda _: 3600.0)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         recording = store.start("own", flush_interval_s=0.1)
         for number in range(5):

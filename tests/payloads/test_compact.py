@@ -21,6 +21,7 @@ from hybridlog.columns.payload_rows import Rebuilder
 from hybridlog_storage import journal
 from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.journal import Journal
+from tests.calls import Calls
 from tests.cli.running import run
 from tests.payloads.logs import (
     BASE,
@@ -190,16 +191,13 @@ def test_a_rebuilt_journal_keeps_the_columns(copy: Path) -> None:
         assert store.recordings()[0].payloads == listed
 
 
-def test_a_proof_that_fails_leaves_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    records = Rebuilder.records
-
-    def wrong(self: Rebuilder, own: Any, fields: Any) -> Any:
-        found = records(self, own, fields)
+def test_a_proof_that_fails_leaves_nothing(copy: Path, calls: Calls) -> None:
+    def wrong(found: Any, _: Rebuilder, own: Any, *__: Any) -> Any:
         if "points" in own:
             found.data[-1] ^= 1
         return found
 
-    monkeypatch.setattr(Rebuilder, "records", wrong)
+    calls.change(Rebuilder, "records", wrong)
     with hl.open(copy) as store:
         cloud, scans = store.compact()
         assert (cloud.messages, cloud.kept, scans.messages) == (0, COUNT, COUNT)
@@ -303,13 +301,10 @@ def test_a_crash_before_the_journal_is_undone_and_after_it_finished(copy: Path) 
 
 @pytest.mark.exhaustive
 def test_a_full_disk_leaves_the_recording_as_it_was(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
+    copy: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
-    def full(self: Journal, *lines: Any) -> None:
-        raise DiskFullError("No space left.")
-
     with hl.open(copy) as store:
-        monkeypatch.setattr(Journal, "append", full)
+        calls.fail(Journal, "append", DiskFullError("No space left."))
         with pytest.raises(DiskFullError):
             store.compact()
         assert sorted(p.name for p in recording_of(copy).iterdir() if p.is_dir()) == []

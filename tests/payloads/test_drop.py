@@ -21,6 +21,7 @@ from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.segments.segment_format import moved_record
 from hybridlog_storage.segments.segment_reader import SegmentReader
+from tests.calls import Calls
 from tests.payloads.logs import (
     BASE,
     COUNT,
@@ -285,13 +286,10 @@ def test_a_flipped_bit_of_columns_is_found(thin: hl.Store, tmp_path: Path) -> No
         assert store.verify().findings
 
 
-def test_a_segment_that_differs_is_not_used(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def wrong(*_: Any) -> None:
-        raise SegmentError("it differs")
-
+def test_a_segment_that_differs_is_not_used(copy: Path, calls: Calls) -> None:
     with hl.open(copy) as store:
         before = messages(store)
-        monkeypatch.setattr(thinning, "_prove", wrong)
+        calls.fail(thinning, "_prove", SegmentError("it differs"))
         with pytest.raises(SegmentError, match="differs"):
             store.compact(drop_mcap=True)
         assert not list(recording_of(copy).glob("*.thinned"))
@@ -300,18 +298,18 @@ def test_a_segment_that_differs_is_not_used(copy: Path, monkeypatch: pytest.Monk
         assert store.verify().findings == []
 
 
-def test_content_that_differs_is_not_used(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_content_that_differs_is_not_used(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
+) -> None:
     """Neither when chunks are taken out, nor when one is read later."""
-    content = RecordingPayloads.content
 
-    def wrong(self: RecordingPayloads, segment: int, chunk: int, size: int) -> Any:
-        found = content(self, segment, chunk, size)
+    def wrong(found: Any, self: RecordingPayloads, segment: int, chunk: int, _: int) -> Any:
         if any("topic=cloud" in r.listed.file for r in self.having(segment, chunk)):
             found[-1] ^= 1
         return found
 
     with hl.open(copy) as store:
-        monkeypatch.setattr(RecordingPayloads, "content", wrong)
+        calls.change(RecordingPayloads, "content", wrong)
         clouds, scans = store.compact(drop_mcap=True)
         assert (clouds.dropped, clouds.both) == (0, COUNT)
         assert (scans.dropped, scans.both) == (COUNT, 0)
@@ -319,7 +317,7 @@ def test_content_that_differs_is_not_used(copy: Path, monkeypatch: pytest.Monkey
         assert store.verify().findings == []
         (clouds,) = store.compact(topics=["cloud"], drop_mcap=True)
         assert clouds.dropped == COUNT
-        monkeypatch.setattr(RecordingPayloads, "content", wrong)
+        calls.change(RecordingPayloads, "content", wrong)
         with pytest.raises(SegmentError, match="do not come back"):
             store.topic("/cloud").at(BASE + STEP)
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import SegmentError
+from tests.limits import Limit
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
 
 AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
@@ -91,9 +91,9 @@ def many(store: hl.Store) -> hl.Store:
 
 
 @pytest.fixture(autouse=True)
-def without_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_tables(limit: Limit) -> None:
     """Let the chunk index answer."""
-    monkeypatch.setattr(TablesEngine, "cost", lambda *_: None)
+    limit(tables_cost=lambda *_: None)
 
 
 def segment_of(store: hl.Store) -> Path:

@@ -14,9 +14,9 @@ import hybridlog as hl
 from hybridlog.query.query import Query
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
-from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
 
 AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
@@ -167,18 +167,9 @@ def test_who_changes_a_message_does_not_change_what_is_kept(
 # What is kept.
 
 
-def test_a_segment_is_read_where_its_chunk_lies(
-    many: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_segment_is_read_where_its_chunk_lies(many: hl.Store, calls: Calls) -> None:
     """The chunks before a time are not read one after the other."""
-    read = []
-    whole = SegmentReader.read_chunk
-
-    def counted(self: SegmentReader, place: object) -> StoredChunk:
-        read.append(place)
-        return whole(self, place)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(SegmentReader, "read_chunk", counted)
+    read = calls(SegmentReader, "read_chunk")
     for moment in (150, 20, 90):  # the first question, the second, and one that knows all
         assert many.topic("/state").at(f"+{moment}s").fields["n"] == moment
     assert len(read) == 3

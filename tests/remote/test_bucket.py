@@ -13,7 +13,6 @@ from hybridlog_storage.errors import (
     ObjectExistsError,
     UsageError,
 )
-from hybridlog_storage.remote import bucket as bucket_module
 from hybridlog_storage.remote.bucket import (
     Bucket,
     Object,
@@ -22,6 +21,7 @@ from hybridlog_storage.remote.bucket import (
     joined_ranges,
     path_of,
 )
+from tests.limits import Limit
 from tests.remote.server import Proxy
 
 DATA = random.Random(1).randbytes(300_000)
@@ -59,11 +59,8 @@ def test_far_ranges_are_read_apart() -> None:
     assert joined_ranges([(50, 60), (0, 20)], gap=30) == [(0, 60)]
 
 
-def test_large_objects_go_in_parts(
-    address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bucket_module, "PART_BYTES", 200_000)
-    monkeypatch.setattr(bucket_module, "_PART", 100_000)
+def test_large_objects_go_in_parts(address: str, proxy: Proxy, limit: Limit) -> None:
+    limit(bucket_whole_bytes=200_000, bucket_part_bytes=100_000)
     bucket, data = Bucket(address), DATA[:250_000]
 
     def sent(content: bytes) -> Object:
@@ -106,13 +103,13 @@ def test_a_server_without_conditions_is_refused(address: str, proxy: Proxy) -> N
     assert [o.name for o in bucket.objects()] == []
 
 
-def test_addresses_and_refusals(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_addresses_and_refusals(proxy: Proxy, limit: Limit) -> None:
     for wrong in ("s3://", "http://lab/store", "/a"):
         with pytest.raises(UsageError):
             Bucket(wrong)
     with pytest.raises(BucketError, match="There is no bucket"):
         Bucket("s3://nobody-has-this/store").read("a", [(0, 1)])
     proxy.spoil = lambda _: "503"
-    monkeypatch.setattr(bucket_module, "_RETRY_S", 0)
+    limit(bucket_retry_s=0)
     with pytest.raises(BucketError, match="nobody-has-this/store/a"):
         Bucket("s3://nobody-has-this/store").read("a", [(0, 1)])

@@ -29,12 +29,12 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.remote import address_of
-from hybridlog_storage.remote import bucket as bucket_module
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.lists import StoreList, list_name
 from hybridlog_storage.remote.store import RemoteDirectory
 from tests.cli.within import answer
+from tests.limits import Limit
 from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy
 
@@ -250,23 +250,25 @@ def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Prox
     assert said.json == {"objects": 0, "bytes": 0, "dry_run": True}
 
 
-def test_old_objects_are_not_taken_for_own(
-    address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_old_objects_are_not_taken_for_own(address: str, proxy: Proxy, limit: Limit) -> None:
     bucket = Bucket(address)
     bucket.create("a", b"1")
     bucket.create("a", b"1")
-    monkeypatch.setattr(bucket_module, "UNLISTED_DAYS", 1)
+    limit(bucket_unlisted_days=1)
     with pytest.raises(ObjectExistsError):
         bucket.create("a", b"1")
 
 
 def test_two_who_send_large_files_at_once(
-    here: Path, address: str, proxy: Proxy, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    here: Path,
+    address: str,
+    proxy: Proxy,
+    monkeypatch: pytest.MonkeyPatch,
+    limit: Limit,
+    tmp_path: Path,
 ) -> None:
     """Some servers give a new version to the same bytes when they come again."""
-    monkeypatch.setattr(bucket_module, "PART_BYTES", 10_000)
-    monkeypatch.setattr(bucket_module, "_PART", 5_000)
+    limit(bucket_whole_bytes=10_000, bucket_part_bytes=5_000)
     publish = BucketPlace.publish
 
     def overtaken(place: BucketPlace, label: str, lines: bytes, **options: Any) -> str:

@@ -10,6 +10,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli import app, open_store
 from hybridlog_storage.settings import NONE
+from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import Answer, answer
 from tests.json_schemas import misfit, schema_of
@@ -83,16 +84,14 @@ def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, int]]:
+def seen(calls: Calls) -> list[dict[str, int]]:
     """What the recording has for each command, when it ends."""
     found: list[dict[str, int]] = []
-    rebuilt = open_store._print_rebuilt
 
-    def look(store: hl.Store, doing: str) -> None:
+    def look(store: hl.Store, _: str) -> None:
         found.append(dict(store.entry(LABEL).messages_by_topic()))
-        rebuilt(store, doing)
 
-    monkeypatch.setattr(open_store, "_print_rebuilt", look)
+    calls(open_store, "_print_rebuilt", look)
     return found
 
 

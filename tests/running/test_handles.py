@@ -14,6 +14,7 @@ from hybridlog.live import LiveOptions
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_reader import SegmentReader
+from tests.calls import Calls
 from tests.running.running import NO_MONGODB
 
 SAID = Channel("/said", "json", None)
@@ -26,23 +27,21 @@ def record(store: hl.Store, name: str, time: int) -> None:
 
 
 def test_a_recording_that_comes_while_another_thread_looks_is_seen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, calls: Calls
 ) -> None:
     with hl.open(tmp_path / "store", create=True) as writer:
         record(writer, "old", START)
         with hl.open(tmp_path / "store", mongo=NO_MONGODB) as store:
             store.refresh()
-            look = session_module.look_at_all
             has_looked, may_end = threading.Event(), threading.Event()
 
-            def slow(*args: object, **options: object) -> object:
-                found = look(*args, **options)  # type: ignore[arg-type]
+            def slow(found: object, *_: object, **__: object) -> object:
                 if threading.current_thread().name == "slow":
                     has_looked.set()
                     may_end.wait(30)
                 return found
 
-            monkeypatch.setattr(session_module, "look_at_all", slow)
+            calls.change(session_module, "look_at_all", slow)
             first = threading.Thread(target=lambda: store.topic("said").count(), name="slow")
             first.start()
             assert has_looked.wait(30)

@@ -21,6 +21,7 @@ from hybridlog_storage.segments.compression import FilePart
 from tests.cli.running import complete, wait_for
 from tests.cli.within import answer
 from tests.imports import ROOT
+from tests.limits import Limit
 from tests.running.methods import LABEL, METHODS, rows, same, sent
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import SAID, START, Known, messages
@@ -46,12 +47,10 @@ def check(store: hl.Store, known: Known) -> None:
             assert same(found, wanted), (name, found, wanted)
 
 
-def test_a_copy_that_cannot_be_written(
-    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_copy_that_cannot_be_written(running: Running, tmp_path: Path, limit: Limit) -> None:
     known = running.flushed()
     copied = copy_of(running, tmp_path / "copy")
-    monkeypatch.setattr(StoreDirectory, "is_writable", False)
+    limit(directory_is_writable=False)
     with hl.open(copied, mongo=NO_MONGODB) as store:
         assert store.entry(LABEL).status == "unfinished"
         check(store, known)

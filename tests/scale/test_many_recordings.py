@@ -16,6 +16,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.sql import topic_view
 from hybridlog_storage.catalog_parts import MAX_PART_BYTES
+from tests.calls import Calls
 from tests.imports import ROOT
 from tests.scale.cost import Cost, cost_of
 
@@ -230,12 +231,8 @@ def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) 
     assert not [path for path in cost.opened if path.endswith(".parquet")]
 
 
-def test_sql_of_a_day_tests_groups_of_recordings(
-    stores: dict[int, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = []
-    inside = topic_view._within
-    monkeypatch.setattr(topic_view, "_within", lambda span: made.append(span) or inside(span))
+def test_sql_of_a_day_tests_groups_of_recordings(stores: dict[int, Path], calls: Calls) -> None:
+    made = calls(topic_view, "_within")
     with hl.open(stores[MANY], mongo="none") as store:
         asked = f"select count(*) from pose where t >= {day(4)[0]} and t < {day(4)[1]}"
         cost = cost_of(store, lambda: store.sql(asked).rows())

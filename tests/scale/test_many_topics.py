@@ -6,7 +6,6 @@ import shutil
 import struct
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import pytest
 from mcap.writer import Writer
@@ -14,7 +13,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.query.answers import field_statistics
 from hybridlog.query.engines.tables import TablesEngine
-from hybridlog.query.question import Part
+from tests.calls import Calls
 from tests.scale.cost import cost_of
 
 START = 1_577_836_800 * 10**9
@@ -63,26 +62,12 @@ def test_a_condition_on_another_topic_reads_each_chunk_once(stores: dict[int, Pa
 
 
 def test_statistics_of_many_topics_are_planned_together(
-    stores: dict[int, Path], monkeypatch: pytest.MonkeyPatch
+    stores: dict[int, Path], calls: Calls
 ) -> None:
-    planned: list[int] = []
-    real = field_statistics.Planner
-
-    def seen(*arguments: Any) -> Any:
-        planned[-1] += 1
-        return real(*arguments)
-
-    monkeypatch.setattr(field_statistics, "Planner", seen)
-    weighed: list[str] = []
-    cost = TablesEngine.cost
-
-    def weigh(engine: TablesEngine, part: Part, *arguments: Any) -> float | None:
-        weighed.append(part.topic)
-        return cost(engine, part, *arguments)
-
-    monkeypatch.setattr(TablesEngine, "cost", weigh)
+    planners, planned = calls(field_statistics, "Planner"), []
+    weighed = calls(TablesEngine, "cost")
     for count, path in stores.items():
-        planned.append(0)
+        planners.clear()
         weighed.clear()
         with hl.open(path) as store:
             found = store.all_topics().stats()
@@ -95,6 +80,7 @@ def test_statistics_of_many_topics_are_planned_together(
             (topic, "data") for topic in sorted(f"/s{n}" for n in range(count))
         ]
         assert {(one.count, one.min, one.max) for one in found} == {(MESSAGES, 0, MESSAGES - 1)}
+        planned.append(len(planners))
     assert planned[0] == planned[1]
 
 

@@ -17,6 +17,7 @@ from hybridlog.schema.definition import parse_definition, typestore
 from hybridlog.schema.index_bodies import index_bodies
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Channel, Schema
+from tests.calls import Calls
 from tests.ros_values import ROS1, message_of, same
 
 RULE = "=" * 80
@@ -179,15 +180,9 @@ def test_a_definition_that_leaves_bytes_over_where_the_standard_type_fits() -> N
     assert completed(longer, [b"\0\0\0\0", b"\0\0\0\0\7", b"\0\0\0\0\7"]) is longer
 
 
-def test_work_on_large_messages_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_on_large_messages_is_bounded(calls: Calls) -> None:
     seen: list[int] = []
-    fit = completion._fit
-
-    def counting(kind: Any, wire: Any, payloads: Any) -> tuple[int, int]:
-        seen.append(sum(map(len, payloads)))
-        return fit(kind, wire, payloads)
-
-    monkeypatch.setattr(completion, "_fit", counting)
+    calls(completion, "_fit", lambda _, __, payloads: seen.append(sum(map(len, payloads))))
     large = (3 << 20).to_bytes(4, "little") + bytes(3 << 20)
     bare = Channel("/t", "ros1", Schema("std_msgs/String", "", b""))
     assert completed(bare, [large] * 10) is not bare

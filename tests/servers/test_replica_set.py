@@ -14,6 +14,7 @@ import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.faults import logs
 from tests.limits import Limit
 from tests.servers.commands import commands
@@ -57,18 +58,16 @@ def check(store: hl.Store, messages: int) -> None:
 
 
 @pytest.fixture
-def killing(members: ReplicaSet, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def killing(members: ReplicaSet, calls: Calls) -> list[str]:
     """The primary is killed when some documents are on their way; collections of all inserts."""
     inserts: list[str] = []
-    insert = Database._insert_batch
 
-    def counted(self: Database, collection: str, *arguments: object, **options: object) -> int:
+    def counted(_: Database, collection: str, *__: object, **___: object) -> None:
         inserts.append(collection)
         if len(inserts) == KILLED_AT:
             members.kill_primary()
-        return insert(self, collection, *arguments, **options)
 
-    monkeypatch.setattr(Database, "_insert_batch", counted)
+    calls(Database, "_insert_batch", counted)
     return inserts
 
 
@@ -143,10 +142,9 @@ def test_questions_go_on(
 
 
 def test_what_only_the_primary_had_is_not_lost(
-    members: ReplicaSet, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    members: ReplicaSet, log: Path, tmp_path: Path, calls: Calls
 ) -> None:
     """Writes that are acknowledged by the primary alone, as the URI wants, are taken back."""
-    insert = Database._insert_batch
     uri = members.uri("weak", "&w=1")
     killer: list[threading.Thread] = []
 
@@ -157,15 +155,14 @@ def test_what_only_the_primary_had_is_not_lost(
         primary.kill()
         members.resume()
 
-    def alone(self: Database, collection: str, *arguments: object, **options: object) -> int:
+    def alone(_: Database, collection: str, *__: object, **___: object) -> None:
         if not killer:
             primary = members.stop_secondaries()
             killer.append(threading.Thread(target=kill_when_written, args=(primary, collection)))
             killer[0].start()
-        return insert(self, collection, *arguments, **options)
 
     with hl.open(tmp_path / "store", create=True, mongo=uri, require_database=True) as store:
-        monkeypatch.setattr(Database, "_insert_batch", alone)
+        calls(Database, "_insert_batch", alone)
         report = store.record(log)
         killer[0].join()
         assert report.failure is None

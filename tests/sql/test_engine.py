@@ -258,9 +258,9 @@ def test_a_query_is_parsed_once(
         own.sql(f"{query} and angle > 1")
     monkeypatch.undo()
     limit(sql_trees=2)
-    for limit in range(5):
-        assert len(own.sql(f"select angle from scan limit {limit}").rows()) == limit
-    assert list(trees) == [f"select angle from scan limit {limit}" for limit in (3, 4)]
+    for most in range(5):
+        assert len(own.sql(f"select angle from scan limit {most}").rows()) == most
+    assert list(trees) == [f"select angle from scan limit {most}" for most in (3, 4)]
     limit(sql_tree_size=10)
     own.sql("select t from scan").rows()
     assert len(trees) == 2

@@ -17,6 +17,7 @@ from hybridlog_storage.disk import append_file, durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Buffer
+from tests.calls import Calls
 from tests.storage.steps import Steps, through
 
 Refusal = Callable[[pytest.MonkeyPatch], None]
@@ -153,7 +154,12 @@ class Full(files.System):
 @pytest.mark.parametrize("can_cut", [True, False])
 @pytest.mark.parametrize("before", [0, 100, BLOCK, 5000, 2 * BLOCK])
 def test_what_is_appended_after_a_failed_write_stands_behind_what_was_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Refusal, can_cut: bool, before: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    calls: Calls,
+    refusal: Refusal,
+    can_cut: bool,
+    before: int,
 ) -> None:
     """Once there is room again; also where the system did not even cut the file."""
     path = tmp_path / "file"
@@ -161,13 +167,9 @@ def test_what_is_appended_after_a_failed_write_stands_behind_what_was_whole(
     file = AppendFile.create(path)
     file.append([b"a" * before])
     system = Full()
-    monkeypatch.setattr(files, "system", system)
+    calls.system(system)
     if not can_cut:
-
-        def refuse(*_: object) -> None:
-            raise OSError(errno.EIO, "no")
-
-        monkeypatch.setattr(system, "truncate", refuse, raising=True)
+        calls.fail(system, "truncate", OSError(errno.EIO, "no"))
     system.full = True
     for _ in range(2):
         with pytest.raises(OSError, match="full") as caught:
@@ -177,7 +179,7 @@ def test_what_is_appended_after_a_failed_write_stands_behind_what_was_whole(
     assert path.read_bytes()[:before] == b"a" * before
     system.full = False
     file.append([b"c" * 10])
-    monkeypatch.setattr(files, "system", files.System())
+    calls.system(files.System())
     file.append([b"d" * 20])
     file.finish(sync=False)
     assert path.read_bytes() == b"a" * before + b"c" * 10 + b"d" * 20

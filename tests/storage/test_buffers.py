@@ -16,21 +16,16 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from hybridlog_storage import buffers as module
 from hybridlog_storage.buffers import SLAB, Buffers
+from tests.calls import Calls
 
 SIZE = 1 << 20
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def made(calls: Calls) -> list[int]:
     """Bytes of each buffer that the system was asked for."""
     asked: list[int] = []
-    new = module.new_memory
-
-    def count(size: int) -> mmap.mmap:
-        asked.append(size)
-        return new(size)
-
-    monkeypatch.setattr(module, "new_memory", count)
+    calls(module, "new_memory", asked.append)
     return asked
 
 

@@ -30,7 +30,7 @@ from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.compression import Compressor, FilePart
 from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_check import SegmentCheck
@@ -52,6 +52,7 @@ from hybridlog_storage.segments.segment_format import (
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, postpone
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.storage.steps import Steps, through
 
@@ -421,20 +422,16 @@ def test_a_segment_has_no_more_chunks_than_a_summary_should(tmp_path: Path, limi
     assert all(10 <= count < 10 + AT_WORK for count in chunks[:-1])
 
 
-def test_chunks_that_wait_are_written_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_that_wait_are_written_together(tmp_path: Path, calls: Calls) -> None:
     go_on = threading.Event()
     together: list[int] = []
-    append_chunks = SegmentFile.append_chunks
 
-    def wait(segment: SegmentFile, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
-        assert go_on.wait(60)
-        stored = append_chunks(segment, chunks, end)
+    def noted(stored: list[StoredChunk], *_: object) -> list[StoredChunk]:
         together.append(len(stored))
         return stored
 
-    monkeypatch.setattr(SegmentFile, "append_chunks", wait)
+    calls.change(SegmentFile, "append_chunks", noted)
+    calls(SegmentFile, "append_chunks", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
     setup = SegmentSettings(chunk_size=100_000, compression="none", segment_size=1_000_000)
     chunks: list[StoredChunk] = []
     writer = RecordingWriter(
@@ -487,14 +484,14 @@ def test_waiting_for_chunks_ends_when_a_signal_asks_for_it(tmp_path: Path) -> No
     assert flushed == []
 
 
-def test_no_chunk_follows_one_that_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
     failing = threading.Event()
 
     def full(*_: object) -> None:
         failing.wait()
         raise DiskFullError("There is no room.")
 
-    monkeypatch.setattr(SegmentFile, "append_chunks", full)
+    calls(SegmentFile, "append_chunks", full)
     writer = RecordingWriter(
         tmp_path,
         RECORDING,

@@ -95,7 +95,7 @@ def test_tables_of_an_imported_recording(few: hl.Store, tmp_path: Path, server: 
         assert contents(other).keys() == contents(few).keys()
 
 
-def test_a_mark_changes_no_other_table(few: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mark_changes_no_other_table(few: hl.Store) -> None:
     before = contents(few)
     few.mark("few", BASE + 5, "here")
     few.connect()
@@ -247,11 +247,9 @@ def test_rows_of_a_lost_segment_are_made_again_once(store: hl.Store, tmp_path: P
     assert contents(store) == before
 
 
-def test_a_store_that_cannot_be_written_makes_none(
-    few: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_cannot_be_written_makes_none(few: hl.Store, limit: Limit) -> None:
     (entry,) = few.recordings()
-    monkeypatch.setattr(type(few.directory), "is_writable", False)
+    limit(directory_is_writable=False)
     shutil.rmtree(few.directory.path / TABLES)
     assert not making.make(few.directory, entry)
     assert not folders(few)

@@ -26,6 +26,7 @@ from hybridlog.columns.topic_table import TopicTable, _merged
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.some import in_turn
 from tests.tables import ask
@@ -116,7 +117,7 @@ def test_ranges_of_time(recorded: hl.Store, topic: str, bounds: list[int]) -> No
 
 
 def test_row_groups_out_of_range_are_not_read(
-    recorded: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    recorded: hl.Store, tmp_path: Path, calls: Calls, limit: Limit
 ) -> None:
 
     limit(table_group_rows=100, long_table_rows=1000)
@@ -124,25 +125,17 @@ def test_row_groups_out_of_range_are_not_read(
     making.make(recorded.directory, entry, ["/large"])
     table = table_of(recorded)
     assert table.files[0].groups == 12
-    read: list[int | None] = []
-    real = ParquetFileReader.read
-
-    def seen(file: ParquetFileReader, group: int | None, leaves: Any) -> Any:
-        if group is not None:
-            read.append(group)
-        return real(file, group, leaves)
-
-    monkeypatch.setattr(ParquetFileReader, "read", seen)
+    read = calls(ParquetFileReader, "read")
     bounds = table.files[0].about.bounds
     assert sum(map(len, table.scan(spans=[(bounds[5][1], bounds[5][1] + 1)]))) >= 1
-    assert set(read) <= {4, 5}
+    assert {group for _, group, _ in read} <= {4, 5, None}
     for rows, *_, last, _ in bounds:  # the last one of a row group begins the range
         found = [block.t.tolist() for block in table.scan(spans=[(last, last + 10)])]
         assert rows
         assert last in found[0]
     read.clear()
     assert sum(map(len, table.scan(spans=[(0, 1)]))) == 0
-    assert not read
+    assert {group for _, group, _ in read} <= {None}
     assert sum(map(len, table.scan(spans=[]))) == 0
 
 
@@ -338,15 +331,13 @@ def test_a_running_recording_has_no_answer_yet(store: hl.Store, tmp_path: Path) 
     del recording
 
 
-def test_what_is_found_is_remembered(
-    recorded: hl.Store, tables: Tables, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_found_is_remembered(recorded: hl.Store, tables: Tables, calls: Calls) -> None:
     (entry,) = recorded.recordings()
     table = tables.of(entry, "/large")
     assert table is not None
     assert tables.of(entry, "/large") is table
     before = list(table.scan(["i8"]))
-    monkeypatch.setattr(ParquetFileReader, "read", None)  # is not needed
+    calls.fail(ParquetFileReader, "read", AssertionError)
     assert [b.records.equals(a.records) for a, b in zip(before, table.scan(["i8"]), strict=True)]
     tables.invalidate()
     assert tables.of(entry, "/large") is not table

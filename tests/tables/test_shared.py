@@ -20,6 +20,7 @@ from hybridlog.query.predicate import to_mask as deciding
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Schema
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.tables.logs import BASE, SECOND, STATE, varied, write_log
 from tests.tables.test_writer import compare, files_of
@@ -41,26 +42,24 @@ def several(store: hl.Store, tmp_path: Path) -> hl.Store:
     return store
 
 
-def opened_files(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def opened_files(calls: Calls) -> list[Path]:
     """Tables that are opened from now on."""
     found: list[Path] = []
-    real = files.open_file
 
-    def seen(path: Path, *arguments: Any, **options: Any) -> int:
+    def seen(path: Path, *_: Any, **__: Any) -> None:
         if path.suffix == ".parquet":
             found.append(path)
-        return real(path, *arguments, **options)
 
-    monkeypatch.setattr(files, "open_file", seen)
+    calls(files, "open_file", seen)
     return found
 
 
 def test_a_file_is_opened_once_for_all_its_recordings_and_topics(
-    several: hl.Store, monkeypatch: pytest.MonkeyPatch
+    several: hl.Store, calls: Calls
 ) -> None:
     assert len(files_of(several)) == 1
     several.refresh()
-    opened = opened_files(monkeypatch)
+    opened = opened_files(calls)
     query = several.query(["/a", "/b"]).where("i8 > 0")
     assert query.count() == COUNT * 12
     assert opened == files_of(several)
@@ -70,17 +69,9 @@ def test_a_file_is_opened_once_for_all_its_recordings_and_topics(
     assert not opened
 
 
-def test_a_predicate_is_evaluated_once_for_a_file(
-    several: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_predicate_is_evaluated_once_for_a_file(several: hl.Store, calls: Calls) -> None:
     decided: list[int] = []
-    real = deciding.to_mask
-
-    def seen(predicate: Any, types: Any, records: Any) -> Any:
-        decided.append(len(records))
-        return real(predicate, types, records)
-
-    monkeypatch.setattr(deciding, "to_mask", seen)
+    calls(deciding, "to_mask", lambda _, __, records: decided.append(len(records)))
     assert several.query(["/a", "/b"]).where("i8 > 0").count() == COUNT * 12
     assert decided == [COUNT * 30]
 
@@ -99,7 +90,7 @@ def test_long_arrays_of_another_recording_change_no_count(
 
 
 def test_more_files_than_may_be_open(
-    several: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    several: hl.Store, tmp_path: Path, calls: Calls, limit: Limit
 ) -> None:
     """A file is closed, but what is known of it stays."""
     limit(long_table_rows=20)
@@ -110,7 +101,7 @@ def test_more_files_than_may_be_open(
     assert len(files_of(several)) == 13
     query = several.query(["/a", "/b"]).where("i8 > 0")
     want = query.count()
-    opened = opened_files(monkeypatch)
+    opened = opened_files(calls)
     assert query.count() == want
     assert not opened
     assert several.query(["/a", "/b"]).where("f64 < 5").count() > 0
@@ -155,11 +146,9 @@ def lists_of(store: hl.Store) -> list[Path]:
     return sorted((store.directory.path / "tables").glob(".*.recordings"))
 
 
-def test_other_shared_files_are_not_opened(
-    apart: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_shared_files_are_not_opened(apart: hl.Store, calls: Calls) -> None:
     one, two, _ = files_of(apart)
-    opened = opened_files(monkeypatch)
+    opened = opened_files(calls)
     assert apart.query(["/a"], ["r1"]).where("i8 > 0").count() == 6
     assert set(opened) == {one}
     opened.clear()
@@ -170,7 +159,7 @@ def test_other_shared_files_are_not_opened(
 
 @pytest.mark.parametrize("harm", ["lost", "cut", "changed"])
 def test_lists_of_shared_files_that_are_lost_or_damaged(
-    apart: hl.Store, monkeypatch: pytest.MonkeyPatch, harm: str
+    apart: hl.Store, calls: Calls, harm: str
 ) -> None:
     """Then all shared files are opened: nothing is missed, or left by a removal."""
     (path,) = lists_of(apart)
@@ -181,7 +170,7 @@ def test_lists_of_shared_files_that_are_lost_or_damaged(
     else:
         path.write_bytes(path.read_bytes().replace(b"shared-000002", b"shared-000001"))
     removed = apart.entry("r8").id
-    opened = opened_files(monkeypatch)
+    opened = opened_files(calls)
     assert apart.query(["/a"], ["r8"]).where("i8 > 0").count() == 6
     assert set(opened) == set(files_of(apart))
     apart.remove("r8")
@@ -200,20 +189,13 @@ def test_lists_go_with_their_folders(several: hl.Store) -> None:
 
 
 def test_folders_are_read_once_for_all_recordings_without_tables(
-    several: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    several: hl.Store, calls: Calls, limit: Limit
 ) -> None:
     (path,) = files_of(several)
     path.unlink()
     limit(settled_ns=-1)
     entries = list(several.recordings())
-    read: list[int] = []
-    real = files.names_in
-
-    def seen(fd: int) -> Any:
-        read.append(fd)
-        return real(fd)
-
-    monkeypatch.setattr(files, "names_in", seen)
+    read = calls(files, "names_in")
     tables = Tables(several.directory.path)
     assert all(tables.of(one, topic) is None for one in entries for topic in ("/a", "/b"))
     assert len(read) == 2  # all folders, and this one

@@ -26,6 +26,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.data import DATA, needs_data
 from tests.limits import Limit
 from tests.some import each
@@ -394,19 +395,21 @@ ERRORS = [MemoryError(), ValueError("odd"), OSError(errno.EIO, "no"), OSError(er
 @pytest.mark.parametrize("error", ERRORS, ids=lambda e: f"{type(e).__name__} {e}")
 @pytest.mark.parametrize("place", ["add", "write", "close", "publish"])
 def test_whatever_fails_the_recording_goes_on(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, error: Exception
+    store: hl.Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    calls: Calls,
+    place: str,
+    error: Exception,
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise error
-
     if place == "add":
-        monkeypatch.setattr(TableWriter, "_collect", fail)
+        calls.fail(TableWriter, "_collect", error)
     elif place == "publish":
-        monkeypatch.setattr(TableFolders, "_change", fail)
+        calls.fail(TableFolders, "_change", error)
     else:
         from hybridlog.columns.parquet_file import ParquetFileWriter
 
-        monkeypatch.setattr(ParquetFileWriter, place, fail)
+        calls.fail(ParquetFileWriter, place, error)
     said = [(BASE + n, "/large" if n % 50 else "/small", varied(n)) for n in range(1500)]
     write_log(tmp_path / "log.mcap", said)
     assert store.record(tmp_path / "log.mcap", name="log").entry.status == "complete"
@@ -432,9 +435,14 @@ class FullDisk(files.System):
 
 @pytest.mark.parametrize("room", [0, *each(4_000, 36_000), 24_000])
 def test_a_disk_that_fills_up(
-    store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, room: int
+    store: hl.Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    calls: Calls,
+    limit: Limit,
+    room: int,
 ) -> None:
-    monkeypatch.setattr(files, "system", FullDisk(room))
+    calls.system(FullDisk(room))
     limit(table_pending_bytes=80_000, table_left_bytes=20_000)
     said = [(BASE + n, f"/{n % 4}", varied(n)) for n in range(2400)]
     write_log(tmp_path / "log.mcap", said)

@@ -21,6 +21,7 @@ from hybridlog.view.routes import ask
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
 from hybridlog_storage.messages import Channel
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.view.conftest import PORT, ROBOT, TOKEN, served
 from tests.view.test_ask import asked_for
@@ -28,8 +29,6 @@ from tests.view.test_ask import asked_for
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-    from hybridlog.view.params import RequestParams
-    from hybridlog.view.question import PageQuestion
 
 S = 10**9
 MS = 10**6
@@ -185,17 +184,9 @@ def running(tmp_path: Path) -> Iterator[hl.Store]:
 
 
 @pytest.mark.peer("browser")
-def test_updates_do_not_starve_a_question(
-    running: hl.Store, page: Page, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_updates_do_not_starve_a_question(running: hl.Store, page: Page, calls: Calls) -> None:
     """An answer that takes longer than the time from one update to the next comes, and again."""
-    question_of = ask.question_of
-
-    def slow(context: context.Context, asked: RequestParams) -> PageQuestion:
-        time.sleep(1.2)
-        return question_of(context, asked)
-
-    monkeypatch.setattr(ask, "question_of", slow)
+    calls(ask, "question_of", lambda *_: time.sleep(1.2))
     page.set_default_timeout(60_000)
     while not running.summaries() or not running.entry("live").messages:
         time.sleep(0.1)

@@ -20,7 +20,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.view import loopback
-from hybridlog.view.server import ROUTES, BoundedConnection
+from hybridlog.view.server import ROUTES
+from tests.limits import Limit
 from tests.view.conftest import served
 
 if TYPE_CHECKING:
@@ -402,11 +403,9 @@ def _refused(door: Door, raw: bytes) -> bool:
     return heard.startswith(b"HTTP/1.1 400 ")
 
 
-def test_connections_that_only_wait_are_closed(
-    demo_store: hl.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_connections_that_only_wait_are_closed(demo_store: hl.Store, limit: Limit) -> None:
     """Those without a request, with part of one, and with an endless body after the answer."""
-    monkeypatch.setattr(BoundedConnection, "patience_s", 0.5)
+    limit(connection_patience_s=0.5)
     with served(demo_store) as url:
         parts = urlsplit(url)
         assert parts.port is not None

@@ -27,6 +27,7 @@ from hybridlog.live.sources.foxglove.protocol import PeerError, parse_channel
 from hybridlog.live.sources.foxglove.source import FoxgloveSource
 from hybridlog_storage.errors import MissingDependencyError, UsageError
 from hybridlog_storage.messages import Schema
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import DEADLINE_S, Heard, must_return
 
@@ -195,10 +196,9 @@ class Server:
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch, limit: Limit) -> Iterator[None]:
+def _quick(limit: Limit) -> Iterator[None]:
     """Look more often and try again sooner; and nothing is left behind."""
-    for module in (foxglove_handshake, foxglove_connection):
-        monkeypatch.setattr(module, "TICK_S", 0.02)
+    limit(foxglove_handshake_tick_s=0.02, foxglove_tick_s=0.02)
     limit(foxglove_pauses_s=(0.02, 0.05))
     yield
     assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
@@ -886,7 +886,7 @@ def test_a_flood_does_not_hold_up_the_end() -> None:
     assert heard.said == []
 
 
-def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, calls: Calls) -> None:
     seen: list[object] = []
     monkeypatch.setattr(threading, "excepthook", lambda args: seen.append(args.exc_value))
 
@@ -894,11 +894,8 @@ def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         peer.send(message(peer.offer(channel())[1], 0, b"1"))
         peer.wait()
 
-    def fails(*_: object, **__: object) -> None:
-        raise RuntimeError("no more")
-
     heard = Heard()
-    monkeypatch.setattr(heard, "take", fails)
+    calls.fail(heard, "take", RuntimeError("no more"))
     with Server(script) as server, FoxgloveSource(server.url) as source:
         source.start(heard)
         heard.until(lambda h: h.ends)

@@ -20,6 +20,7 @@ from hybridlog.live.sources.replay_order import Lookahead, Rows
 from hybridlog_storage.errors import SourceError, UsageError
 from hybridlog_storage.messages import Batch, Channel
 from tests import independent
+from tests.calls import Calls
 from tests.data import DATA, needs_data
 from tests.limits import Limit
 from tests.live.sources.heard import Heard, must_return
@@ -201,16 +202,10 @@ def test_nothing_comes_before_its_time(
         assert -1e-6 <= late <= replay._MIN_PAUSE_S + 1e-6
 
 
-def test_many_small_messages_do_not_cost_a_pause_each(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_small_messages_do_not_cost_a_pause_each(tmp_path: Path, calls: Calls) -> None:
     count = 5000
     path = write(tmp_path / "a.mcap", [("/a", BEGIN + at * 100_000, b"") for at in range(count)])
-    pauses = []
-    pause = replay._Player._pause
-    monkeypatch.setattr(
-        replay._Player, "_pause", lambda *given: (pauses.append(1), pause(*given))[1]
-    )
+    pauses = calls(replay._Player, "_pause")
     heard = Heard()
     play(path, heard, speed=1.0)
     assert len(heard.taken) == count
@@ -404,16 +399,15 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
         source.stop()
 
 
-def test_a_sink_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sink_that_fails_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
+) -> None:
     seen: list[object] = []
     monkeypatch.setattr(threading, "excepthook", lambda given: seen.append(given.exc_value))
     path = write(tmp_path / "a.mcap", [("/a", BEGIN, b"x")])
 
-    def fails(*_: object, **__: object) -> None:
-        raise RuntimeError("no more")
-
     heard = Heard()
-    monkeypatch.setattr(heard, "take", fails)
+    calls.fail(heard, "take", RuntimeError("no more"))
     with ReplaySource(path) as source:
         source.start(heard)
         heard.until(lambda h: h.ends)
