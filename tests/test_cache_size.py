@@ -12,7 +12,7 @@ from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.settings import read_settings
 from tests.cli.running import run
 from tests.many_topics import mongod_of, write_log
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 
 @pytest.fixture(autouse=True)

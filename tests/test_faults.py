@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -42,6 +41,7 @@ from tests.calls import Calls
 from tests.cli import running
 from tests.some import in_turn
 from tests.storage.chunk_entries import chunk_entries
+from tests.waiting import wait_for
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
 LIMIT_S = 120
@@ -131,13 +131,6 @@ def run(
     assert "Traceback" not in done.stderr, done.stderr
     assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
     return done
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.001)
 
 
 # A recorder that is killed.

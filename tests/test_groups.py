@@ -14,8 +14,8 @@ from hybridlog.demo.write import write_bag
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.sharing import make_shared
 from hybridlog_storage.settings import StoreSettings, write_settings
-from tests.cli.running import wait_for
 from tests.other_user import User, needs_root, open_place
+from tests.waiting import wait_for
 
 LAB = 23456  # a group that nobody has to know
 

@@ -44,6 +44,7 @@ from tests.calls import Calls
 from tests.cli.running import run
 from tests.damage import WAYS
 from tests.limits import Limit
+from tests.waiting import wait_for
 
 TOPICS = ["/imu/data", "/base/scan", "/joint_states"]
 IMU, SCAN = TOPICS[:2]
@@ -78,13 +79,6 @@ def pids(store: Path) -> list[int]:
             if any(str(store / "mongod") in part for part in process.cmdline()):
                 found.append(process.pid)
     return found
-
-
-def wait_for(condition: Callable[[], object], limit_s: float = 30) -> None:
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
 
 
 def ended(store: Path) -> None:

@@ -23,7 +23,8 @@ from hybridlog.demo.write import write_bag
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.mongo import mongod_keeper
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
-from tests.cli.running import run, wait_for
+from tests.cli.running import run
+from tests.waiting import wait_for
 
 OLD = 1_000_000_000  # a time of reading that any reading changes
 

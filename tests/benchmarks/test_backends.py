@@ -29,7 +29,8 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo import mongod
 from hybridlog_storage.mongo.collection_names import collection_of
 from tests.imports import ROOT
-from tests.test_faults import kill_mongod, wait_for
+from tests.test_faults import kill_mongod
+from tests.waiting import wait_for
 
 KEEPING = [name for name in BACKENDS if name != "nothing"]
 START = 1_436_866_013_589_000_000

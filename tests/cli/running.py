@@ -6,8 +6,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,14 +92,20 @@ def complete(words: str) -> list[str]:
     return [line.partition(",")[2] for line in ended.stdout.splitlines() if line]
 
 
+def forked() -> list[str]:
+    """`COMMAND` for those that nobody kills: forked from a process with all of its imports."""
+    return [str(fork_server().path / "hybridlog")]
+
+
 @contextmanager
 def started(
-    *arguments: object, output: Path, wrapper: Sequence[str] = ()
+    *arguments: object, output: Path, wrapper: Sequence[str] = (), is_killed: bool = False
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A running command, killed if it has not ended; both of its streams go to a file."""
+    command = COMMAND if is_killed else forked()
     with output.open("ab") as file:
         process = subprocess.Popen(
-            [*wrapper, *COMMAND, *map(str, arguments)],
+            [*wrapper, *command, *map(str, arguments)],
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,
@@ -111,14 +116,6 @@ def started(
     finally:
         process.kill()
         process.wait()
-
-
-def wait_for(condition: Callable[[], object], limit_s: float = 60) -> None:
-    """Wait until something is the case."""
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.002)
 
 
 def open_bytes(store: Path) -> int:

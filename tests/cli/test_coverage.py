@@ -11,8 +11,9 @@ import hybridlog as hl
 from hybridlog.live.control_server import ControlServer
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.waiting import wait_for
 
-from .running import run, wait_for
+from .running import run
 
 BEGIN_NS = 1_750_000_000_000_000_000
 SECOND_NS = 10**9

@@ -12,8 +12,9 @@ pytest.importorskip("websockets", reason="websockets is not installed: no playba
 
 from tests.independent import Seen, read_bag
 from tests.view.playback.viewer import Viewer
+from tests.waiting import wait_for
 
-from .running import run, started, wait_for
+from .running import run, started
 
 
 def test_it_plays_until_ctrl_c(logs: Path, store: Path, tmp_path: Path) -> None:

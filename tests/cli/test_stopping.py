@@ -19,6 +19,7 @@ from hybridlog.cli.signals import SIGNALS
 from hybridlog_storage.mongo.mongod import find_mongod
 from tests.calls import Calls
 from tests.independent import read_bag
+from tests.waiting import wait_for
 
 from .running import (
     BACKGROUND,
@@ -28,7 +29,6 @@ from .running import (
     recordings,
     run,
     started,
-    wait_for,
 )
 
 Server = tuple[str, subprocess.Popen[bytes]]
@@ -72,7 +72,9 @@ def test_the_second_ctrl_c_waits_for_the_first(logs: Path, fresh: Path, tmp_path
 
 def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_path: Path) -> None:
     with started(
-        "record", logs / "robot.bag", "--store", fresh, *SLOW, output=tmp_path / "out"
+        *("record", logs / "robot.bag", "--store", fresh, *SLOW),
+        output=tmp_path / "out",
+        is_killed=True,
     ) as process:
         wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 200_000)
         process.kill()

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from hybridlog.demo.write import write_bag
+from tests.waiting import wait_for
 
-from .running import environment, run, wait_for
+from .running import environment, run
 
 BLOCKED = """
 import sys

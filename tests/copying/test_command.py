@@ -14,10 +14,11 @@ from hybridlog.schema.states import State
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
 from hybridlog_storage.errors import PayloadError
-from tests.cli.running import run, started, wait_for
+from tests.cli.running import run, started
 from tests.cli.within import answer
 from tests.copying.conftest import answers
 from tests.json_schemas import misfit, schema_of
+from tests.waiting import wait_for
 
 HYBRIDLOG = f"{sys.executable} -m hybridlog"
 _SSH = """

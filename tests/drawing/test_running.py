@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -18,6 +17,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.odd_messages import MS, START
+from tests.waiting import wait_for
 
 SAID = Channel("/said", "json", Schema("foxglove.Log", "jsonschema", b"{}"))
 OTHER = Channel("/other", "json", None)
@@ -50,10 +50,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LiveReco
         for n in range(COUNT):
             recording.write(SAID, json.dumps(message(n)).encode(), log_time=time_of(n))
             recording.write(OTHER, b"{}", log_time=time_of(n))
-        until = time.monotonic() + 60
-        while store.entry("live").messages < 2 * COUNT:
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        wait_for(lambda: store.entry("live").messages >= 2 * COUNT)
         assert store.entry("live").flushed
         assert store.entry("live").digests
         yield recording, store

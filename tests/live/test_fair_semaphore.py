@@ -6,7 +6,7 @@ import threading
 import time
 
 from hybridlog.live.recording import FairSemaphore
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 
 def test_no_more_threads_than_the_limit_are_inside() -> None:

@@ -18,8 +18,9 @@ import hybridlog as hl
 from hybridlog.live import LiveOptions
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
-from tests.cli.running import COMMAND, complete, environment, run
+from tests.cli.running import COMMAND, complete, environment, forked, run
 from tests.live.robot import Robot, robot
+from tests.waiting import wait_for
 
 NOWHERE = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=200"
 
@@ -32,10 +33,7 @@ def path(tmp_path: Path) -> Path:
 
 def wait_until_flushed(store: hl.Store, count: int) -> None:
     """Wait until so many messages are flushed."""
-    deadline = time.monotonic() + 60
-    while sum(one.messages for one in store.summaries()) < count:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for(lambda: sum(one.messages for one in store.summaries()) >= count)
 
 
 class Followed:
@@ -58,10 +56,7 @@ class Followed:
 
     def wait(self, lines: int) -> list[str]:
         """Wait until so many lines have come."""
-        deadline = time.monotonic() + 60
-        while len(self.lines) < lines:
-            assert time.monotonic() < deadline, self.lines
-            time.sleep(0.02)
+        wait_for(lambda: len(self.lines) >= lines)
         return self.lines
 
     def ended(self) -> int:
@@ -80,7 +75,7 @@ class Followed:
 @contextmanager
 def follow(store: Path, *arguments: object) -> Iterator[Followed]:
     """`hybridlog fetch --follow`."""
-    command = [*COMMAND, "fetch", "--store", str(store), "--follow", *map(str, arguments)]
+    command = [*forked(), "fetch", "--store", str(store), "--follow", *map(str, arguments)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()
     ) as process:
@@ -332,9 +327,6 @@ def test_a_range_that_is_past_ends_it(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True) as store, store.start("live", options) as rec:
         for second in range(5):
             rec.write(channel, b'{"n": 1}', log_time=second * 10**9)
-        deadline = time.monotonic() + 30
-        while not store.topics() or store.topic("past").count() < 5:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        wait_for(lambda: store.topics() and store.topic("past").count() >= 5)
         found = [m.log_time_ns for m in store.topic("past").between(10**9, 3 * 10**9).follow()]
     assert found == [10**9, 2 * 10**9]

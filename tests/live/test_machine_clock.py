@@ -19,7 +19,7 @@ from hybridlog.record.losses import Cause
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.messages import Channel
 from tests.live.speaker import TEXT, Speaker, text, text_channel
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 SECOND = 10**9
 YEAR = 365 * 86_400 * SECOND

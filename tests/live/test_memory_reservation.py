@@ -20,7 +20,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.test_recording import channel, text
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 SIZE = 1 << 18
 BUDGET = 128 * SIZE

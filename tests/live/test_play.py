@@ -34,7 +34,7 @@ from tests.live.speaker import Speaker
 from tests.live.test_killed import FLUSH_S, SLACK_S
 from tests.live.test_machine_clock import BOOT, NOW, Clock
 from tests.live.test_retention import NOISE, store_with
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 SECOND = 10**9
 BLOB = Schema("a/Blob", "ros1msg", b"uint32 n\nfloat64 x\nbool pressed\nuint8[] data\n")

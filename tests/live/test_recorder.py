@@ -47,7 +47,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 SECOND = 1_000_000_000
 FREE = RecorderOptions(reserve_bytes=0)

@@ -40,7 +40,8 @@ from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, 
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import must_return
-from tests.test_faults import kill_mongod, wait_for
+from tests.test_faults import kill_mongod
+from tests.waiting import wait_for
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 Seen = tuple[str, int, int, bytes]

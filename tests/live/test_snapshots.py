@@ -24,7 +24,7 @@ from hybridlog.record.marks import MARKS
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.speaker import TEXT, Speaker, scan, scan_channel, text, text_channel
-from tests.test_faults import wait_for
+from tests.waiting import wait_for
 
 SECOND = 1_000_000_000
 T = 1_700_000_000 * SECOND

@@ -15,6 +15,7 @@ from hybridlog.record.losses import Cause
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.running.methods import LABEL, TAGS
 from tests.running.sequence import CHANNELS, SECOND, START, Known, Sent, messages
+from tests.waiting import wait_for
 
 SETTINGS = {
     "one": SegmentSettings(chunk_size=8192, sync="never"),
@@ -79,10 +80,7 @@ class Running:
     def flushed(self, limit_s: float = 60) -> Known:
         """Wait until everything is in the files and the index; return what is there."""
         self.seen_by(self.before, limit_s)
-        until = time.monotonic() + limit_s
-        while self.recording.lag:
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        wait_for(lambda: not self.recording.lag)
         return Known(self.sent)
 
     def seen_by(self, store: hl.Store, limit_s: float = 60) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +24,7 @@ from tests.drawing.test_mp4 import read as read_mp4
 from tests.drawing.test_video import JSON, encoded, payload
 from tests.odd_messages import ros_channel
 from tests.ros_values import ROS2
+from tests.waiting import wait_for
 
 SECOND, MS = 10**9, 10**6
 START = 1_748_937_600 * SECOND
@@ -127,10 +127,7 @@ class Jobs:
             live = store.start("run", settings=settings, flush_interval_s=0.05)
             write(live)
             with hl.open(self.path, mongo="none") as reader:
-                until = time.monotonic() + 60
-                while reader.entry("run").messages < 174:
-                    assert time.monotonic() < until, reader.entry("run").messages
-                    time.sleep(0.05)
+                wait_for(lambda: reader.entry("run").messages >= 174)
             (self.path / "contract.yaml").write_text("topics: {}\n")
             shutil.copytree(self.path, self.copy, ignore=shutil.ignore_patterns("*.sock"))
             live.close()

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from hybridlog.maintenance.expiry import expire
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
-from tests.cli.running import complete, wait_for
+from tests.cli.running import complete
 from tests.cli.within import answer
 from tests.imports import ROOT
 from tests.limits import Limit
@@ -27,6 +26,7 @@ from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import SAID, START, Known, messages
 from tests.running.stores import copy_of
 from tests.scale.cost import cost_of
+from tests.waiting import wait_for
 
 ABOUT_LOSSES = {"completeness", "remarks"}
 """What a crash has cost is lost, too."""
@@ -145,10 +145,7 @@ def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.Monkey
         assert process.stdout is not None
         assert process.stdout.readline() == "begun\n"
         with hl.open(path, mongo=NO_MONGODB) as before:
-            until = time.monotonic() + 60
-            while before.entry(LABEL).messages < 300:
-                assert time.monotonic() < until
-                time.sleep(0.01)
+            wait_for(lambda: before.entry(LABEL).messages >= 300)
             least = before.entry(LABEL).messages_by_topic()
             process.send_signal(signal.SIGKILL)
             process.wait()

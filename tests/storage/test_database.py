@@ -35,6 +35,7 @@ from hybridlog_storage.mongo.database import (
 )
 from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
 from tests.limits import Limit
+from tests.waiting import wait_for
 
 NUMBERS = count()
 
@@ -55,10 +56,7 @@ def mongod(runtime: Path) -> Iterator[EmbeddedMongod]:
 
 
 def wait_for_end(directory: Path) -> None:
-    deadline = time.monotonic() + 20
-    while (directory / "mongod.json").exists():
-        assert time.monotonic() < deadline, "mongod outlived its users"
-        time.sleep(0.02)
+    wait_for(lambda: not (directory / "mongod.json").exists())
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import HybridlogError, ResourceError, StoreError
 from hybridlog_storage.stopping import GivenUpError, check_wanted, until_given_up
 from tests.imports import ROOT
+from tests.waiting import wait_for
 
 if TYPE_CHECKING:
     from starlette.testclient import TestClient
@@ -82,10 +83,11 @@ def process(demo_store: hl.Store) -> SqlProcess:
 
 
 def assert_ends(number: int) -> None:
-    until = time.monotonic() + LIMIT_S
-    while psutil.pid_exists(number) and psutil.Process(number).status() != psutil.STATUS_ZOMBIE:
-        assert time.monotonic() < until, "it runs on"
-        time.sleep(0.02)
+    wait_for(
+        lambda: (
+            not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE
+        )
+    )
 
 
 def process_of(client: TestClient) -> SqlProcess:

@@ -30,6 +30,7 @@ from hybridlog_storage.messages import Schema
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import DEADLINE_S, Heard, must_return
+from tests.waiting import wait_for
 
 pytest.importorskip(
     "websockets", reason="websockets is not installed: nothing of the Foxglove source is tested"
@@ -1035,10 +1036,7 @@ def plain(sdk: Any, topic: str, context: Any) -> Any:
 
 def subscribed(heard: Heard, channels: dict[str, Any]) -> None:
     heard.until(lambda h: {t[0] for t in h.topics} >= set(channels))
-    deadline = time.monotonic() + DEADLINE_S
-    while not all(each.has_sinks() for each in channels.values()):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: all(each.has_sinks() for each in channels.values()))
 
 
 def until_taken(heard: Heard, log: Callable[[], None], topic: str, payload: bytes) -> None:
