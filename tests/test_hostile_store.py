@@ -214,33 +214,33 @@ def planted(template: Path, tmp_path: Path, name: str, target: Path) -> Path:
     return store
 
 
-@pytest.mark.parametrize("kind", FILES)
-def test_a_file_that_leads_out(
-    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
+LEADS = pytest.mark.parametrize("leads", ["out", "to nothing"])
+
+
+@LEADS
+@pytest.mark.parametrize("kind", [*FILES, *FOLDERS])
+def test_a_place_that_leads_elsewhere(
+    template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
 ) -> None:
-    name = FILES[kind]
     victims = Victims(tmp_path / "victims")
+    name = {**FILES, **FOLDERS}[kind]
     original = template / name
-    content = original.read_bytes() if original.is_file() else b"precious"
-    store = planted(template, tmp_path, name, victims.file(content))
+    if leads == "to nothing":
+        target = victims.place / "new"
+    elif kind in FILES:
+        target = victims.file(original.read_bytes() if original.is_file() else b"precious")
+    else:
+        target = victims.folder(
+            template / "recordings/small" if "recording" in kind[1:] else original
+        )
+    store = planted(template, tmp_path, name, target)
     victims.watch()
-    use(store, database(server, f"file{list(FILES).index(kind)}"), bag)
+    use(store, database(server, f"{[*FILES, *FOLDERS].index(kind)}{leads[0]}"), bag)
     victims.check()
 
 
-@pytest.mark.parametrize("kind", FILES)
-def test_a_file_that_leads_to_nothing(
-    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
-) -> None:
-    victims = Victims(tmp_path / "victims")
-    store = planted(template, tmp_path, FILES[kind], victims.place / "new")
-    victims.watch()
-    use(store, database(server, f"none{list(FILES).index(kind)}"), bag)
-    victims.check()
-
-
+@LEADS
 @pytest.mark.parametrize("kind", ["tables/*", "tables/*/*", "tables.part/new"])
-@pytest.mark.parametrize("leads", ["out", "to nothing"])
 def test_tables_that_lead_out(
     template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
 ) -> None:
@@ -254,30 +254,6 @@ def test_tables_that_lead_out(
     store = planted(template, tmp_path, name, target)
     victims.watch()
     use(store, database(server, f"tables{len(kind)}{leads[0]}"), bag)
-    victims.check()
-
-
-@pytest.mark.parametrize("kind", FOLDERS)
-def test_a_folder_that_leads_out(
-    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
-) -> None:
-    name = FOLDERS[kind]
-    victims = Victims(tmp_path / "victims")
-    like = template / ("recordings/small" if "recording" in kind[1:] else name)
-    store = planted(template, tmp_path, name, victims.folder(like))
-    victims.watch()
-    use(store, database(server, f"folder{list(FOLDERS).index(kind)}"), bag)
-    victims.check()
-
-
-@pytest.mark.parametrize("kind", FOLDERS)
-def test_a_folder_that_leads_to_nothing(
-    template: Path, tmp_path: Path, server: str, bag: Path, kind: str
-) -> None:
-    victims = Victims(tmp_path / "victims")
-    store = planted(template, tmp_path, FOLDERS[kind], victims.place / "new")
-    victims.watch()
-    use(store, database(server, f"gone{list(FOLDERS).index(kind)}"), bag)
     victims.check()
 
 

@@ -93,7 +93,7 @@ def complete(words: str) -> list[str]:
 
 
 def forked() -> list[str]:
-    """`COMMAND` for those that nobody kills: forked from a process with all of its imports."""
+    """`COMMAND`, faster, for processes that nobody kills and no terminal controls."""
     return [str(fork_server().path / "hybridlog")]
 
 

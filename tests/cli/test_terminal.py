@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from .running import COMMAND, environment, forked, open_bytes, recordings, run
+from .running import COMMAND, environment, open_bytes, recordings, run
 
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\x1b[()][A-Z0-9]")
 
@@ -39,7 +39,7 @@ def on_terminal(
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
     process = subprocess.Popen(
-        [*forked(), *map(str, arguments)],
+        [*COMMAND, *map(str, arguments)],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
