@@ -99,13 +99,12 @@ def forked() -> list[str]:
 
 @contextmanager
 def started(
-    *arguments: object, output: Path, wrapper: Sequence[str] = (), is_killed: bool = False
+    *arguments: object, output: Path, wrapper: Sequence[str] = ()
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A running command, killed if it has not ended; both of its streams go to a file."""
-    command = COMMAND if is_killed else forked()
     with output.open("ab") as file:
         process = subprocess.Popen(
-            [*wrapper, *command, *map(str, arguments)],
+            [*wrapper, *COMMAND, *map(str, arguments)],
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,

@@ -74,7 +74,6 @@ def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_p
     with started(
         *("record", logs / "robot.bag", "--store", fresh, *SLOW),
         output=tmp_path / "out",
-        is_killed=True,
     ) as process:
         wait_for(lambda: process.poll() is not None or open_bytes(fresh) > 200_000)
         process.kill()
