@@ -167,7 +167,8 @@ def _bring_up(
         Number of indexed chunks; None if all were in the index.
     """
     state = IndexState(database)
-    indexed = state.one(entry.key)  # read again, now that it is locked
+    # Both are read again, now that it is locked: another process may have indexed it meanwhile.
+    indexed, entry = state.one(entry.key), put_entry(directory, catalog, entry.label)
     if indexed is None or not indexed.is_whole(entry):
         return catch_up(directory, catalog, database, entry.label, progress)
     if not entry.is_decoded:

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
@@ -27,10 +28,12 @@ def arrive(robot: Path, lab: Path, label: str) -> None:
     (lab / "recordings" / ".coming").rename(lab / "recordings" / label)
 
 
-def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(tmp_path: Path) -> None:
+def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot, lab = tmp_path / "robot", tmp_path / "lab"
     with hl.open(robot, create=True, mongo="none") as store:
-        for n in range(4):
+        for n in range(5):
             log = logs.write(tmp_path / f"{n}.mcap", logs.content(n, 20 + n))
             store.record(log, name=f"drive-{n}", settings=logs.SETTINGS)
         expected = store.all_topics().count()
@@ -43,6 +46,22 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(tmp_path:
         with hl.open(lab, create=True, mongo=uri) as store:
             arrive(robot, lab, "drive-0")
             store.connect()
+            with hl.open(lab, mongo=uri) as other:
+                arrive(robot, lab, "drive-4")
+                read = store.session.entry_of
+
+                def overtaken(summary: Any) -> Any:
+                    entry = read(summary)
+                    if summary.label == "drive-4" and not other.session.repairs.indexed:
+                        other.refresh()
+                        other.connect()
+                    return entry
+
+                monkeypatch.setattr(store.session, "entry_of", overtaken)
+                store.refresh()
+                store.connect()
+                assert "drive-4" in other.session.repairs.indexed
+                assert "drive-4" not in store.session.repairs.indexed
 
         def is_indexed(label: str) -> Any:
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:
