@@ -163,11 +163,11 @@ class Tabular(Forced, AsJson):
 
     Attributes:
         formats: Formats that the command has.
-        unasked: The format on a terminal, and elsewhere.
+        usual: The format on a terminal, and elsewhere.
     """
 
     formats: ClassVar[Sequence[str]] = TABLE_FORMATS
-    unasked: ClassVar[tuple[str, str]] = SCREEN, "jsonl"
+    usual: ClassVar[tuple[str, str]] = SCREEN, "jsonl"
     form: str | None = format_option(TABLE_FORMATS)
     output: Path | None = output_option("Write to this file")
     limit: int | None = option("At most so many.", "N", short="-n", type=click.IntRange(min=0))
@@ -193,7 +193,7 @@ class Tabular(Forced, AsJson):
             raise UsageError("--json is --format json: leave out one of them.")
         form, path = "json" if self.as_json else self.form, self.output
         if form is None and path is None:
-            form = self.unasked[not sys.stdout.isatty()]
+            form = self.usual[not sys.stdout.isatty()]
         elif form is None and path is not None:
             suffixes = suffixes_of(self.formats)
             if path.suffix.lower() not in suffixes:
@@ -215,7 +215,7 @@ class Tabular(Forced, AsJson):
 class Listing(Tabular):
     """Options of commands that answer with rows, which are text unless another form is given."""
 
-    unasked: ClassVar[tuple[str, str]] = SCREEN, SCREEN
+    usual: ClassVar[tuple[str, str]] = SCREEN, SCREEN
     form: str | None = format_option(TABLE_FORMATS, "")
 
     def answer(

@@ -46,7 +46,7 @@ class _Choices(Asking, Tabular, Slices):
     formats: ClassVar[Sequence[str]] = _FORMATS
 
     @property
-    def unasked(self) -> tuple[str, str]:  # type: ignore[override]
+    def usual(self) -> tuple[str, str]:  # type: ignore[override]
         """The format on a terminal, and elsewhere."""
         return "jsonl" if self.follow else SCREEN, "jsonl"
 
