@@ -150,6 +150,7 @@ class LogRecorder:
                 self.results.known(piece.path, error)
             except (SourceError, UsageError) as error:
                 self.results.fail(piece.path, error)
+        self.results.finish(log)
 
     def _pieces(self, store: Store, log: Log) -> Iterator[Log]:
         """The log; the missing parts of it if others were recorded on their own."""
@@ -305,6 +306,7 @@ class Results:
     def __init__(self, choices: RecordChoices) -> None:
         self._choices = choices
         self._logs: Sequence[Log] = ()
+        self._unfinished: list[Path] = []
         self._is_search = False
         self._reports_each = False
         self._current: Path | None = None
@@ -323,6 +325,7 @@ class Results:
             is_search: Whether they were found in directories, so that known ones are no error.
         """
         self._logs, self._is_search = logs, is_search
+        self._unfinished = [log.path for log in logs]
 
     def report_each(self) -> None:
         """Print a line for each log when it is recorded; there is no end to the search."""
@@ -337,6 +340,11 @@ class Results:
     def begin(self, path: Path) -> None:
         """The log at a path is recorded now."""
         self._current = path
+
+    def finish(self, log: Log) -> None:
+        """Each part of a log is stored, or it has been said why not."""
+        if log.path in self._unfinished:
+            self._unfinished.remove(log.path)
 
     def add(self, path: Path, report: RecordReport) -> None:
         """Add a recording."""
@@ -376,6 +384,7 @@ class Results:
         """
         self._current = None
         if len(self._logs) == 1 and not self._is_search:
+            self._unfinished.clear()
             raise error
         output.note(f"hybridlog: {error}")
         self._failed += 1
@@ -393,11 +402,15 @@ class Results:
 
     def on_stop(self) -> str:
         """The effect of stopping now on the recordings."""
-        kept = output.counted(self._recorded, "recording")
-        before = f" {kept} stored before." if self._recorded else ""
+        left = list(self._unfinished)
         if self._current is not None:
-            return f"Nothing of {self._current} is stored.{before}"
-        return "" if self._is_search else "Everything was recorded."
+            left[:1] = [self._current]
+        what = str(left[0]) if len(left) == 1 else output.counted(len(left), "log")
+        parts = [f"Nothing of {what} is stored."] if left else []
+        if self._recorded:
+            before = " before" if left else ""
+            parts.append(f"{output.counted(self._recorded, 'recording')} stored{before}.")
+        return " ".join(parts)
 
     def show(self) -> None:
         """Print the table of the finished recordings, and what became of the others."""

@@ -195,7 +195,10 @@ def stop(frame, event, argument):
         sys.setprofile(None)
         os.kill(os.getpid(), signal.SIGINT)
 
-FILES = ("formats/writing.py", "formats/raw.py", "rosbag1/writer.py", "unfinished.py")
+FILES = (
+    "record_logs.py", "open_store.py",
+    "formats/writing.py", "formats/raw.py", "rosbag1/writer.py", "unfinished.py",
+)
 MOMENT = sys.argv.pop(1)
 sys.setprofile(stop)
 from hybridlog.cli import main
@@ -203,7 +206,7 @@ main()
 """
 
 
-def stop_at(moment: str, *command: str, store: Path) -> subprocess.CompletedProcess[str]:
+def stop_at(moment: str, *command: str | Path, store: Path) -> subprocess.CompletedProcess[str]:
     """Run a command that gets SIGINT at a moment."""
     return subprocess.run(
         [sys.executable, "-c", STOPS_ITSELF, moment, *command],
@@ -212,6 +215,30 @@ def stop_at(moment: str, *command: str, store: Path) -> subprocess.CompletedProc
         env=environment(HYBRIDLOG_STORE=str(store)),
         check=False,
     )
+
+
+@pytest.mark.parametrize(
+    ("moment", "names", "said"),
+    [
+        ("return opened_store", ["robot.bag"], "Nothing of {robot.bag} is stored."),
+        ("call _what", ["robot.bag"], "Nothing of {robot.bag} is stored."),
+        ("call _what", ["robot.bag", "odd.mcap"], "Nothing of 2 logs is stored."),
+        (
+            "return Results.finish",
+            ["odd.mcap", "robot.bag"],
+            "Nothing of {robot.bag} is stored. 1 recording stored before.",
+        ),
+        ("return Results.finish", ["odd.mcap"], "1 recording stored."),
+    ],
+)
+def test_a_stopped_record_says_what_is_stored(
+    moment: str, names: list[str], said: str, logs: Path, fresh: Path
+) -> None:
+    paths = [logs / name for name in names]
+    ended = stop_at(moment, "record", *paths, "--again", store=fresh)
+    assert ended.returncode == 130, ended.stderr
+    whole = said.replace("{robot.bag}", str(logs / "robot.bag"))
+    assert ended.stderr.rstrip().endswith(f"hybridlog: interrupted. {whole}")
 
 
 @pytest.mark.parametrize(
