@@ -90,12 +90,18 @@ class _LazyGroup(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        check_moved(cmd_name)
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if not ctx.resilient_parsing:
+            check_moved(*args[:2])
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         width = formatter.width - max(map(len, COMMANDS)) - 6
@@ -147,7 +153,7 @@ def _install_script(context: click.Context, _: click.Parameter, wanted: bool) ->
     cls=_LazyGroup,
     # Names only: an unknown command is compared with them, and `get_command` loads one.
     commands=dict.fromkeys(COMMANDS, click.Command(None)),
-    context_settings={"show_default": True},
+    context_settings={"show_default": True, "help_option_names": ["-h", "--help"]},
     epilog="The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.",
 )
 @click.option(

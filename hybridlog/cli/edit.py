@@ -20,6 +20,7 @@ from hybridlog.cli.options import (
     Named,
     Quiet,
     Running,
+    names_argument,
     one_recording,
     recordings_of,
 )
@@ -177,6 +178,9 @@ _MAX_ROWS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class _Remove(Named, InStore, Quiet):
+    names: tuple[str, ...] = names_argument(  # type: ignore[misc]
+        what="These recordings", without="those that the options choose"
+    )
     yes: bool = option("Do not ask.", short="-y")
 
 

@@ -19,32 +19,52 @@ _NAMED: Final = {"recording": "-r", "topic": "-t", "fields": "--fields"}
 MOVED: Final = {
     "attachments": "info RECORDING --attachments",
     "changes": "intervals TOPIC --changes FIELDS",
+    "convert": "export FILE",
+    "delete": "rm RECORDING",
     "du": "info --sizes recording",
-    "help": "--help",
+    "filter": "fetch TOPIC --where PREDICATE -o FILE",
     "gaps": "intervals TOPIC --gaps",
     "losses": "info --losses",
     "note": "edit RECORDING --note TEXT",
+    "play": "export DIRECTORY -F rosbag2",
+    "query": "fetch TOPIC --where PREDICATE",
     "rate": "stats --rate",
-    "reindex": "index rebuild",
+    "record -a": "record --ros2",
+    "reindex": "repair",
+    "remove": "rm RECORDING",
     "rename": "edit RECORDING --name NAME",
     "resample": "align TOPIC --step DURATION",
     "schema": "info --topic TOPIC",
+    "search": "fetch TOPIC --where PREDICATE",
     "serve": "open websocket",
+    "show": "info RECORDING",
+    "topics": "info",
     "trigger --rehearse": "intervals --rehearse EXPRESSION",
     "trust": "index trust",
     "untag": "tag RECORDING --remove KEY",
 }
 """Other names and options that people try, and the commands that do this."""
 
+_BEFORE: Final = {"bag": "{}", "help": "{} --help"}
+"""Words that people write before a command, and how that is written here."""
 
-def check_moved(words: str) -> None:
+
+def check_moved(words: str, after: str = "") -> None:
     """Say which command does what another name or option was tried for.
+
+    Args:
+        words: The name, with an option or without.
+        after: The word behind them.
 
     Raises:
         click.UsageError: One does.
     """
-    if words in MOVED:
-        raise click.UsageError(f"There is no `{words}`: use `hybridlog {MOVED[words]}`.")
+    meant = MOVED.get(words)
+    if words in _BEFORE:
+        meant = _BEFORE[words].format(MOVED.get(after, after)).strip()
+        words = f"{words} {after}".strip()
+    if meant is not None:
+        raise click.UsageError(f"There is no `{words}`: use `hybridlog {meant or '--help'}`.")
 
 
 class _Formatter(click.HelpFormatter):

@@ -103,7 +103,7 @@ class LiveSummary:
         for report in self._reports:
             yield from output.surpluses(report.entry.channels)
         if matcher is not None and not unused and not topics:
-            yield "no topic is left: --exclude takes away all that --topics names"
+            yield "no topic is left: --exclude takes away all that --topic names"
         for option, rules in (
             ("--throttle", self._options.throttles),
             ("--priority", self._options.priorities),

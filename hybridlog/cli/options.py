@@ -171,10 +171,20 @@ class Choosing:
         return recordings_of(store, self.choice)
 
 
-def names_argument(metavar: str = "[RECORDING]...", what: str = "Only these recordings") -> Any:
-    """The argument that names recordings."""
+def names_argument(
+    metavar: str = "[RECORDING]...", what: str = "Only these recordings", without: str = "all"
+) -> Any:
+    """The argument that names recordings.
+
+    Args:
+        metavar: What the usage line calls it.
+        what: What its recordings are.
+        without: What no name means.
+    """
     return argument(
-        f"{what}, as for --recording; without, all.", metavar, shell_complete=complete_recording
+        f"{what}, as for --recording; without, {without}.",
+        metavar,
+        shell_complete=complete_recording,
     )
 
 

@@ -57,7 +57,9 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "of them.",
         "[PATH]...",
     )
-    topics: tuple[str, ...] = option("Only these: name, glob, or re:REGEX.", "TOPIC", short="-t")
+    topics: tuple[str, ...] = option(
+        "Only these: name, glob, or re:REGEX.", "TOPIC", name="--topic", short="-t"
+    )
     exclude: tuple[str, ...] = option("Not these.", "TOPIC", short="-x")
     no_index: tuple[str, ...] = option(
         "No documents in MongoDB for these: questions about them read tables.", "TOPIC"

@@ -80,6 +80,12 @@ def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
 
     logs: list[Log] = []
     walked: Found | None = None
+    if choices.paths and all(map(_is_topic, choices.paths)):
+        topics = " ".join(f"-t {path}" for path in choices.paths)
+        raise UsageError(
+            f"There is no file {choices.paths[0]}. To record topics of a running robot: "
+            f"`hybridlog record --ros2 {topics}`."
+        )
     for path in choices.paths:
         found = find_logs(path) if path.is_dir() else Found()
         is_one = len(found.logs) == 1 and path in {found.logs[0].path, found.logs[0].path.parent}
@@ -93,6 +99,12 @@ def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
         walked.stores += found.stores
         walked.problems += found.problems
     return logs, walked
+
+
+def _is_topic(path: Path) -> bool:
+    """True where a path is none, and is more likely the name of a topic."""
+    is_near = path.parent.exists() and path.parent != Path("/")
+    return path.is_absolute() and not (path.suffix or is_near or path.exists())
 
 
 def print_stores(stores: Iterable[Path]) -> None:

@@ -75,6 +75,8 @@ def sql_command(given: _Given) -> None:
 _PROMPT: Final = "sql> "
 _MORE: Final = "...> "
 _ENDS: Final = frozenset({"exit", "quit", ".exit", ".quit", "\\q"})
+_HELP: Final = frozenset({"help", ".help", "?", "\\?"})
+_HINT: Final = "Statements end with a semicolon; `show tables;` lists views, Ctrl-D or `quit` ends."
 _HISTORY: Final = "sql_history"
 _MAX_HISTORY: Final = 1000
 
@@ -97,7 +99,7 @@ def run_prompt(
     """
     from hybridlog.sql.duck import limited_memory
 
-    say("Statements end with a semicolon; `show tables;` lists views, Ctrl-D ends.")
+    say(_HINT)
     completer = Completer(connection)
     with _Keys() as keys, _line_editing(completer):
         while (text := _statement(completer, keys)) is not None:
@@ -132,8 +134,12 @@ def _statement(completer: Completer, keys: _Keys) -> str | None:
         except EOFError:
             say()
             return None
-        if not lines and line.strip().rstrip(";").lower() in _ENDS:
+        word = line.strip().rstrip(";").lower()
+        if not lines and word in _ENDS:
             return None
+        if not lines and word in _HELP:
+            say(_HINT)
+            continue
         lines.append(line)
         if line.rstrip().endswith(";") or not any(map(str.strip, lines)):
             return "\n".join(lines)

@@ -234,6 +234,9 @@ class Person:
 def test_the_prompt(root: Path, tmp_path: Path) -> None:
     person = Person("sql", "--store", root, XDG_STATE_HOME=str(tmp_path))
     person.reads("sql> ")
+    person.types("help\r")
+    person.reads("`quit` ends")
+    person.reads("sql> ")
     person.types("create table few as select * from scan limit 3;\r")
     person.reads("sql> ")
     person.types("select count(*) + 100 as n\r")

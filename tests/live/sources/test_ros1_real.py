@@ -317,7 +317,7 @@ def test_a_publisher_in_c_plus_plus(master: _Master, tmp_path: Path) -> None:
                 str(master.debian.tools / "play"),
                 "--quiet",
                 "--wait-for-subscribers",
-                "--topics",
+                "--topic",
                 "/played",
                 "--bags",
                 bag,
