@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -28,6 +28,9 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
+
+_NEAR: Final = 0.05
+"""Share of differences that a tolerance is proposed for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,14 +189,25 @@ def diff_command(given: _Diff) -> None:
     given.answer(
         map(asdict, found),
         [(name, "left") for name in names],
-        lambda row: [row[name] for name in names],
+        _cells_of_difference,
         titles=2,
     )
     sys.stdout.flush()
     if not (given.quiet or given.as_json):
         output.notes(verdicts)
+        near = sum(one.share is not None and one.share <= _NEAR for one in found)
+        if near and not share:
+            output.note(f"--tolerance {_NEAR:.0%} leaves out {near} of the differences.")
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)
         output.note(f"The first {given.limit} of {total}" if is_cut else total)
     if found:
         raise click.exceptions.Exit(DIFFERENT)
+
+
+def _cells_of_difference(row: Mapping[str, Any]) -> list[str]:
+    """In words where only one recording has something."""
+    sides = [row["a"], row["b"]]
+    if row["what"] in {"times", "topic"}:
+        sides = [told and f"only {name}: {told}" for name, told in zip("ab", sides, strict=True)]
+    return [row["topic"], row["what"], *sides]

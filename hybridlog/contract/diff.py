@@ -26,6 +26,7 @@ Value = float | str | None
 Range = tuple["TimeLike | None", "TimeLike | None"]
 _LEAST_SHARE: Final = 0.01
 """Of the longer recording: only a difference in length above that is one of times."""
+_ENDS: Final = ("late_start", "early_stop")
 _STATISTICS: Final = ("count", "nan", "infinite", "min", "max", "mean", "std")
 
 
@@ -39,12 +40,14 @@ class Difference:
             `early_stop`, `lost`, the path of a field, or a rule of the contract.
         a: What the first choice has, in words; empty if it has no such thing.
         b: The same for the second one.
+        share: How far numbers differ, as a share of the greater one; None for other things.
     """
 
     topic: str
     what: str
     a: str
     b: str
+    share: float | None = None
 
 
 class _Side:
@@ -71,6 +74,7 @@ class _Side:
     def values(self, topic: str) -> dict[str, Value]:
         """Figures of a topic, by name; durations in ns."""
         ones = self.topics[topic]
+        steady = [one for one in ones if not one.is_latched]
         rated = [one for one in ones if one.rate_hz]
         steps = sum(one.messages - 1 for one in rated)
         seconds = sum((one.messages - 1) / one.rate_hz for one in rated if one.rate_hz)
@@ -80,8 +84,8 @@ class _Side:
             "rate": steps / seconds if seconds else None,
             "longest_gap": _greatest(one.gap_ns for one in ones),
             "jitter": _greatest(one.jitter_ns for one in ones),
-            "late_start": _greatest(one.late_ns for one in ones),
-            "early_stop": _greatest(one.early_ns for one in ones),
+            "late_start": _greatest(one.late_ns for one in steady),
+            "early_stop": _greatest(one.early_ns for one in steady),
             "lost": None if any(o.lost is None for o in ones) else sum(o.lost or 0 for o in ones),
         }
 
@@ -119,20 +123,25 @@ def diff(
     rest: list[Difference] = []
     for topic in sorted({*sides[0].topics, *sides[1].topics}):
         if not all(topic in side.topics for side in sides):
+            # There is no common time of what only one has: its messages are all of them.
             words = [
-                ""
-                if topic not in side.topics
-                else counted(sum(one.messages for one in side.topics[topic]), "message")
-                for side in sides
+                counted(one.topic(topic).between(*(between or (None, None))).count(), "message")
+                if topic in side.topics
+                else ""
+                for one, side in zip((a, b), sides, strict=True)
             ]
-            found.append(Difference(topic, "topic", *words))
+            found.append(Difference(topic, "topic", words[0], words[1]))
             continue
         first, second = (side.values(topic) for side in sides)
         for what, value in first.items():
-            if not _same(value, second[what], tolerance):
+            if what in _ENDS and None in (value, second[what]):
+                continue  # latched, or without messages
+            share = _share(value, second[what])
+            if share > tolerance:
                 words = [_worded(what, one) for one in (value, second[what])]
-                rest.append(Difference(topic, what, *words))
-        rest += _of_fields(topic, sides[0].fields[topic], sides[1].fields[topic], tolerance)
+                rest.append(Difference(topic, what, words[0], words[1], _finite(share)))
+        counts = first["messages"], second["messages"]
+        rest += _of_fields(topic, sides[0].fields[topic], sides[1].fields[topic], tolerance, counts)
     found += rest
     if contract is not None:
         broke = [_broken(session, contract, side) for side in sides]
@@ -140,7 +149,7 @@ def diff(
         changed = [rule for rule in rules if (rule in broke[0]) != (rule in broke[1])]
         for topic, rule, limit in changed:
             words = [one.get((topic, rule, limit), "holds") for one in broke]
-            found.append(Difference(topic, f"{rule} {limit}", *words))
+            found.append(Difference(topic, f"{rule} {limit}", words[0], words[1]))
     return found
 
 
@@ -175,7 +184,7 @@ def _shared(a: Recordings, b: Recordings) -> _Shared | None:
         parts = (first, begin), (end, last)
         least = _LEAST_SHARE * max(lengths)
         told = [
-            f"+{_to_ms(low - first)} to +{_to_ms(high - first)}"
+            f"from +{_to_ms(low - first)} to +{_to_ms(high - first)}"
             for low, high in parts
             if high - low > least
         ]
@@ -192,25 +201,30 @@ def _of_fields(
     a: Mapping[str, FieldStatistics],
     b: Mapping[str, FieldStatistics],
     tolerance: float,
+    messages: tuple[Value, Value],
 ) -> Iterator[Difference]:
-    """A difference for each field whose statistics are not the same."""
+    """A difference for each field whose statistics are not the same.
+
+    A number of values that is that of the messages is told by those.
+    """
     for field in sorted({*a, *b}):
         if field not in a or field not in b:
             words = ["" if field not in side else "there" for side in (a, b)]
-            yield Difference(topic, field, *words)
+            yield Difference(topic, field, words[0], words[1])
             continue
-        values = [[getattr(side[field], name) for name in _STATISTICS] for side in (a, b)]
-        names = [
-            name
-            for name, one, other in zip(_STATISTICS, *values, strict=True)
-            if not _same(one, other, tolerance)
-        ]
+        names, shares = [], []
+        for name in _STATISTICS:
+            one, other = (getattr(side[field], name) for side in (a, b))
+            share = _share(one, other)
+            if share > tolerance and (name, (one, other)) != ("count", messages):
+                names.append(name)
+                shares.append(share)
         if names:
             words = [
                 ", ".join(f"{name} {_worded(name, getattr(side[field], name))}" for name in names)
                 for side in (a, b)
             ]
-            yield Difference(topic, field, *words)
+            yield Difference(topic, field, words[0], words[1], _finite(max(shares)))
 
 
 def _broken(session: Session, contract: Contract, side: _Side) -> dict[tuple[str, str, str], str]:
@@ -223,12 +237,19 @@ def _greatest(values: Iterator[float | None]) -> float | None:
     return max((value for value in values if value is not None), default=None)
 
 
-def _same(a: Value, b: Value, tolerance: float) -> bool:
+def _share(a: Value, b: Value) -> float:
+    """How far two values differ, as a share of the greater one; infinite if no number says so."""
     if isinstance(a, str) or isinstance(b, str) or a is None or b is None:
-        return a == b
+        return 0.0 if a == b else math.inf
     if a == b or (math.isnan(a) and math.isnan(b)):
-        return True
-    return abs(a - b) <= tolerance * max(abs(a), abs(b)) < math.inf
+        return 0.0
+    greater = max(abs(a), abs(b))
+    share = abs(a - b) / greater
+    return share if share <= 2 else math.inf  # NaN, too
+
+
+def _finite(share: float) -> float | None:
+    return share if math.isfinite(share) else None
 
 
 def _worded(what: str, value: Value) -> str:

@@ -16,11 +16,22 @@ from tests.cli.running import run
 from tests.data import DATA, needs_data
 from tests.some import EXHAUSTIVE
 
-from .test_contract import GOOD, MS, SECOND, START, Change, Sent, changed, good, play, without
+from .test_contract import (
+    GOOD,
+    MS,
+    SECOND,
+    START,
+    Change,
+    Sent,
+    changed,
+    channel,
+    good,
+    play,
+    without,
+)
 
 COUNTS = {"messages", "rate", "jitter"}
 LATE = START + 2 * SECOND
-X, STAMPED = {"x"}, {"header.seq", "x"}
 
 
 def moved(ms: int) -> Change:
@@ -58,16 +69,16 @@ PLANTED: dict[str, tuple[Change, set[tuple[str, str]]]] = {
         ("/scan", what) for what in ("late_start", "rate", "jitter")
     }),
     "a message less": (without("/odom", 2, 2.001), {
-        *(("/odom", what) for what in COUNTS | STAMPED | {"longest_gap"})
+        *(("/odom", what) for what in COUNTS | {"longest_gap"})
     }),
     "a message twice": (lambda s: [*s, *(m for m in s if (m.topic, m.time) == ("/odom", LATE))], {
-        *(("/odom", what) for what in COUNTS | STAMPED)
+        *(("/odom", what) for what in COUNTS)
     }),
     "a gap": (without("/scan", 2, 2.2), {
-        *(("/scan", what) for what in COUNTS | STAMPED | {"longest_gap"})
+        *(("/scan", what) for what in COUNTS | {"longest_gap"})
     }),
     "early stop": (without("/scan", 4.9), {
-        *(("/scan", what) for what in {"messages", "early_stop"} | STAMPED)
+        *(("/scan", what) for what in ("messages", "early_stop"))
     }),
     "both": (lambda s: at("/scan", x=3.0)(at("/odom", x=4.0)(s)), {("/scan", "x"), ("/odom", "x")}),
 }  # fmt: skip
@@ -123,20 +134,36 @@ def test_what_only_one_has_comes_first(tmp_path: Path) -> None:
 
         (only,) = told("all", "begin")
         assert only[:2] == ("", "times")
-        assert re.fullmatch(r"\+1\.9\d+s to \+\d\.\d+s", only[2])
+        assert re.fullmatch(r"from \+1\.9\d+s to \+\d\.\d+s", only[2])
         assert only[3] == ""
-        assert told("rest", "all") == [("", "times", "", "+0s to +2s")]
+        assert told("rest", "all") == [("", "times", "", "from +0s to +2s")]
         # Of different times: since the beginnings.
         first, topic, *others = told("all", "later", topics=["scan", "new"])
         assert (first, topic) == (only, ("/new", "topic", "", "1 message"))
         assert {one[0] for one in others} <= {"/scan"}
         assert told("all", "begin", between=("+1s", "+1.5s")) == []
+        # All messages of a topic that the other lacks, not those of the common time.
+        play(store, [m for m in sent if m.topic == "/odom" and m.time < LATE], "odom")
+        assert ("/scan", "topic", "100 messages", "") in told("all", "odom")
         path = store.directory.path
     asked = ("diff", "all", "later", "-t", "scan", "-t", "new", "-n", "1")
     done = run(*asked, store=path, code=12)
     assert len(done.lines) == 2
+    assert f"only a: {only[2]}" in done.lines[1]
     assert done.err == f"The first 1 of {2 + len(others)} differences.\n"
     assert run("diff", "all", "begin", "--between", "+1s", "+1.5s", store=path).out == ""
+
+
+def test_latched_topics_neither_start_late_nor_stop_early(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "s", create=True, mongo="none") as store:
+        for name, late in (("a", 0), ("b", 140_000)):
+            with store.start(name) as live:
+                odom = channel("/odom", "test_msgs/Odom")
+                latched = replace(channel("/map", "test_msgs/Map"), metadata={"latching": "1"})
+                for time in (0, SECOND):
+                    live.write(odom, bytes(24), log_time=START + time)
+                live.write(latched, bytes(24), log_time=START + late)
+        assert store.diff("a", "b") == []
 
 
 def test_the_command(store: hl.Store, tmp_path: Path) -> None:
@@ -145,7 +172,13 @@ def test_the_command(store: hl.Store, tmp_path: Path) -> None:
     shown = run("diff", "base", "n-a-value", store=path, code=12)
     assert [line.split()[:2] for line in shown.lines] == [["topic", "what"], ["/scan", "x"]]
     as_json = run("diff", "base", "n-a-new-topic", "--json", store=path, code=12).json
-    assert as_json == [{"topic": "/new", "what": "topic", "a": "", "b": "1 message"}]
+    assert as_json == [{"topic": "/new", "what": "topic", "a": "", "b": "1 message", "share": None}]
+    shown = run("diff", "base", "n-a-message-less", store=path, code=12)
+    rows = {(d.topic, d.what): d for d in store.diff("base", "n-a-message-less")}
+    assert rows["/odom", "messages"].share == pytest.approx(1 / 250)
+    near = sum(one.share is not None and one.share <= 0.05 for one in rows.values())
+    assert f"--tolerance 5% leaves out {near} of the differences." in shown.err
+    assert len(store.diff("base", "n-a-message-less", tolerance=0.05)) == len(rows) - near
     assert run("diff", "base", "n-a-value", "--tolerance", "100%", store=path).out == ""
     run("diff", "base", "n-a-value", "--tolerance", "much", store=path, code=2)
     run("diff", "base", "no-such", store=path, code=2)
