@@ -7,16 +7,18 @@ and not sent again. The next list names all of a recording: only from then on is
 
 from __future__ import annotations
 
+import secrets
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import IN_TYPE, SHARED, SUFFIX
-from hybridlog.entries import describe, take_inventory
+from hybridlog.entries import describe, put_entry, take_inventory
+from hybridlog.maintenance.keep import pin_of
 from hybridlog.maintenance.opening import open_catalog
 from hybridlog.maintenance.places import (
     Begun,
@@ -27,6 +29,7 @@ from hybridlog.maintenance.places import (
     check_proven,
     content_of,
     copied_of,
+    edits_of,
     pieces_of,
     problems_of,
 )
@@ -35,7 +38,7 @@ from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import ObjectExistsError, StoreError, unreadable
-from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.bucket import Upload, path_of
 from hybridlog_storage.remote.lists import RECORDINGS, TABLES, ListedRecording
@@ -44,7 +47,6 @@ from hybridlog_storage.segments.segment_file import sealed_name
 if TYPE_CHECKING:
     from hybridlog.columns.tables import Tables
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.journal import JournalState
     from hybridlog_storage.messages import Buffer
     from hybridlog_storage.remote.bucket import Object
     from hybridlog_storage.remote.store import RemoteDirectory
@@ -70,6 +72,8 @@ class BucketPlace:
         self._tables = tables
         self._own = open_catalog(target)
         self._recording = ""
+        self._is_mending = False
+        self._pins: dict[str, str] = {}  # by id of the recording
         self._there: dict[str, Object] = {}  # by path below the recording
         self._proven: dict[str, CopiedFile] = {}
         self._upload: Upload | None = None
@@ -79,7 +83,7 @@ class BucketPlace:
         return False
 
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
-        """As of `Place`; what has lost objects lacks payloads."""
+        """As of `Place`."""
         self._target.refresh()
         labels = self._target.labels_by_id()
         return {one: self._copied(labels[one], one) for one in recordings if one in labels}
@@ -91,7 +95,7 @@ class BucketPlace:
             found = copied_of(self._target, label)
         else:
             found = Copied(label, content=content_of(_digests(row[1])))
-        return replace(found, lacks_payloads=True) if self._target.is_damaged(label) else found
+        return replace(found, is_damaged=self._target.is_damaged(label))
 
     def segments(self, recording: str) -> dict[int, str]:
         """As of `Place`."""
@@ -103,17 +107,36 @@ class BucketPlace:
         self.leave()
         known = self.have([recording]).get(recording)
         listed: set[str] = set()
+        lost: list[CopiedFile] | None = None
         if known is not None:
-            if not (known.lacks_payloads and wants_payloads):
+            if not (wants_payloads and (known.lacks_payloads or known.is_damaged)):
                 return Begun(known)
             listed = {one.name for one in self._target.files_of(known.label).values()}
+            self._is_mending = not (known.lacks_payloads or self._has_lost_lines(known.label))
+            lost = [*self._lost(known.label).values()] if self._is_mending else None
         self._recording = recording
         bucket, folder = self._target.source.bucket, f"{RECORDINGS}/{recording}/"
         for one in sorted(bucket.objects(folder), key=lambda one: one.modified):
             if one.name in listed or bucket.is_young(one):
                 self._there[path_of(one.name[len(folder) :])] = replace(one, modified=0)
         sizes = {path.removeprefix(f"{PAYLOADS}/"): o.size for path, o in self._there.items()}
-        return Begun(sizes=sizes)
+        return Begun(sizes=sizes, lost=lost)
+
+    def _has_lost_lines(self, label: str) -> bool:
+        """True if lines of the journal are lost, so that nothing says what else is."""
+        return any(map(_is_lines, self._target.lost_of(label)))
+
+    def _lost(self, label: str) -> dict[str, CopiedFile]:
+        """The files of a recording whose objects are lost, as its journal lists them."""
+        state = journal.read(self._target.recording(label)) or JournalState()
+        listed = {f"{PAYLOADS}/{name}": file for name, file in state.payloads.items()}
+        found = {path: CopiedFile(**asdict(file)) for path, file in listed.items()}
+        for number, sealed in state.sealed.items():
+            digest, size = [(sealed.digest, sealed.bytes), *state.thinned.get(number, ())][-1]
+            name = sealed_name(number)
+            found[name] = CopiedFile(name, size, digest)
+        lost = self._target.lost_of(label)
+        return {path: file for path, file in found.items() if path in lost}
 
     def digest(self, file: CopiedFile, length: int) -> str:
         """As of `Place`, but for the kind of digest; empty if it has another length."""
@@ -140,6 +163,8 @@ class BucketPlace:
 
     def publish(self, label: str, lines: bytes, *, lacks_payloads: bool) -> str:
         """As of `Place`."""
+        if self._is_mending:
+            return self._mend()
         target, recording, state = self._target, self._recording, journal.parse(lines)
         check_proven(state, recording, self._proven)
         found = {_path(file): self._there[_path(file)] for file in self._proven.values()}
@@ -151,14 +176,18 @@ class BucketPlace:
             with suppress(ObjectExistsError), target.changing():
                 known = self.have([recording]).get(recording)
                 there = {} if known is None else target.files_of(known.label)
-                if known is not None and not known.lacks_payloads:  # another process was faster
+                is_whole = known is not None and not (known.lacks_payloads or known.is_damaged)
+                if is_whole:  # another process was faster
                     # Of large files the last one to come replaced what the other one had sent.
                     newer = {path: o for path, o in found.items() if _replaces(o, there.get(path))}
                     listed = {**there, **newer}
                 else:
                     bucket, name = target.source.bucket, f"{RECORDINGS}/{recording}/{JOURNAL}"
-                    listed = {**self._kept(there, state), **found}
-                    listed[JOURNAL] = bucket.create_beside(name, lines)
+                    edits, marks = self._added(there, state)
+                    listed = {**marks, **found}
+                    if known is not None and self._has_lost_lines(known.label):
+                        self._check_holds_more(there, listed, state.name)
+                    listed[JOURNAL] = bucket.create_beside(name, lines + edits)
                 label = known.label if known is not None else target.free_label(label)
                 if listed != there:
                     target.add_recording(label, ListedRecording(recording, listed), fields)
@@ -167,27 +196,71 @@ class BucketPlace:
                 return label
         raise StoreError(f"{self.name} changes all the time. Copy again.")
 
-    def _kept(self, there: Mapping[str, Object], state: JournalState) -> dict[str, Object]:
-        """What was added there to a recording: lines of its journal, and segments of marks.
+    def _mend(self) -> str:
+        """List what was sent in the place of what was lost; the rest stays as it is.
+
+        Raises:
+            RefusedError: More is lost than was sent.
+        """
+        target, recording, proven = self._target, self._recording, {*self._proven.values()}
+        for _ in range(TRIES):
+            with suppress(ObjectExistsError), target.changing():
+                known = self.have([recording]).get(recording)
+                if known is None:
+                    raise RefusedError(f"It was removed from {self.name} meanwhile. Copy again.")
+                found = {
+                    path: self._there[path]
+                    for path, file in self._lost(known.label).items()
+                    if file in proven
+                }
+                if found:
+                    target.mend(known.label, found)
+                    self._own.put(describe(self._own, take_inventory(target, known.label)))
+                left = target.lost_of(known.label)
+                break
+        else:
+            raise StoreError(f"{self.name} changes all the time. Copy again.")
+        self.leave()
+        if left:
+            raise RefusedError(
+                f"{known.label} in {self.name} has lost {', '.join(sorted(left))}, which this "
+                "store does not have either: their payloads were deleted here, or were never "
+                "here. All else of it stays as it is. Another store may have them."
+            )
+        return known.label
+
+    def _added(
+        self, there: Mapping[str, Object], state: JournalState
+    ) -> tuple[bytes, dict[str, Object]]:
+        """Lines that users added there to a recording, and the segments of their marks.
 
         Raises:
             RefusedError: It was marked here, too.
         """
-        notes = {path: one for path, one in there.items() if path.startswith(f"{JOURNAL}.")}
-        added = self._target.source.read([one for _, one in sorted(notes.items())])
-        marks = {
-            line["segment"]
-            for _, line in journal.read_lines(added)
-            if line is not None and line["event"] == journal.SEALED
-        }
-        if marks & state.sealed.keys():
+        parts = {int(p.partition(".")[2] or 0): o for p, o in there.items() if _is_lines(p)}
+        data = self._target.source.read([one for _, one in sorted(parts.items())])
+        edits, marks = edits_of(data, state, self.name)
+        lines = b"".join(map(journal.encode, edits))
+        return lines, {name: there[name] for name in marks if name in there}
+
+    def _check_holds_more(
+        self, there: Mapping[str, Object], found: Mapping[str, Object], name: str
+    ) -> None:
+        """Raise if segments there have payloads that those sent lack: they are shorter then.
+
+        Raises:
+            RefusedError: Some have, or were not sent.
+        """
+        more = [
+            path
+            for path, one in there.items()
+            if path.endswith(".mcap") and (path not in found or found[path].size < one.size)
+        ]
+        if more:
             raise RefusedError(
-                f"Recording {state.name!r} was marked here and in {self.name}, where it lacks "
-                "payloads: note the mark there, `hybridlog mark --remove` it, copy again, and set "
-                "it again."
+                f"Recording {name!r} in {self.name} has lost its journal, and has payloads that "
+                f"are not here, in {', '.join(sorted(more))}. It stays as it is."
             )
-        names = {sealed_name(number) for number in marks} & there.keys()
-        return {**notes, **{name: there[name] for name in names}}
 
     def _describe(self, label: str, entry: RecordingEntry | None) -> None:
         """Make the row of the catalog from what is there, as it is read back."""
@@ -204,9 +277,26 @@ class BucketPlace:
             raise StoreError(f"What was copied of recording {label!r} does not fit together.")
         self._own.put(describe(self._own, inventory))
 
-    def hold(self) -> bool:
-        """True: what a list names is not deleted, and the list after it is another state."""
+    def hold(self, recordings: Sequence[str]) -> bool:
+        """True: nobody locks anything, but pins keep payloads. After a crash the pins stay."""
+        self.leave()
+        reason = "held for a copy that deletes payloads at its source; unpin it if none runs"
+        pins = {one: pin_of(secrets.token_hex(4), (None, None), None, reason) for one in recordings}
+        self._note(pins)
+        self._pins = {recording: pin["id"] for recording, pin in pins.items()}
         return True
+
+    def _note(self, lines: Mapping[str, journal.Event]) -> None:
+        """Append a line to each journal of recordings, in one change."""
+        target = self._target
+        for _ in range(TRIES):
+            with suppress(ObjectExistsError), target.changing():
+                labels = target.labels_by_id()
+                for recording in lines.keys() & labels.keys():
+                    target.append(labels[recording], lines[recording])
+                    put_entry(target, self._own, labels[recording])
+                return
+        raise StoreError(f"{self.name} changes all the time. Copy again.")
 
     def drop(self) -> None:
         """As of `Place`; objects that no list names go when the bucket is tidied."""
@@ -214,7 +304,11 @@ class BucketPlace:
 
     def leave(self) -> None:
         """As of `Place`."""
-        self._recording, self._upload = "", None
+        pins, self._pins = self._pins, {}
+        if pins:
+            line = journal.UNPINNED
+            self._note({recording: journal.event(line, id=pin) for recording, pin in pins.items()})
+        self._recording, self._upload, self._is_mending = "", None, False
         self._there.clear()
         self._proven.clear()
 
@@ -263,6 +357,11 @@ class BucketPlace:
 def _path(file: CopiedFile) -> str:
     """The path of a file below its recording."""
     return file.below(Path()).as_posix()
+
+
+def _is_lines(path: str) -> bool:
+    """True for the journal of a recording, and for objects with later lines of it."""
+    return path.partition(".")[0] == JOURNAL
 
 
 def _digests(entry: RecordingEntry) -> dict[int, str]:

@@ -187,7 +187,7 @@ class _Copying:
     def _let_go(self, proved: Callable[[str, Mapping[int, str]], None]) -> None:
         """Tell which segments have a proven copy, while nothing can be deleted there."""
         name, problems = self._place.name, self._report.problems
-        if not self._place.hold():
+        if not self._place.hold([*self._proven]):
             problems.append(f"Payloads stay: another process makes room in {name}. Run it again.")
             return
         there: dict[str, Copied] = {}
@@ -196,7 +196,8 @@ class _Copying:
             there |= self._place.have(ids[begin : begin + _ASKED_AT_ONCE])
         for recording, sent in self._proven.items():
             now = there.get(recording)
-            if now is None or now.lacks_payloads or now.expired > expired_in(sent):
+            is_whole = now is not None and not (now.lacks_payloads or now.is_damaged)
+            if now is None or not is_whole or now.expired > expired_in(sent):
                 problems.append(f"Payloads of {sent.name} stay: its copy in {name} has lost some.")
                 continue
             digests = self._place.segments(recording)
@@ -231,8 +232,10 @@ class _Copying:
 
     def _is_known(self, recording: str, there: Copied | None) -> bool:
         """True if the place has all that would be copied."""
-        if there is None or not there.lacks_payloads or self._options.only_fields:
+        if there is None or self._options.only_fields:
             return there is not None
+        if there.is_damaged or not there.lacks_payloads:
+            return not there.is_damaged
         return self._state(recording).lacks_payloads
 
     def _state(self, recording: str) -> JournalState:
@@ -256,6 +259,12 @@ class _Copying:
         may_lack = known.expired and not known.lacks_payloads
         if may_lack and known.expired > expired_in(state):
             self._report.lacking.append(known.label)
+        self._check_there(one, known, state)
+
+    def _check_there(
+        self, one: RecordingEntry | RecordingSummary, known: Copied, state: JournalState
+    ) -> None:
+        """Read a copy that is there before payloads expire here."""
         if self._options.then_expire:
             problems = self._place.problems(one.id)
             if known.lacks_payloads or known.expired:
@@ -302,8 +311,9 @@ class _Copying:
                     if begun.known is not None:  # another process has copied it meanwhile
                         self._note_known(one, begun.known)
                         return
-                    self._total += sent.bytes - one.stored_bytes
-                    for file in sent.files:
+                    wanted = [f for f in sent.files if begun.lost is None or f in begun.lost]
+                    self._total += sum(file.bytes for file in wanted) - one.stored_bytes
+                    for file in wanted:
                         self._bring(sent, file, begun.sizes.get(file.file, 0))
                 break
             except StoreError:
@@ -313,7 +323,9 @@ class _Copying:
                     raise
         there = self._place.publish(one.label, sent.lines, lacks_payloads=sent.lacks_payloads)
         self._report.copied.append(there)
-        if self._options.then_expire and not only_fields:
+        if begun.lost is not None:  # the rest of it was not sent
+            self._check_there(one, self._place.have([one.id])[one.id], sent.state)
+        elif self._options.then_expire and not only_fields:
             self._proven[one.id] = sent.state
 
     def _bring(self, sent: _Sent, file: CopiedFile, there: int) -> None:
@@ -334,10 +346,9 @@ class _Copying:
             raise damaged
         at = 0
         if 0 < there <= file.bytes:
-            digest = place.digest(file, there)
-            here = digest_like(digest, sent.pieces(file, 0, there, _READ))
-            at = there if digest == here else 0
+            at = there if self._is_same_there(sent, file, there) else 0
         self._total -= at
+        is_there = at == file.bytes
         piece, limit = self._options.piece, self._options.limit_rate
         if limit is not None:  # a server must not take a slow one for a dead one
             piece = max(min(piece, int(limit / 4)), 1)
@@ -347,6 +358,15 @@ class _Copying:
             self._count(sent.label, len(data))
         if not place.prove(file):
             raise damaged
+        if not (place.proves or is_there or self._is_same_there(sent, file, file.bytes)):
+            raise RefusedError(
+                f"{file.file} did not arrive in {place.name} as it was sent. Copy again."
+            )
+
+    def _is_same_there(self, sent: _Sent, file: CopiedFile, length: int) -> bool:
+        """True if the first bytes of a file have the same digest there."""
+        digest = self._place.digest(file, length)
+        return digest == digest_like(digest, sent.pieces(file, 0, length, _READ))
 
     def _count(self, label: str, size: int) -> None:
         """Count bytes that were sent, and wait as long as the limit of the rate asks for."""

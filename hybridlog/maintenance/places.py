@@ -136,8 +136,8 @@ class Copied:
 
     Attributes:
         label: Its label there.
-        lacks_payloads: Whether only its fields were copied, or objects of it were lost: the next
-            copy completes it.
+        lacks_payloads: Whether only its fields were copied: the next copy completes it.
+        is_damaged: Whether objects of it were lost: the next copy brings them back.
         expired: Number of expired topics there, summed over its segments.
         content: As of `content_of`.
     """
@@ -146,6 +146,7 @@ class Copied:
     lacks_payloads: bool = False
     expired: int = 0
     content: str = ""
+    is_damaged: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,10 +156,12 @@ class Begun:
     Attributes:
         known: The recording, if the place has it already: then nothing was begun.
         sizes: Bytes of the files that an interrupted copy has left, by name.
+        lost: Files that a damaged copy has lost: only these are sent. None to send all.
     """
 
     known: Copied | None = None
     sizes: Mapping[str, int] = field(default_factory=dict)
+    lost: Sequence[CopiedFile] | None = None
 
 
 class Place(Protocol):
@@ -214,8 +217,8 @@ class Place(Protocol):
             The label it has.
         """
 
-    def hold(self) -> bool:
-        """Keep payloads from being deleted until `leave`; False if somebody deletes some now."""
+    def hold(self, recordings: Sequence[str]) -> bool:
+        """Keep payloads of recordings until `leave`; False if somebody deletes some now."""
 
     def drop(self) -> None:
         """Delete what has arrived of the recording that was begun, if one was."""
@@ -451,26 +454,8 @@ class DirectoryPlace:
         """Lines that users added to a copy without payloads; segments of marks get a name here."""
         old = self._directory.recording(label)
         data = files.read_file(old / JOURNAL, journal.MAX_JOURNAL)
-        lines = [line for _, line in journal.read_lines(data) if line is not None]
-        last = max(n for n, line in enumerate(lines) if line["event"] == journal.ADOPTED)
-        found: list[journal.Event] = []
-        for line in lines[last + 1 :]:
-            if line["event"] == journal.RENAMED:
-                found.append(journal.event(journal.RENAMED, name=line["name"]))
-            elif line["event"] in _EDITS:
-                found.append(line)
-        now = journal.parse(data)
-        marked = {line["segment"] for line in found if line["event"] == journal.SEALED}
-        gone = marked & now.unmarked  # set and removed there: the number may be another mark's here
-        found = [line for line in found if line.get("segment") not in gone]
-        for number in marked - gone:
-            name = sealed_name(number)
-            if number in state.sealed or number not in now.sealed:
-                raise RefusedError(
-                    f"Recording {label!r} was marked here and in {self.name}, where it lacks "
-                    "payloads: note the mark there, `hybridlog mark --remove` it, copy again, and "
-                    "set it again."
-                )
+        found, marks = edits_of(data, state, self.name)
+        for name in marks:
             with suppress(FileExistsError):
                 files.link(old / name, self._path / name, new_depth=files.IN_RECORDING)
         files.sync_folder(self._path)
@@ -490,7 +475,7 @@ class DirectoryPlace:
         self._directory.sweep(hidden)
         return label
 
-    def hold(self) -> bool:
+    def hold(self, recordings: Sequence[str]) -> bool:
         """As of `Place`."""
         return self._held.enter_context(self._directory.retaining())
 
@@ -534,6 +519,39 @@ def copied_of(directory: StoreDirectory, label: str) -> Copied:
     state = journal.read(directory.recording(label)) or JournalState()
     digests = {number: sealed.digest for number, sealed in state.sealed.items()}
     return Copied(label, state.lacks_payloads, expired_in(state), content_of(digests))
+
+
+def edits_of(data: bytes, state: JournalState, place: str) -> tuple[list[journal.Event], list[str]]:
+    """Lines that users added to a copy, and the files of the marks that they set there.
+
+    Args:
+        data: The journal of the copy.
+        state: The journal that takes its place.
+        place: Where the copy is.
+
+    Raises:
+        RefusedError: A mark that was set here has the number of one there.
+    """
+    lines = [line for _, line in journal.read_lines(data) if line is not None]
+    adopted = [n for n, line in enumerate(lines, 1) if line["event"] == journal.ADOPTED]
+    found: list[journal.Event] = []
+    for line in lines[max(adopted, default=0) :]:
+        if line["event"] == journal.RENAMED:
+            found.append(journal.event(journal.RENAMED, name=line["name"]))
+        elif line["event"] in _EDITS:
+            found.append(line)
+    now = journal.parse(data)
+    marked = {line["segment"] for line in found if line["event"] == journal.SEALED}
+    gone = marked & now.unmarked  # set and removed there: the number may be another mark's here
+    marks = marked - gone
+    if marks & state.sealed.keys() or marks - now.sealed.keys():
+        raise RefusedError(
+            f"Recording {state.name!r} was marked here and in {place}, where its payloads or "
+            "its journal have to be completed first: note the mark there, `hybridlog mark "
+            "--remove` it, copy again, and set it again."
+        )
+    left = [line for line in found if line.get("segment") not in gone]
+    return left, [sealed_name(number) for number in sorted(marks)]
 
 
 def adopted_line(

@@ -164,9 +164,9 @@ class Server:
         said = {"label": label, "lacks_payloads": lacks_payloads}
         return str(self._ask("publish", lines, **said))
 
-    def hold(self) -> bool:
+    def hold(self, recordings: Sequence[str]) -> bool:
         """As of `Place`."""
-        return self._ask("hold") is True
+        return self._ask("hold", recordings=[*recordings]) is True
 
     def drop(self) -> None:
         """As of `Place`."""
@@ -309,7 +309,7 @@ _ANSWERS: Final[Mapping[str, Callable[[DirectoryPlace, Mapping[str, Any], bytes]
     "sees": lambda place, request, _: place.sees(str(request["mark"])),
     "have": _have,
     "segments": lambda place, request, _: place.segments(str(request["recording"])),
-    "hold": lambda place, *_: place.hold(),
+    "hold": lambda place, request, _: place.hold([str(one) for one in request["recordings"]]),
     "drop": lambda place, *_: place.drop(),
     "begin": _begin,
     "digest": lambda place, request, _: place.digest(

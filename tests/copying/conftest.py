@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, cast
@@ -46,11 +46,11 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path / "store"
 
 
-def expire(store: hl.Store, label: str) -> None:
-    """Delete the payloads of a recording."""
+def expire(store: hl.Store, label: str, segments: Sequence[int] = ()) -> None:
+    """Delete the payloads of segments of a recording; without, of all."""
     directory = store.directory
     with directory.writing(label):
-        numbers = [*directory.listing(label).sealed]
+        numbers = segments or [*directory.listing(label).sealed]
         expiry.expire(directory, label, numbers, min_bytes=0)
     store.session.catch_up()
 

@@ -286,10 +286,10 @@ def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: Pl
 
     def run_to(path: Path, change: Any = None) -> CopyReport:
         class Changed(Disturbed):
-            def hold(self) -> bool:
+            def hold(self, recordings: Sequence[str]) -> bool:
                 if change is not None:
                     change()
-                return bool(self.__getattr__("hold")())
+                return bool(self.__getattr__("hold")(recordings))
 
         told.clear()
         with hl.open(robot, mongo="none") as store, place_at(path) as place:

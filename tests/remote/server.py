@@ -55,7 +55,7 @@ class Proxy:
         sent: Bytes of their bodies.
         spoil: Called with the number of each request, from 1; says what becomes of it: "reset"
             before it reaches the server, "lost" after that, "503", "403", "cut" in the middle of
-            the answer, "slow", or "" for nothing.
+            the answer, "slow", "flip" for one bit of what it sends, or "" for nothing.
         delay: Seconds that each request takes longer.
         old_lists: Answers to requests for lists, once they are kept; None to pass them on.
         without_conditions: Drop the conditions of writers, as some servers do.
@@ -107,6 +107,8 @@ class Proxy:
         what = self.spoil(len(self.requests))
         body = client.rfile.read(int(headers.get("content-length", 0)))
         self.sent += len(body)
+        if what == "flip" and body:
+            body = bytes([body[0] ^ 1]) + body[1:]
         time.sleep(self.delay)
         if what == "reset":
             _break(client)

@@ -624,7 +624,12 @@ class RemoteDirectory(StoreDirectory):
 
     def is_damaged(self, label: str) -> bool:
         """True if objects of a recording were lost, as far as it was compared with them."""
-        return len(self.files_of(label)) < len(self._now.recordings[label].files)
+        return bool(self.lost_of(label))
+
+    def lost_of(self, label: str) -> dict[str, Object]:
+        """The files of a recording whose objects were lost, as far as it was compared with them."""
+        there = self.files_of(label)
+        return {p: o for p, o in self._now.recordings[label].files.items() if p not in there}
 
     def add_recording(
         self, label: str, recording: ListedRecording, tables: Mapping[str, Object]
@@ -633,6 +638,12 @@ class RemoteDirectory(StoreDirectory):
         self.source.bucket.lost.difference_update(recording.files.values(), tables.values())
         self._relist(label, recording)
         self._replace_tables(recording.id, tables)
+
+    def mend(self, label: str, found: Mapping[str, Object]) -> None:
+        """List objects of a recording in the place of lost ones, within `changing`."""
+        self.source.bucket.lost.difference_update(found.values())
+        listed = self._now.recordings[label]
+        self._relist(label, replace(listed, files={**listed.files, **found}))
 
     def move(self, old: str, new: str) -> None:
         """Give a recording another label, within `writing`."""

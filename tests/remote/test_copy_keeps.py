@@ -1,0 +1,153 @@
+"""A copy into a bucket never takes the place of more than it brings, and proves what it sent."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance.bucket_place import BucketPlace
+from hybridlog.maintenance.copying import CopyOptions, run
+from hybridlog_storage.disk import files
+from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.store import RemoteDirectory
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.copying.conftest import expire
+from tests.remote.conftest import BEGIN, SCAN
+from tests.remote.server import Proxy
+
+THEN = CopyOptions(then_expire=True)
+COUNT = 60
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> hl.Store:
+    """A store with a recording of three segments."""
+    store = hl.open(tmp_path / "robot", mongo="none", create=True)
+    noise = np.random.default_rng(1)
+    settings = SegmentSettings(chunk_size=4096, segment_size=45_000)
+    with store.start("run", settings=settings) as run:
+        for number in range(COUNT):
+            scan = struct.pack("<II", number, 500) + noise.random(500, np.float32).tobytes()
+            run.write(SCAN, scan, log_time=BEGIN + number * 10**8)
+    assert store.entry("run").segments == 3
+    return store
+
+
+def states(address: str | Path) -> dict[str, int]:
+    files.mounted.clear()
+    with hl.open(address) as store:
+        return dict(Counter(str(one.state) for one in store.topic("scan")))
+
+
+def lose(address: str, *names: str) -> None:
+    bucket = Bucket(address)
+    found = [o.name for o in bucket.objects("recordings") if o.name.rpartition("/")[2] in names]
+    bucket.delete(found)
+    files.mounted.clear()
+
+
+def test_only_lost_objects_are_replaced(robot: hl.Store, address: str) -> None:
+    """What only the bucket has stays, whatever was deleted here."""
+    robot.copy(address)
+    expire(robot, "run", [0, 1])
+    assert states(robot.directory.path)["expired"] > COUNT // 2
+    lose(address, "000002.mcap")
+    there = states(address)
+    assert there["whole"] < COUNT
+    report = robot.copy(address, options=THEN)
+    assert (report.copied, report.problems) == (["run"], [])
+    assert states(robot.directory.path) == {"expired": COUNT}  # all of it is there
+    assert states(address) == {"whole": COUNT}
+
+
+def test_what_neither_has_is_told(robot: hl.Store, address: str) -> None:
+    assert robot.copy(address, options=THEN).freed_bytes
+    lose(address, "000001.mcap")
+    there = states(address)
+    for _ in range(2):
+        report = robot.copy(address, options=THEN)
+        assert report.copied == []
+        assert "has lost 000001.mcap, which this store does not have" in report.refused["run"]
+        assert states(address) == there
+    lose(address, "journal")
+    report = robot.copy(address, options=THEN)
+    assert "has payloads that are not here, in 000000.mcap, 0000" in report.refused["run"]
+
+
+def test_a_lost_journal_is_brought_back(robot: hl.Store, address: str) -> None:
+    """With what was added there since."""
+    robot.copy(address)
+    with hl.open(address) as there:
+        there.tag("run", seen="yes")
+        there.mark("run", "+1s", "lab")
+    lose(address, "journal")
+    assert robot.copy(address).copied == ["run"]
+    files.mounted.clear()
+    with hl.open(address) as there:
+        assert not there.verify().findings
+        assert there.entry("run").tags == {"seen": "yes"}
+        assert [mark["text"] for mark in there.entry("run").marks] == ["lab"]
+
+
+@pytest.mark.parametrize("has_digests", [True, False])
+def test_what_did_not_arrive_as_sent(
+    robot: hl.Store, address: str, proxy: Proxy, has_digests: bool
+) -> None:
+    """Payloads stay here; also if the tags of the server are no digests of what it got."""
+
+    spoiled = ["000001.mcap"]
+
+    def spoil(number: int) -> str:
+        method, path, _ = proxy.requests[number - 1]
+        puts = [name for what, name, _ in proxy.requests if what == "PUT"]
+        is_first_probe = "/probe-" in path and puts.count(path) == 1
+        is_wrong = any(name in path for name in spoiled) or (is_first_probe and not has_digests)
+        return "flip" if method == "PUT" and is_wrong else ""
+
+    proxy.spoil = spoil
+    report = robot.copy(address, options=THEN)
+    assert "000001.mcap did not arrive" in report.refused["run"]
+    assert states(robot.directory.path) == {"whole": COUNT}
+    proxy.spoil = lambda number: (
+        "" if "000001.mcap" in proxy.requests[number - 1][1] else spoil(number)
+    )
+    report = robot.copy(address, options=THEN)
+    assert (report.copied, report.problems) == (["run"], [])
+    read = [path for method, path, _ in proxy.requests if method == "GET" and ".mcap" in path]
+    assert has_digests or read
+    assert states(address) == {"whole": COUNT}
+
+
+def test_nothing_is_deleted_there_while_it_is_deleted_here(robot: hl.Store, address: str) -> None:
+    told: list[str] = []
+
+    def proved(recording: str, _: object) -> None:
+        told.append(recording)
+        with hl.open(address) as there:
+            assert there.keep({"quota": "1kB", "fields-age": "1d"}).freed_bytes == 0
+
+    place = BucketPlace(RemoteDirectory.create_in(address), robot.catalog, robot.session.tables)
+    report = run(robot.directory, place, robot.summaries(), THEN, proved=proved)
+    assert (told, report.problems) == ([robot.entry("run").id], [])
+    assert states(address) == {"whole": COUNT}
+    with hl.open(address) as there:
+        assert not there.entry("run").pins
+        assert there.keep({"quota": "1kB"}).freed_bytes
+
+
+def test_a_removed_mark_there_is_no_mark(robot: hl.Store, address: str) -> None:
+    robot.copy(address, options=CopyOptions(only_fields=True))
+    with hl.open(address) as there:
+        there.mark("run", "+1s", "lab")
+        there.unmark("run", "lab")
+        there.tag("run", seen="yes")
+    robot.mark("run", "+2s", "here")
+    assert robot.copy(address).copied == ["run"]
+    assert states(address) == {"whole": COUNT}
+    with hl.open(address) as there:
+        assert (there.entry("run").tags, not there.verify().findings) == ({"seen": "yes"}, True)
