@@ -1262,7 +1262,7 @@ class Store:
             What went, and why.
 
         Raises:
-            UsageError: A rule is malformed.
+            UsageError: A rule is malformed, or not for a bucket.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
         from hybridlog.entries import put_entry
@@ -1271,6 +1271,7 @@ class Store:
 
         wanted = Rules.of(self.directory.settings.retention if rules is None else rules)
         is_remote = self.directory.is_remote
+        wanted.check_place(is_remote=is_remote)
         put = partial(put_entry, self.directory, self.catalog)
         keeper = Keeper(self.directory, self.remove, changed=put if is_remote else lambda _: None)
         if dry_run:

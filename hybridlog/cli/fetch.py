@@ -221,7 +221,7 @@ def _destination(choices: _Choices) -> Destination:
 
 
 def _check_together(choices: _Choices) -> None:
-    """Refuse options that --at or --follow make no sense with."""
+    """Refuse options that make no sense together."""
     with_others = any(map(_names_topics, choices.where)), "--where with other topics"
     alone: dict[str, list[tuple[bool, str]]] = {}
     if choices.split is not None:
@@ -231,6 +231,11 @@ def _check_together(choices: _Choices) -> None:
             (choices.follow, "--follow"),
             (choices.reverse, "--reverse"),
             (choices.form == "table", "--format table"),
+        ]
+    if choices.count:
+        alone["--count prints a number"] = [
+            (choices.output is not None, "--output"),
+            (choices.form is not None, "--format"),
         ]
     if choices.at is not None:
         alone["--at gives one message, by log time"] = [

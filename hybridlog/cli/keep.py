@@ -221,6 +221,7 @@ def _keep(
             "--fields-age, or write them into [retention] of hybridlog.toml, as --save does."
         )
     if given["save"]:
+        Rules.of(rules).check_place(is_remote=store.directory.is_remote)
         store.directory.check_changes()
         store.directory.change_settings(retention=rules)
     dry_run = given["dry_run"]

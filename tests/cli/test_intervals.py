@@ -164,6 +164,8 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
             ("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "1s", "--at", "0"),
             "leave out --where",
         ),
+        (("fetch", "-t", "odom", "--count", "-o", "x.csv"), "leave out --output"),
+        (("fetch", "-t", "odom", "--count", "-F", "csv"), "leave out --format"),
         (("intervals", "-t", "/camera/*/image_raw"), "one topic"),
         (("intervals", *GRIPPER, "--where", "position ="), "value"),
         (("intervals", *GRIPPER, "--at-least", "soon"), "not a duration"),

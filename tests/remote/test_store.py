@@ -20,7 +20,7 @@ import hybridlog as hl
 from hybridlog.maintenance.bucket_place import BucketPlace
 from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import (
+from hybridlog_storage.errors import (, UsageError
     BucketError,
     HybridlogError,
     ObjectExistsError,
@@ -187,6 +187,11 @@ def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
         assert len(store.unmark("run", "wrong").marks) == 2
         pin = store.pin("run", "+0s", "+5s", reason="to keep")
         assert store.unpin(store.pin("moved")) is None
+        rule = ("keep", "--min-free", "1GB", "--save")
+        answer(*rule, store=Path(address), code=2)
+        assert not directory.settings.retention
+        with pytest.raises(UsageError, match="use --quota"):
+            store.keep({"min-free": "1GB"})
         said = answer("keep", "--quota", "1MB", "--save", "--json", store=Path(address), code=None)
         print(said.err)
         assert said.json["freed_bytes"] > 500_000
