@@ -20,7 +20,7 @@ import hybridlog as hl
 from hybridlog.maintenance.bucket_place import BucketPlace
 from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import (, UsageError
+from hybridlog_storage.errors import (
     BucketError,
     HybridlogError,
     ObjectExistsError,
