@@ -76,10 +76,11 @@ def remove(given: _Fields) -> None:
 
 @command(_Shared, to=index_command)
 def address(given: _Shared) -> None:
-    """Print the address of the index for other programs, and what is in it.
+    """Print where other programs find the index.
 
-    The index is brought up to date first. The embedded MongoDB keeps its address, waits ten
-    minutes for the first client, and runs as long as one is connected.
+    Also its collections, and how many documents they have. The index is brought up to date
+    first. The embedded MongoDB keeps its address, waits ten minutes for the first client, and
+    runs as long as one is connected.
     """
     with given.opened(needs_database=True) as store:
         found = store.index_address()
