@@ -180,10 +180,13 @@ class Aligned:
         names = [name for stream in self._others for name in stream.question.topics]
         return f"<Aligned {', '.join(names)}; {self._how}>"
 
-    def to_tables(self) -> Iterator[pa.Table]:
+    def to_tables(self, told: int | None = None) -> Iterator[pa.Table]:
         """The rows in Arrow tables of bounded size; at least one, possibly empty.
 
         The type of a column may differ between tables if no definition fixes it.
+
+        Args:
+            told: `rows`, `empty` and `remarks` are about so many first rows; None for all.
         """
         for stream in self._streams:
             stream.counters.reset()
@@ -198,11 +201,17 @@ class Aligned:
                 partner.enter(recording, _end_of(resolved, self._clock))
             for times, table in self._base.tables(recording):
                 label = resolved.summary.label if several else None
-                for rows in _pieces(times, partners):
+                left = None if told is None else told - self.rows
+                for rows in _pieces(times, partners, left):
                     own = table.slice(rows.start, rows.stop - rows.start)
-                    self.rows += own.num_rows
+                    before = Counter(self._empty)
                     _count_blanks(self._empty, own, 0)
                     beside = [partner.rows(times[rows]) for partner in partners]
+                    if told is None or self.rows < told:
+                        self.rows += own.num_rows
+                    else:
+                        self._empty.clear()
+                        self._empty.update(before)
                     yield _side_by_side(own, label, beside)
                 given = given or bool(table.num_rows)
         if not given:
@@ -488,13 +497,20 @@ def _count_blanks(empty: Counter[tuple[str, str]], table: pa.Table, known: int) 
             empty[name, _NO_VALUE] += column.null_count - known
 
 
-def _pieces(times: NDArray[np.int64], partners: Sequence[_Partner | Bins]) -> Iterator[slice]:
-    """Rows in pieces that stay small where many rows have the same large message."""
+def _pieces(
+    times: NDArray[np.int64], partners: Sequence[_Partner | Bins], left: int | None
+) -> Iterator[slice]:
+    """Rows in pieces that stay small where many rows have the same large message.
+
+    One ends behind `left` rows, if there are more.
+    """
     begin = 0
     while begin < len(times):
         rest = times[begin:]
         row = sum(one.row_bytes(rest) for one in partners if isinstance(one, _Partner))
         end = min(begin + max(_PIECE_BYTES // max(row, 1), 1), len(times))
+        if left is not None and begin < left < end:
+            end = left
         yield slice(begin, end)
         begin = end
 

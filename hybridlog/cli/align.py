@@ -101,7 +101,7 @@ def _resample(
     if given.fields:
         query = query.fields(*parse_fields(",".join(given.fields)))
     rows = query.resample(given.step or 0, given.how, given.tolerance)
-    answer_tables(rows.to_tables(), rows.schema, to)
+    answer_tables(rows.to_tables(to.shown), rows.schema, to)
     return rows.counters, rows.remarks(*topics)
 
 
@@ -139,7 +139,7 @@ def _align(
     )
     # That there is a transform shows only at the end.
     completeness = aligned.completeness if given.strict else None
-    answer_tables(aligned.to_tables(), aligned.schema, to, completeness)
+    answer_tables(aligned.to_tables(to.shown), aligned.schema, to, completeness)
     return aligned.counters, aligned.remarks(base, *topics)
 
 

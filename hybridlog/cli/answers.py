@@ -62,6 +62,8 @@ SCREEN_ROWS: Final = 20
 _LINES_AT_ONCE: Final = 4096
 TABLE_FORMATS: Final = formats_of("lines", "table")
 """Formats of tables that are no messages."""
+_LISTING_FORMATS: Final = [name for name in TABLE_FORMATS if not OUTPUTS[name].is_of_places]
+"""Those of rows that have no place."""
 
 Progress = Callable[[], None]
 
@@ -100,6 +102,11 @@ class Destination:
     limit: int | None = None
     quiet: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> int | None:
+        """Maximum number of rows of a table that are printed or written; None for all."""
+        return SCREEN_ROWS if self.limit is None and self.form == SCREEN else self.limit
 
     @contextmanager
     def opened(self) -> Iterator[Target]:
@@ -215,8 +222,9 @@ class Tabular(Forced, AsJson):
 class Listing(Tabular):
     """Options of commands that answer with rows, which are text unless another form is given."""
 
+    formats: ClassVar[Sequence[str]] = _LISTING_FORMATS
     usual: ClassVar[tuple[str, str]] = SCREEN, SCREEN
-    form: str | None = format_option(TABLE_FORMATS, "")
+    form: str | None = format_option(_LISTING_FORMATS, "")
 
     def answer(
         self,

@@ -101,6 +101,7 @@ class OutputFormat:
         suffixes: Suffixes of file names, the usual one first; none if it writes a directory.
         is_text: It can be read on a terminal, and written a message at a time.
         has_profile: The writer takes the MCAP `profile` of the messages, too.
+        is_of_places: It is for poses and places alone.
     """
 
     content: Content
@@ -108,6 +109,7 @@ class OutputFormat:
     suffixes: tuple[str, ...]
     is_text: bool = False
     has_profile: bool = False
+    is_of_places: bool = False
 
     def open(self, target: Target, **options: Any) -> Any:
         """Open a writer of `hybridlog.formats.writing`, according to `content`.
@@ -132,9 +134,15 @@ OUTPUTS: Final[dict[str, OutputFormat]] = {
     ),
     "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:BagWriter", (".bag",)),
     "rosbag2": OutputFormat("log", "hybridlog.formats.rosbag2.writer:Rosbag2Writer", ()),
-    "tum": OutputFormat("table", "hybridlog.formats.places:TumWriter", (".tum",), is_text=True),
+    "tum": OutputFormat(
+        "table", "hybridlog.formats.places:TumWriter", (".tum",), is_text=True, is_of_places=True
+    ),
     "geojson": OutputFormat(
-        "table", "hybridlog.formats.places:GeoJsonWriter", (".geojson",), is_text=True
+        "table",
+        "hybridlog.formats.places:GeoJsonWriter",
+        (".geojson",),
+        is_text=True,
+        is_of_places=True,
     ),
     "ply": OutputFormat("payloads", "hybridlog.formats.ply:PlyWriter", ()),
     "raw": OutputFormat("payloads", "hybridlog.formats.raw:open_raw_writer", ()),

@@ -529,8 +529,11 @@ def test_the_commands(logs: Logs, tmp_path: Path) -> None:
     cost, *why = done.err.splitlines()
     assert cost.endswith(" s")
     assert "/left/pose: 87 of 260 rows are empty: no message within 5ms." in why
-    lines = [json.loads(line) for line in run(*asked, "-n", "30", store=store).lines]
+    first = run(*asked, "-n", "30", store=store)
+    lines = [json.loads(line) for line in first.lines]
     assert len(lines) == 30
+    empty = want["left/pose.state"].to_pylist()[:30].count(None)
+    assert f"/left/pose: {empty} of 30 rows are empty: no message within 5ms." in first.err
     assert lines[0]["log_time_ns"] == want["log_time"][0].value
     assert [row["left/pose.state"] for row in lines] == want["left/pose.state"].to_pylist()[:30]
     shown = run(

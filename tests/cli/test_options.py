@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def test_topics_are_arguments_or_options(store: Path) -> None:
         assert "Missing TOPIC" in str(_error(command, *more, store=store))
 
 
-def _error(*words: str, store: Path) -> str:
+def _error(*words: object, store: Path) -> str:
     with pytest.raises(AssertionError) as caught:
         answer(*words, store=store)
     return str(caught.value)
@@ -67,6 +68,13 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
     assert _set(json.loads(lines[0])) == _set(rows[0])
     assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
     assert "--json is --format json" in _error(*words, "--json", "-F", "csv", store=store)
+    # Rows without a place are not offered the formats of places.
+    assert "tum" not in answer(words[0], "--help", store=store).out
+    assert "does not give the format" in _error(*words, "-o", tmp_path / "a.tum", store=store)
+
+
+def test_help_cuts_no_line(store: Path) -> None:
+    assert not re.search(r"[^\]]\.\.\.$", answer("index", "--help", store=store).out, re.MULTILINE)
 
 
 def _set(row: dict[str, object]) -> dict[str, object]:
