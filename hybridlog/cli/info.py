@@ -35,7 +35,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import MAX_LISTED
-from hybridlog_storage.errors import SegmentError, StoreError, UsageError
+from hybridlog_storage.errors import SegmentError, SourceError, StoreError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
@@ -89,9 +89,15 @@ def info_command(given: _Given) -> None:
     if len(given.names) == 1 and _is_segment(given.names[0]):
         show_segment(Path(given.names[0]), as_json=given.as_json)
         return
-    with given.opened() as store:
-        if not _show_part(store, given):
-            _show(store, given)
+    try:
+        with given.opened() as store:
+            if not _show_part(store, given):
+                _show(store, given)
+    except (StoreError, UsageError):
+        # The directory of a ROS 2 bag may be named like its recording.
+        if len(given.names) == 1 and Path(given.names[0], "metadata.yaml").exists():
+            _refuse_log(Path(given.names[0]))
+        raise
 
 
 def _check(given: _Given) -> None:
@@ -173,7 +179,7 @@ def _extras(
 
 def _is_segment(what: str) -> bool:
     """True for the path of a file; names and ids of recordings have no slash."""
-    looks = "/" in what or what.endswith((".mcap", ".mcap.open"))
+    looks = "/" in what or what.endswith((".mcap", ".mcap.open", ".bag", ".db3"))
     return looks and Path(what).exists()
 
 
@@ -245,9 +251,9 @@ def _rate(channel: ChannelEntry) -> float | None:
 
 
 def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
-    """Log time minus header stamp, ns."""
+    """Log time minus header stamp, ns; None if there are stamps of zero, which were not set."""
     stats = channel.stats
-    if not stats.stamped:
+    if not stats.stamped or stats.first_stamp == 0:
         return None
     return {
         "mean": stats.skew_sum / stats.stamped,
@@ -423,7 +429,9 @@ def _channel_row(
     if video is not None and video.frames:
         notes.append(_video_text(video, stats.messages))
     skew = "-" if is_decoded else "?"
-    if stats.stamped:
+    if stats.first_stamp == 0:
+        skew = "not set" if stats.last_stamp == 0 else "not always set"
+    elif stats.stamped:
         skew = output.short_duration(round(stats.skew_sum / stats.stamped))
     encoding = encoding_of(channel.message_encoding, channel.metadata)
     kind = channel.type or encoding
@@ -463,6 +471,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     Raises:
         StoreError: It is being written, or is no segment of a store.
     """
+    from hybridlog_storage.journal import JOURNAL
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
     stem = path.name.split(".")[0]
@@ -471,13 +480,15 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             f"{path} is being written, or was left by a crash. Any command on its store, such as "
             "`hybridlog ls --store DIR`, seals segments that a crash left."
         )
-    if not path.is_file():
-        raise StoreError(f"{path} is no file; a segment is a file that ends in .mcap.")
-    _check_magic(path)
     number = int(stem) if stem.isascii() and stem.isdigit() else 0
-    with SegmentReader(path, number) as reader:
-        summary = reader.summary()
-        bytes_all = reader.size
+    try:
+        with SegmentReader(path, number) as reader:
+            summary = reader.summary()
+            bytes_all = reader.size
+    except SegmentError:
+        if not (path.parent / JOURNAL).exists():
+            _refuse_log(path)
+        raise
     chunks = summary.chunks
     channels = [
         {
@@ -528,17 +539,18 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     )
 
 
-def _check_magic(path: Path) -> None:
-    """Tell another file from a damaged segment."""
-    from hybridlog_storage.mcap.mcap_scan import MAGIC
+def _refuse_log(path: Path) -> None:
+    """Tell a log, and a file of another kind, from a segment."""
+    from hybridlog.formats.detect import open_source
+    from hybridlog.record.recorder import name_of
 
     try:
-        with path.open("rb") as file:
-            begins = file.read(len(MAGIC))
-    except OSError as error:
-        raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
-    if begins != MAGIC:
+        open_source(path).close()
+    except SourceError as error:
         raise StoreError(
-            f"{path} is no segment of a hybridlog store. If it is a log, `hybridlog record {path}` "
-            "records it."
-        )
+            f"{path} is no segment of a hybridlog store, and no log: {error}"
+        ) from None
+    raise StoreError(
+        f"{path} is a log, and `info` is about recordings: `hybridlog record {path}`, then "
+        f"`hybridlog info {name_of(path)}`."
+    )

@@ -140,7 +140,7 @@ def record(
         directory,
         catalog,
         target,
-        name=options.name or _name_of(source.path),
+        name=options.name or name_of(source.path),
         tags=options.tags,
         source={
             "path": text(str(source.path)),
@@ -353,7 +353,8 @@ def _refuse_known(catalog: Catalog, source: Source, fingerprint: Fingerprint) ->
         )
 
 
-def _name_of(path: Path) -> str:
+def name_of(path: Path) -> str:
+    """The name of the recording of a log, unless one is given."""
     name = path.resolve().name
     for suffix in (".active", ".zstd", ".bag", ".mcap", ".db3"):
         name = name.removesuffix(suffix)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import struct
 from pathlib import Path
 
 from mcap.writer import Writer
 from rosbags.rosbag1 import Reader
+from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 import hybridlog as hl
 from hybridlog.cli.info import _channel_row
@@ -18,6 +21,8 @@ from tests.independent import read_bag
 
 from .odd_log import HOSTILE_NAME
 from .running import run
+
+HEADER = b"=" * 80 + b"\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 
 
 def test_ls(logs: Path, store: Path) -> None:
@@ -91,10 +96,47 @@ def test_info_of_a_segment(logs: Path, store: Path) -> None:
     assert found["recording"]["id"] == run("info", "robot", "--json", store=store).json["id"]
     assert sum(c["messages"] for c in found["channels"]) == len(read_bag(logs / "robot.bag"))
     assert "/base/scan" in run("info", path).out
-    for log in ("odd.mcap", "robot.bag"):
-        refused = run("info", logs / log, code=5)
-        assert "is no segment of a hybridlog store" in refused.err
-        assert "restore" not in refused.err
+
+
+def test_a_log_is_told_from_a_recording(logs: Path, store: Path, tmp_path: Path) -> None:
+    with Rosbag2Writer(tmp_path / "bag2", version=9):
+        pass
+    for log, name in (
+        (logs / "odd.mcap", "odd"),
+        (logs / "robot.bag", "robot"),
+        (tmp_path / "bag2", "bag2"),
+        (Path("bag2"), "bag2"),
+    ):
+        with contextlib.chdir(tmp_path):
+            refused = run("info", log, store=store, code=5)
+        assert refused.err == (
+            f"hybridlog: {log} is a log, and `info` is about recordings: `hybridlog record {log}`, "
+            f"then `hybridlog info {name}`.\n"
+        )
+    (tmp_path / "text.mcap").write_text("text")
+    assert "no log: " in run("info", tmp_path / "text.mcap", code=5).err
+
+
+def test_stamps_that_were_not_set_are_no_delay(tmp_path: Path) -> None:
+    kind = Schema("test_msgs/A", "ros1msg", b"Header header\n" + HEADER)
+    stamps = {"/never": [0, 0], "/late": [0, 5], "/all": [5, 5]}
+    with (
+        hl.open(tmp_path / "s", create=True, mongo="none") as store,
+        store.start("mine") as recording,
+    ):
+        for topic, seconds in stamps.items():
+            channel = Channel(topic, "ros1", kind)
+            for sec in seconds:
+                payload = struct.pack("<4I", 0, sec, 0, 0)
+                recording.write(channel, payload, log_time=7 * 10**9)
+    told = {
+        line.split()[0]: line for line in run("info", "mine", store=tmp_path / "s").lines if line
+    }
+    assert "  not set" in told["/never"]
+    assert "  not always set" in told["/late"]
+    assert "  2s" in told["/all"]
+    found = run("info", "mine", "--json", store=tmp_path / "s").json["channels"]
+    assert [one["topic"] for one in found if one["skew_ns"]] == ["/all"]
 
 
 def test_a_recording_that_is_not_there(store: Path) -> None:
