@@ -85,11 +85,13 @@ def check_command(given: _Check) -> None:
             *((name, "right") for name in ("late", "early", "lost")),
         ]
         is_one = len({one.recording for one in found}) == 1
+        # Losses are left out only where there are none; a late start may be why a topic is bad.
+        no_losses = () if any(one.lost != 0 for one in found) else ("lost",)
         given.answer(
             map(asdict, found),
             columns[1:] if is_one else columns,
             lambda row: _cells(row)[is_one:],
-            ("early", "late", "from", "jitter", "Hz"),
+            ("from", "jitter", "Hz", *no_losses, "early", "late"),
         )
         if not found and not given.quiet:
             output.note("No topic.")

@@ -132,14 +132,13 @@ def _intervals(given: _Given, query: Query) -> Intervals:
 
 
 def _show(given: _Given, found: Intervals, asked: Answering) -> None:
-    from hybridlog.query.times import format_duration, format_time
+    from hybridlog.query.times import format_duration
 
     labels = {recording.id: recording.label for recording in asked.store.summaries()}
-    narrow = output.is_narrow()
     columns: list[output.Column] = [
         ("recording", "left"),
         ("begin", "whole"),
-        *([] if narrow else [("end", "whole")]),  # type: ignore[list-item]
+        ("end", "whole"),
         ("duration", "right"),
         ("messages", "right"),
     ]
@@ -148,8 +147,7 @@ def _show(given: _Given, found: Intervals, asked: Answering) -> None:
         begin, end = row["begin_ns"], row["end_ns"]
         return [
             str(row["recording"]),
-            format_time(begin),
-            *([] if narrow else [format_time(end)]),
+            *output.begin_and_end(begin, end),
             format_duration(end - begin),
             str(row["messages"]),
         ]

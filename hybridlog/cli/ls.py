@@ -46,7 +46,18 @@ def _print(recordings: Sequence[RecordingSummary]) -> None:
         ("note", "left"),
     ]
     rows = [_row(entry, narrow=narrow) for entry in recordings]
-    output.print_pages(*output.fitted(columns, rows, ("topics", "stored")))
+    output.print_pages(*_with_short_notes(*output.fitted(columns, rows, ("topics", "stored"))))
+
+
+def _with_short_notes(
+    columns: Sequence[output.Column], rows: Sequence[Sequence[str]]
+) -> tuple[Sequence[output.Column], Sequence[Sequence[str]]]:
+    """The same table, where notes are cut short if the terminal has no room for them."""
+    headings = [heading for heading, _ in columns]
+    room = output.room(headings, [row[:-1] for row in rows]) + len(headings[-1])
+    if output.fits(headings, rows):
+        return columns, rows
+    return columns, [[*row[:-1], output.cut(row[-1], max(room, _LEAST_NOTE))] for row in rows]
 
 
 def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
@@ -74,6 +85,7 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     ]
 
 
+_LEAST_NOTE = 12
 _STATUS = {
     "open": "being recorded",
     "damaged": "source damaged",

@@ -235,9 +235,9 @@ def quoted(text: str) -> str:
     return f"'{printable(raw.decode('utf-8', 'backslashreplace'))}'"
 
 
-def cut(line: str) -> str:
-    """A line, cut off where it is longer than 100 characters."""
-    return line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…"
+def cut(line: str, most: int = _MAX_LINE) -> str:
+    """A line, cut off where it is longer than so many characters."""
+    return line if len(line) <= most else f"{line[: most - 1]}…"
 
 
 def say(text: str = "") -> None:
@@ -302,6 +302,17 @@ def short_time(ns: int, *, minutes: bool = False) -> str:
 
     whole = format_time(ns - ns % 10**9)
     return whole[:16] + "Z" if minutes else whole
+
+
+def begin_and_end(begin: int, end: int) -> tuple[str, str]:
+    """Times in UTC; on a narrow terminal to the ms, and the end without the day of the begin."""
+    from hybridlog.query.times import format_time
+
+    if not is_narrow():
+        return format_time(begin), format_time(end)
+    first, last = (format_time(ns - ns % 10**6) for ns in (begin, end))
+    day, _, time = last.partition("T")
+    return first, time if first.startswith(day) else last
 
 
 def short_duration(ns: int) -> str:

@@ -93,11 +93,9 @@ def stats_command(given: _Given) -> None:
 
 
 def _cells_of_rate(row: Mapping[str, Any]) -> list[str]:
-    from hybridlog.query.times import format_time
-
     rate = "" if row["rate"] is None else f"{row['rate']:.2f}"
-    times = format_time(row["begin_ns"]), format_time(row["end_ns"])
-    return [row["topic"], times[0], times[1], row["recording"], str(row["messages"]), rate]
+    times = output.begin_and_end(row["begin_ns"], row["end_ns"])
+    return [row["topic"], *times, row["recording"], str(row["messages"]), rate]
 
 
 def _number(value: float | None) -> str:
