@@ -37,6 +37,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
         "Delete payloads here once their copy is proved there; pinned ones stay."
     )
     limit_rate: str | None = option("Bytes a second at most, such as 5MB/s.", "RATE")
+    check: bool = option("Read copies that are there already, too, and mend them in a bucket.")
     watch: bool = option("Go on with what ends later, until Ctrl-C.")
     ssh: str | None = option(
         "The ssh program, with options; without, ssh.",
@@ -61,7 +62,9 @@ def copy_command(given: _Copy) -> None:
         _receive(Path(given.to))
         return
     rate = _rate(given.limit_rate)
-    how = CopyOptions(given.only_fields, given.then_expire, rate, given.ssh, given.program)
+    how = CopyOptions(
+        given.only_fields, given.then_expire, rate, given.ssh, given.program, check=given.check
+    )
     with (
         given.opened(is_lasting=given.watch) as store,
         if_stopped("What arrived stays there: run the command again."),

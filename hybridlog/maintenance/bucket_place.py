@@ -37,10 +37,10 @@ from hybridlog.schema.states import expired_messages
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import PAYLOADS
-from hybridlog_storage.errors import ObjectExistsError, StoreError, unreadable
+from hybridlog_storage.errors import ObjectChangedError, ObjectExistsError, StoreError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.remote import TRIES
-from hybridlog_storage.remote.bucket import Upload, path_of
+from hybridlog_storage.remote.bucket import Upload, other_name, path_of
 from hybridlog_storage.remote.lists import RECORDINGS, TABLES, ListedRecording
 from hybridlog_storage.segments.segment_file import sealed_name
 
@@ -74,6 +74,7 @@ class BucketPlace:
         self._recording = ""
         self._is_mending = False
         self._pins: dict[str, str] = {}  # by id of the recording
+        self._damaged: set[Object] = set()
         self._there: dict[str, Object] = {}  # by path below the recording
         self._proven: dict[str, CopiedFile] = {}
         self._upload: Upload | None = None
@@ -90,6 +91,7 @@ class BucketPlace:
 
     def _copied(self, label: str, recording: str) -> Copied:
         self._target.source.compare(recording)
+        self._target.source.bucket.lost.update(self._damaged)
         row = self._own.recording(recording)
         if row is None or expired_messages(row[1]):
             found = copied_of(self._target, label)
@@ -116,8 +118,9 @@ class BucketPlace:
             lost = [*self._lost(known.label).values()] if self._is_mending else None
         self._recording = recording
         bucket, folder = self._target.source.bucket, f"{RECORDINGS}/{recording}/"
+        damaged = {one.name for one in self._damaged}  # whatever their entity tags say
         for one in sorted(bucket.objects(folder), key=lambda one: one.modified):
-            if one.name in listed or bucket.is_young(one):
+            if one.name in listed or (bucket.is_young(one) and one.name not in damaged):
                 self._there[path_of(one.name[len(folder) :])] = replace(one, modified=0)
         sizes = {path.removeprefix(f"{PAYLOADS}/"): o.size for path, o in self._there.items()}
         return Begun(sizes=sizes, lost=lost)
@@ -147,6 +150,8 @@ class BucketPlace:
         """As of `Place`; from the first byte on."""
         if at == 0 or self._upload is None:
             name = f"{RECORDINGS}/{self._recording}/{_path(file)}"
+            if any(one.name == name for one in self._damaged):
+                name = other_name(name)
             self._upload = Upload(self._target.source.bucket, name, file.bytes)
         self._upload.write(data)
 
@@ -313,8 +318,23 @@ class BucketPlace:
         self._proven.clear()
 
     def problems(self, recording: str) -> list[str]:
-        """As of `Place`."""
-        return problems_of(self._target, self._target.labels_by_id().get(recording))
+        """As of `Place`; damaged objects count as lost from here on."""
+        label = self._target.labels_by_id().get(recording)
+        objects = {} if label is None else self._target.files_of(label)
+
+        def is_whole(file: CopiedFile) -> bool:
+            """True if an object is, whatever was kept of it here."""
+            with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
+                try:
+                    self._target.fetch(objects[_path(file)], file.below(Path(place)))
+                except (KeyError, FileNotFoundError, ObjectChangedError):
+                    return False
+                if not file.is_whole(Path(place)):
+                    self._damaged.add(objects[_path(file)])
+                    return False
+            return True
+
+        return problems_of(self._target, label, is_whole)
 
     def _bring_fields(self, entry: RecordingEntry) -> dict[str, Object]:
         """Create the objects of a recording's fields; each file has no other recording."""

@@ -59,6 +59,7 @@ class CopyOptions:
         ssh: The program, with options, that reaches `ssh://` places; None for `ssh`.
         program: hybridlog on the other side.
         piece: Bytes sent at once; what a cut costs.
+        check: Read the copies that are there already, too.
     """
 
     only_fields: bool = False
@@ -67,6 +68,7 @@ class CopyOptions:
     ssh: str | None = None
     program: str = "hybridlog"
     piece: int = 256 << 10
+    check: bool = False
 
 
 @dataclass(slots=True)
@@ -156,6 +158,8 @@ class _Copying:
         for begin in range(0, len(chosen), _ASKED_AT_ONCE):
             asked = chosen[begin : begin + _ASKED_AT_ONCE]
             there |= self._place.have([one.id for one in asked])
+        if self._options.check:
+            there = self._checked(there)
         wanted = [one for one in chosen if not self._is_known(one.id, there.get(one.id))]
         self._total = sum(one.stored_bytes for one in wanted)
         missing = {one.id for one in wanted}
@@ -237,6 +241,19 @@ class _Copying:
         if there.is_damaged or not there.lacks_payloads:
             return not there.is_damaged
         return self._state(recording).lacks_payloads
+
+    def _checked(self, there: Mapping[str, Copied]) -> dict[str, Copied]:
+        """Read what is there; where damaged files can be replaced, the place notes them."""
+        for recording, known in there.items():
+            problems = self._place.problems(recording)
+            found = self._place.have([recording]).get(recording)
+            if problems and not (found is not None and found.is_damaged):
+                self._report.problems.append(
+                    f"{known.label} in {self._place.name} is damaged: {'; '.join(problems[:3])}. "
+                    f"Restore it, or remove it there (`hybridlog rm {known.label}`), and copy "
+                    "again."
+                )
+        return self._place.have([*there])
 
     def _state(self, recording: str) -> JournalState:
         """The journal of a recording here; an empty one if it cannot be read."""

@@ -497,12 +497,17 @@ class DirectoryPlace:
         return problems_of(self._directory, self._labels().get(recording))
 
 
-def problems_of(directory: StoreDirectory, label: str | None) -> list[str]:
+def problems_of(
+    directory: StoreDirectory,
+    label: str | None,
+    is_whole: Callable[[CopiedFile], bool] | None = None,
+) -> list[str]:
     """Read a whole recording, and say what is wrong with it.
 
     Args:
         directory: Its store.
         label: Its label; None if it is gone.
+        is_whole: Reads a file of it; None to read it where it is.
     """
     if label is None:
         return ["it is gone"]
@@ -511,7 +516,8 @@ def problems_of(directory: StoreDirectory, label: str | None) -> list[str]:
     if not inventory.is_proven:
         found.append("it is incomplete")
     path = directory.recording(label)
-    return found + [f"{f.file} is damaged" for f in files_of(inventory) if not f.is_whole(path)]
+    is_whole = is_whole or (lambda file: file.is_whole(path))
+    return found + [f"{f.file} is damaged" for f in files_of(inventory) if not is_whole(f)]
 
 
 def copied_of(directory: StoreDirectory, label: str) -> Copied:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _REPAIR = "run `hybridlog repair`"
 RESTORE = "restore the file from a copy"
-_COPY_AGAIN = "`hybridlog copy` from a store that has it brings it back"
+_COPY_AGAIN = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
 _NOTING_S = 2.0  # that a recorder may take to note a segment that it has sealed
 _KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})

@@ -55,7 +55,7 @@ class Proxy:
         sent: Bytes of their bodies.
         spoil: Called with the number of each request, from 1; says what becomes of it: "reset"
             before it reaches the server, "lost" after that, "503", "403", "cut" in the middle of
-            the answer, "slow", "flip" for one bit of what it sends, or "" for nothing.
+            the answer, "slow", "flip" for one bit of it and of the answer, or "" for nothing.
         delay: Seconds that each request takes longer.
         old_lists: Answers to requests for lists, once they are kept; None to pass them on.
         without_conditions: Drop the conditions of writers, as some servers do.
@@ -107,8 +107,8 @@ class Proxy:
         what = self.spoil(len(self.requests))
         body = client.rfile.read(int(headers.get("content-length", 0)))
         self.sent += len(body)
-        if what == "flip" and body:
-            body = bytes([body[0] ^ 1]) + body[1:]
+        if what == "flip":
+            body = _flipped(body)
         time.sleep(self.delay)
         if what == "reset":
             _break(client)
@@ -124,6 +124,8 @@ class Proxy:
             server.request(client.command, client.path, body, headers)
             answer = server.getresponse()
             content = answer.read()
+        if what == "flip":
+            content = _flipped(content)
         self.received += len(content)
         if self.old_lists is not None and "list-type" in client.path:
             content = self.old_lists.setdefault(client.path, content)
@@ -148,6 +150,10 @@ class Proxy:
                 if what == "slow":
                     time.sleep(0.02)
                 client.wfile.write(content[begin : begin + step])
+
+
+def _flipped(data: bytes) -> bytes:
+    return bytes([data[0] ^ 1]) + data[1:] if data else data
 
 
 class _Closing:

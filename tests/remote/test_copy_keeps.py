@@ -151,3 +151,28 @@ def test_a_removed_mark_there_is_no_mark(robot: hl.Store, address: str) -> None:
     assert states(address) == {"whole": COUNT}
     with hl.open(address) as there:
         assert (there.entry("run").tags, not there.verify().findings) == ({"seen": "yes"}, True)
+
+
+def test_damaged_objects_are_replaced(
+    robot: hl.Store,
+    address: str,
+    proxy: Proxy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also if their entity tags and the cache here tell nothing."""
+    robot.copy(address)
+    proxy.spoil = lambda number: "flip" if proxy.requests[number - 1][1].endswith("1.mcap") else ""
+    with monkeypatch.context() as other:
+        other.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+        files.mounted.clear()
+        with hl.open(address) as there:
+            assert "copy --check" in there.verify().findings[0].cure
+    files.mounted.clear()
+    assert robot.copy(address).known == ["run"]
+    proxy.requests.clear()
+    report = robot.copy(address, options=CopyOptions(check=True))
+    assert (report.copied, report.problems) == (["run"], [])
+    sent = [path for method, path, _ in proxy.requests if method == "PUT" and ".mcap" in path]
+    assert len(sent) == 1
+    assert states(address) == {"whole": COUNT}

@@ -583,7 +583,7 @@ class RemoteDirectory(StoreDirectory):
             (folder / JOURNAL).write_bytes(lines)
             for path in wanted:
                 try:
-                    self._fetch(objects[path], folder / path)
+                    self.fetch(objects[path], folder / path)
                 except (KeyError, FileNotFoundError, ObjectChangedError) as error:
                     raise StoreError(f"{self.recording(label) / path} is lost.") from error
             before = _files_below(folder)
@@ -604,7 +604,14 @@ class RemoteDirectory(StoreDirectory):
             if added := (folder / JOURNAL).read_bytes()[len(lines) :]:
                 self._append(label, added)
 
-    def _fetch(self, about: Object, path: Path) -> None:
+    def fetch(self, about: Object, path: Path) -> None:
+        """Write an object to a file, whatever the cache has of it.
+
+        Raises:
+            FileNotFoundError: It does not exist.
+            ObjectChangedError: It has another version.
+            BucketError: The server does not answer, or refuses.
+        """
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as file:
             for piece in self.source.bucket.pieces(about):
