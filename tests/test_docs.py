@@ -167,21 +167,37 @@ _NUMBER = re.compile(
     r"(?<![\w.])-?(?:(?:\d+(?:\.\d+)?(?:d|h|ms|us|ns|m|s))+\b"
     r"|\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?(?:\s[kMGT]?B\b)?)"
 )
+_COUNT = r"(?<![\w.])-?\d{1,5}(?![\w.]*[\w])(?!\s[kMGT]?B\b)"
 _TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[\d.]*(?:Z|\+00:00)?")
 _URI = re.compile(r"mongodb://\S+")
 
 
-def skeleton(line: str) -> str:
-    """A line of output without what differs from run to run: numbers, times, widths."""
-    for pattern, name in ((_URI, "URI"), (_TIME, "TIME"), (_NUMBER, "N")):
+_MEASURED = re.compile(f"(?!{_COUNT}){_NUMBER.pattern}")
+
+
+def skeleton(line: str, *, counts: bool = False) -> str:
+    """A line of output without what differs from run to run: numbers, times, widths.
+
+    Args:
+        line: The line.
+        counts: Whole numbers without a unit are kept.
+    """
+    number = _MEASURED if counts else _NUMBER
+    for pattern, name in ((_URI, "URI"), (_TIME, "TIME"), (number, "N")):
         line = pattern.sub(name, line)
     return " ".join(line.split())
 
 
-def missing_lines(shown: list[str], output: str) -> list[str]:
-    """Shown lines that the output does not have. A count is compared to the digit."""
+def missing_lines(shown: list[str], output: str, *, counts: bool = False) -> list[str]:
+    """Shown lines that the output does not have. A count is compared to the digit.
+
+    Args:
+        shown: The lines.
+        output: What was printed.
+        counts: Whole numbers in a line are counts.
+    """
     exact = {line.strip() for line in output.splitlines()}
-    bones = {skeleton(line) for line in output.splitlines()}
+    bones = {skeleton(line, counts=counts) for line in output.splitlines()}
     missing = []
     for line in shown:
         if not line.strip() or line.strip() in {"...", "…"}:
@@ -189,7 +205,7 @@ def missing_lines(shown: list[str], output: str) -> list[str]:
         if line.strip().isdigit():
             if line.strip() not in exact:
                 missing.append(line)
-        elif skeleton(line) not in bones:
+        elif skeleton(line, counts=counts) not in bones:
             missing.append(line)
     return missing
 
@@ -358,7 +374,7 @@ def trouble(page: Path, directory: Path, bag: Path) -> str:
         place = f"{page.name}:{step.line}: {step.text}"
         if code != step.code:
             return f"{place}\nexit {code}, not {step.code}\n{output}"
-        if missing := missing_lines(step.shown, output):
+        if missing := missing_lines(step.shown, output, counts=step.kind == "python"):
             return f"{place}\nis not said: {missing}\n{output}"
     return ""
 
@@ -414,6 +430,9 @@ def test_the_skeleton_keeps_words_and_drops_numbers() -> None:
     assert skeleton("start   2025-06-03T08:00:00.001075172Z  59.9s") == "start TIME N"
     assert missing_lines(["3", "N  rows", "…"], "4\nN rows") == ["3"]
     assert missing_lines(["gone"], "here") == ["gone"]
+    assert (
+        skeleton("/scan 163 83 (2, 48) 1.5 12 kB 3s", counts=True) == "/scan 163 83 (2, 48) N N N"
+    )
 
 
 def test_a_failing_command_is_noticed(tmp_path: Path) -> None:
@@ -641,7 +660,9 @@ def documented_classes() -> list[type]:
 @pytest.mark.parametrize("thing", documented_classes(), ids=lambda c: c.__name__)
 def test_every_public_name_is_described(thing: type) -> None:
     text = sections(DOCS / "api.md", 3)[thing.__name__]
-    rows = dict(re.findall(r"^\| `(\w+)(\([^`]*\))?`", text, flags=re.MULTILINE))
+    listed = re.findall(r"^\| `(\w+)(\([^`]*\))?`", text, flags=re.MULTILINE)
+    rows = dict(listed)
+    assert len(rows) == len(listed), "a name is listed twice"
     members = public(thing)
     if thing.__name__ == "LiveRecording":
         members |= dict.fromkeys(("id", "ledger"))
@@ -685,9 +706,23 @@ def test_every_exported_name_is_described() -> None:
         assert "```python" in shown, f"{family} has no example"
 
 
+def test_attributes_of_answers_are_named_as_they_are() -> None:
+    """`completeness().unwritten` and the like, in all pages."""
+    kinds = {kind.__name__: public(kind) for kind in documented_classes()}
+    methods = kinds["Store"] | kinds["Query"]
+    pages = [page.read_text("utf-8") for page in PAGES]
+    found = [one for text in pages for one in re.findall(r"`(\w+)\(\)\.(\w+)`", text)]
+    assert found
+    for method, name in found:
+        assert method in methods, method
+        assert name in kinds[methods[method].__annotations__["return"]], (method, name)
+
+
 def test_every_error_is_described() -> None:
     text = sections(DOCS / "api.md", 2)["Errors"]
-    rows = dict(re.findall(r"^\| `(\w+)` \| (\d+) \|", text, flags=re.MULTILINE))
+    listed = re.findall(r"^\| `(\w+)` \| (\d+) \|", text, flags=re.MULTILINE)
+    rows = dict(listed)
+    assert len(rows) == len(listed), "an error is listed twice"
     real = {
         n: str(c.exit_code)
         for n, c in vars(errors).items()
