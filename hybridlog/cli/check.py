@@ -13,7 +13,8 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering, check_room
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.binder import command, option
+from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import (
     Between,
     InStore,
@@ -155,6 +156,9 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 class _Diff(Between, InStore, Quiet, Listing):
     a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
     b: str = one_recording("The same.", "B")
+    words: tuple[str, ...] = argument(
+        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
+    )
     tolerance: str = option(
         "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
     )
@@ -177,7 +181,7 @@ def diff_command(given: _Diff) -> None:
         found = store.diff(
             given.a,
             given.b,
-            topics=given.topic,
+            topics=(*given.words, *given.topic),
             between=given.between,
             tolerance=share,
             contract=rules,

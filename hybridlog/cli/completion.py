@@ -6,6 +6,7 @@ The names come from directories and the catalog: nothing is repaired, no MongoDB
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -114,7 +115,29 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
     return []
 
 
-def _store(context: click.Context) -> StoreDirectory:
+def complete_path(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Fields of the topics of the command, for the last name in a list or a predicate."""
+    last = re.findall(r"[\w.]*$", incomplete)[0]
+    before = incomplete.removesuffix(last)
+    # The parser leaves words where a value is missing, as that of the option that is completed.
+    given = [*context.args, *(context.params.get("words") or ())]
+    given += context.params.get("topic") or ()
+    if not context.resilient_parsing:  # what is completed was taken for a topic
+        given = [topic for topic in given if topic != incomplete]
+    with _nothing_on_error():
+        from hybridlog.frames.names import SUMMARIES, is_summary
+        from hybridlog.store import Store
+
+        with Store(_store(context, read_only=True), mongo="none", recover=False) as store:
+            known = (store.topic(*given).field_types() if given else None) or {}
+        array = last.rpartition(".")[0]
+        summaries = (f"{array}.{name}" for name in SUMMARIES)
+        names = [*known, *(name for name in summaries if is_summary(name, known))]
+        return [f"{before}{name}" for name in names if name.startswith(last)]
+    return []
+
+
+def _store(context: click.Context, *, read_only: bool = False) -> StoreDirectory:
     from hybridlog_storage.lazy import import_numpy_late
 
     import_numpy_late()
@@ -123,7 +146,8 @@ def _store(context: click.Context) -> StoreDirectory:
 
     value: Path | None = context.params.get("store")
     # The shell has not expanded the tilde of the line that is being completed.
-    return directory_of(store_path(None if value is None else os.path.expanduser(value)))  # noqa: PTH111
+    path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
+    return directory_of(path, read_only=read_only)
 
 
 def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:

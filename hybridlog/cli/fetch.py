@@ -26,6 +26,7 @@ from hybridlog.cli.answers import (
     write_following,
 )
 from hybridlog.cli.binder import command, option
+from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
 from hybridlog.cli.signals import Stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
@@ -60,7 +61,9 @@ class _Choices(Asking, Tabular, Slices):
         "Of running recordings: print messages as they come, from now on or from the "
         "beginning of --between, until the recordings end or Ctrl-C."
     )
-    fields: str | None = option("Only these fields, with commas between them.", "A,B.C")
+    fields: str | None = option(
+        "Only these fields, with commas between them.", "A,B.C", shell_complete=complete_path
+    )
     frame: str | None = in_frame()
     within: str | None = option(
         "Greatest distance in time of messages of other topics in --where "

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
+import shlex
 import textwrap
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Final
 
 import click
@@ -12,6 +15,7 @@ from hybridlog_storage.errors import TopicError
 
 _FIRST: Final = ("topic", "between", "where", "fields", "output", "form", "recording")
 _LAST: Final = ("store", "mongo", "verbose", "quiet", "help")
+_NEAR: Final = 0.75  # likeness of an option that is suggested
 _NAMED: Final = {"recording": "-r", "topic": "-t", "fields": "--fields"}
 """Options whose values people type as arguments, and how they are written."""
 
@@ -42,6 +46,16 @@ MOVED: Final = {
     "trigger --rehearse": "intervals --rehearse EXPRESSION",
     "trust": "index trust",
     "untag": "tag RECORDING --remove KEY",
+    **dict.fromkeys(("diff -r", "diff --tag"), "diff RECORDING RECORDING"),
+    **dict.fromkeys(
+        ("diff --last", "diff --older-than"), "diff RECORDING RECORDING --between T0 T1"
+    ),
+    **dict.fromkeys(("sql -r", "sql --recording"), "sql \"... where recording = 'NAME'\""),
+    "sql --tag": "sql \"... where tags['KEY'] = 'VALUE'\"",
+    **dict.fromkeys(
+        ("sql --last", "sql --older-than", "sql --between"),
+        "sql \"... where log_time > '2025-06-03'\"",
+    ),
 }
 """Other names and options that people try, and the commands that do this."""
 
@@ -113,10 +127,15 @@ class Command(click.Command):
             extra = super().parse_args(ctx, args)
         except click.NoSuchOption as error:
             check_moved(f"{self.name} {error.option_name}")
-            raise
+            near = difflib.get_close_matches(
+                error.option_name, error.possibilities or (), cutoff=_NEAR
+            )
+            raise click.NoSuchOption(error.option_name, possibilities=near, ctx=ctx) from None
         if extra and not ctx.resilient_parsing:
             word = extra[0]
-            raise click.UsageError(f"There is no place for {word!r} here.{self._meant(word)}", ctx)
+            raise click.UsageError(
+                f"There is no place for {word!r} here.{self._meant(ctx, word)}", ctx
+            )
         return extra
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -128,27 +147,32 @@ class Command(click.Command):
                 given = ctx.params.get(argument.name or "")
                 if not isinstance(argument, click.Argument) or hasattr(error, "__notes__"):
                     continue
-                if "did you mean" in str(error):
-                    continue
                 for word in given if isinstance(given, tuple) else [str(given or "")]:
-                    hint = self._meant(word, argument)
-                    if hint and f"'{word}'" in str(error):
+                    if f"'{word}'" not in str(error):
+                        continue
+                    if Path(word).is_file():
+                        record = f"`hybridlog record {shlex.quote(word)}`"
+                        error.add_note(f"{word} is a file: {record} makes it a recording.")
+                    elif hint := self._meant(ctx, word, argument):
                         error.add_note(hint.strip())
             raise
 
-    def _meant(self, word: str, argument: click.Argument | None = None) -> str:
-        """The options that a word may belong to, as a question.
+    def _meant(
+        self, context: click.Context, word: str, argument: click.Argument | None = None
+    ) -> str:
+        """The options that a word may belong to, since the store has such a thing, as a question.
 
         Args:
+            context: Of the command.
             word: As typed.
             argument: What it was taken for.
         """
         taken = (argument.metavar or "").casefold() if argument is not None else ""
-        options = {one.name for one in self.params if isinstance(one, click.Option)}
+        options = {one.name: one for one in self.params if isinstance(one, click.Option)}
         found = [
             f"{short} {word}"
             for name, short in _NAMED.items()
-            if name in options and name not in taken
+            if name in options and name not in taken and options[name].shell_complete(context, word)
         ]
         return f" Did you mean {' or '.join(found)}?" if found else ""
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -260,9 +258,6 @@ def _print_undefined(log: PlayedLog) -> None:
         )
 
 
-_MAX_FOLDERS = 1000
-
-
 @dataclass(frozen=True, kw_only=True)
 class _View(InStore, AsJson, Served):
     recording: str | None = one_recording(
@@ -289,8 +284,6 @@ def view_command(given: _View) -> None:
         raise MissingDependencyError(
             "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
         ) from error
-    if given.store is None and not os.environ.get("HYBRIDLOG_STORE"):
-        given = replace(given, store=_only_store_near())
     if given.origins and not given.mcap:
         raise UsageError("--allow-origin is about --mcap: add that.")
     with given.opened(is_lasting=True) as store:
@@ -329,23 +322,6 @@ def _print_mcap(url: str, label: str) -> None:
     output.note(f"MCAP file: {file}")
     output.note(f"In Foxglove: {foxglove}")
     output.note(f"For a remote data loader: {url}manifest")
-
-
-def _only_store_near() -> Path | None:
-    """The only store in the folders here and in theirs, where no other one is meant."""
-    from hybridlog.store import store_path
-    from hybridlog_storage.settings import NAME
-
-    if store_path().exists():
-        return None
-    folders = chain.from_iterable(
-        islice(Path().glob(depth), _MAX_FOLDERS) for depth in ("*", "*/*")
-    )
-    found = [folder for folder in folders if (folder / NAME).is_file()]
-    if len(found) != 1:
-        return None
-    output.note(f"Showing {found[0]}, the only store below this folder.")
-    return found[0]
 
 
 @dataclass(frozen=True, kw_only=True)

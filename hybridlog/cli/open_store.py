@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+
+import click
 
 from hybridlog.cli.output import counted, note
 from hybridlog.cli.progress import LateBar
-from hybridlog_storage.errors import WithoutMongoError
+from hybridlog_storage.errors import StoreError, WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.segments.recovery import Recovered
 
 _MAX_LISTED = 3  # recordings that are reported one by one
+_MAX_FOLDERS = 1000
+_READING: Final = ("Look", "Ask", "Export")
+"""Groups of commands that take the only store that is near; others name it."""
 
 
 @contextmanager
@@ -52,6 +59,10 @@ def opened_store(
     import_numpy_late()
     from hybridlog.store import open_store
 
+    near = None if path or create else _only_store_near()
+    if near is not None and _reads():
+        note(f"Store: {near}, the only one below this folder.")
+        path = near
     bar = LateBar("indexing", quiet=quiet)
     try:
         store = open_store(
@@ -64,6 +75,10 @@ def opened_store(
             cache_mb=cache_mb,
             recover=recover,
         )
+    except StoreError as error:
+        if near is not None and path is None:
+            error.add_note(f"There is one below this folder: --store {near}.")
+        raise
     finally:
         bar.close()
     during: AbstractContextManager[None] = store.at_one_moment()
@@ -84,6 +99,28 @@ def opened_store(
             _print_left(store)
         finally:
             _print_rebuilt(store, "" if records else doing)
+
+
+def _only_store_near() -> Path | None:
+    """The only store in the folders here and in theirs, where no other one is meant."""
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import NAME
+
+    if os.environ.get("HYBRIDLOG_STORE") or store_path().exists():
+        return None
+    folders = chain.from_iterable(
+        islice(Path().glob(depth), _MAX_FOLDERS) for depth in ("*", "*/*")
+    )
+    found = [folder for folder in folders if (folder / NAME).is_file()]
+    return found[0] if len(found) == 1 else None
+
+
+def _reads() -> bool:
+    """True in a command that only reads the store."""
+    from hybridlog.cli.app import GROUPS
+
+    context = click.get_current_context(silent=True)
+    return context is not None and any(context.info_name in GROUPS[one] for one in _READING)
 
 
 def _print_repairs(store: Store, doing: str) -> None:

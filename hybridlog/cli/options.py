@@ -15,6 +15,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import argument, option
 from hybridlog.cli.completion import (
     complete_condition,
+    complete_path,
     complete_recording,
     complete_running,
     complete_tag,
@@ -285,6 +286,7 @@ class Filtered(Strict, Topics):
     where: tuple[str, ...] = option(  # type: ignore[misc]
         "Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'.",
         "PREDICATE",
+        shell_complete=complete_path,
     )
 
 

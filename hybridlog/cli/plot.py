@@ -14,6 +14,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import answering, check_room, not_written
 from hybridlog.cli.binder import command, option
+from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Forced, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
@@ -36,7 +37,9 @@ _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 class _Given(Asking, Forced):
     needs_topic: ClassVar[bool] = True
     fields: str | None = option(
-        "Fields that are numbers (ranges.min, position[2]), or messages with numbers.", "A,B.C"
+        "Fields that are numbers (ranges.min, position[2]), or messages with numbers.",
+        "A,B.C",
+        shell_complete=complete_path,
     )
     output: Path | None = option(
         "Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard "

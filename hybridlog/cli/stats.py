@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
+from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, parse_fields
 from hybridlog_storage.errors import UsageError
 
@@ -29,7 +30,9 @@ _RATE_COLUMNS: Sequence[output.Column] = [
 @dataclass(frozen=True, kw_only=True)
 class _Given(Asking, Listing):
     fields: str | None = option(
-        "Only these fields, also summaries and arrays; without, all that are numbers.", "A,B.C"
+        "Only these fields, also summaries and arrays; without, all that are numbers.",
+        "A,B.C",
+        shell_complete=complete_path,
     )
     rate: bool = option("Instead: how many messages came in a second.")
     window: str | None = option("With --rate: a row for each so long, such as 1s.", "DURATION")

@@ -26,7 +26,7 @@ FIELD: Final = b"hybridlog.field"
 TAG: Final = b"hybridlog.tag"
 """Arrow metadata of a column with a tag of the recordings: the key of the tag."""
 
-_SUMMARIES = ("n", "min", "max", "mean")
+SUMMARIES = ("n", "min", "max", "mean")
 
 
 def own_columns(requested: Sequence[str] | None, defined: Collection[str]) -> list[str]:
@@ -102,7 +102,7 @@ def _is_part(name: str, path: str) -> bool:
 def summary_of(path: str) -> tuple[str, str] | None:
     """The array and the summary that a path may mean: `ranges.min`."""
     array, dot, what = path.rpartition(".")
-    return (array, what) if dot and what in _SUMMARIES else None
+    return (array, what) if dot and what in SUMMARIES else None
 
 
 def is_summary(path: str, known: Mapping[str, str]) -> bool:

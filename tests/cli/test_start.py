@@ -18,6 +18,7 @@ from hybridlog.cli.binder import PATH
 from hybridlog.cli.hints import MOVED
 from hybridlog.cli.installed import NEEDED_FOR
 from hybridlog.cli.main import EXIT_CODES
+from hybridlog_storage.disk.directory import StoreDirectory
 from tests.json_schemas import misfit, schema_of, schemas
 
 from .running import COMMAND, complete, environment, run
@@ -199,6 +200,9 @@ def test_completion(store: Path) -> None:
     assert complete(f"top --store {store} --field /base/s") == ["/base/scan:"]
     assert complete(f"trigger x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
+    assert "scan_time" in complete(f"fetch --store {store} scan --fields scan")
+    assert "ranges,scan_time" in complete(f"stats --store {store} scan --fields ranges,scan")
+    assert complete(f"fetch --store {store} -t scan --where range_m") == ["range_min", "range_max"]
     assert complete("info --store /nowhere r") == []
 
 
@@ -255,9 +259,14 @@ def test_paths_are_checked_by_the_library() -> None:
         ("record /scan /lidar/points", ": `hybridlog record --ros2 -t /scan -t /lidar/points`."),
         ("fetch --betwee", "'--between'"),
         ("check robot", "robot is a recording: -r robot."),
-        ("plot scan ranges.min", "Did you mean -r ranges.min or --fields ranges.min?"),
+        ("plot scan ranges.min", "\nDid you mean --fields ranges.min?"),
+        ("fetch robot", "\nrobot is a recording: -r robot.\n"),
+        ("fetch nosuch", " more\n"),
+        (f"fetch {__file__}", f" is a file: `hybridlog record {__file__}` makes it a recording."),
+        ("sql --limt x", "No such option '--limt'. Did you mean '--limit'?"),
+        ("tf --toleranse x", "No such option '--toleranse'.\n"),
         ("ls robot", "Did you mean -r robot?"),
-        ("keep --pin robot", "Did you mean -r robot or -t robot?"),
+        ("keep --pin robot", "Did you mean -r robot?"),
         ("fetch -t scan --between +10s --count", ": --between takes two times: --between +10s end"),
         ("fetch scan --between +1s --where n>1", ": --between takes two times: --between +1s end"),
         ("ls --during +1s -r robot", ": --during takes two times: --during +1s end"),
@@ -326,6 +335,27 @@ def test_a_reader_that_ends_early_is_no_error(store: Path) -> None:
         assert process.wait(60) == 0, text
         assert "Traceback" not in text
         assert "BrokenPipe" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("ls", 0, "Store: demo/robot-logs, the only one below this folder."),
+        ("rm x -y", 5, "There is one below this folder: --store demo/robot-logs."),
+    ],
+)
+def test_the_only_store_below_the_folder(words: str, code: int, said: str, tmp_path: Path) -> None:
+    """Commands that read take it, others name it."""
+    StoreDirectory.create(tmp_path / "demo" / "robot-logs")
+    done = subprocess.run(
+        [*COMMAND, *words.split()],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, said in done.stderr) == (code, True), done.stderr
 
 
 UNNEEDED = {

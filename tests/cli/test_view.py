@@ -73,7 +73,7 @@ def test_the_only_store_below_the_folder_is_shown(tmp_path: Path) -> None:
     assert running.stdout.readline() == "{\n"
     running.terminate()
     _, errors = running.communicate(timeout=20)
-    assert "Showing demo/robot-logs, the only store below this folder." in errors
+    assert "Store: demo/robot-logs, the only one below this folder." in errors
 
 
 def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
