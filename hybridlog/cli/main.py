@@ -88,11 +88,11 @@ def _run_command() -> int:
 
 
 def _complain(text: str) -> None:
-    from hybridlog.cli.output import printable
+    from hybridlog.cli.output import folded
 
-    lines = "\n".join(printable(line) for line in text.split("\n"))
+    lines = "\n".join(map(folded, f"hybridlog: {text}".split("\n")))
     try:
-        print(f"hybridlog: {lines}", file=sys.stderr, flush=True)  # noqa: T201
+        print(lines, file=sys.stderr, flush=True)  # noqa: T201
     except OSError:
         _discard(sys.stderr)
 

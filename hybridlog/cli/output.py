@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, is_dataclass
@@ -261,7 +263,16 @@ def print_json_line(value: object) -> None:
 
 def note(text: str) -> None:
     """A line for the person, on standard error."""
-    print(printable(text), file=sys.stderr)  # noqa: T201
+    print(folded(text), file=sys.stderr)  # noqa: T201
+
+
+def folded(text: str) -> str:
+    """A line for standard error, which a terminal shows without broken words."""
+    text = printable(text)
+    if not sys.stderr.isatty():
+        return text
+    width = shutil.get_terminal_size().columns
+    return textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 def notes(lines: Iterable[str]) -> None:

@@ -305,3 +305,13 @@ def test_a_long_note_is_cut_short(fresh: Path) -> None:
     _, row = plain(on_terminal("ls", "--store", fresh)[1]).splitlines()
     assert re.search(r"  place=x+…$", row)
     assert len(row) <= 80
+
+
+def test_a_message_breaks_between_words() -> None:
+    for width in (60, 80):
+        code, shown = on_terminal("ls", "--store", "nowhere/robot-logs", width=width)
+        lines = shown.splitlines()
+        assert code == 5
+        assert len(lines) > 1
+        assert max(map(len, lines)) <= width
+        assert " ".join(lines) == run("ls", "--store", "nowhere/robot-logs", code=5).err.strip()

@@ -228,7 +228,7 @@ COMMANDS: dict[str, list[Asked]] = {
             lambda k: [(_f(m)["n"], _f(m)["big"], _f(m)["state"]) for m in k.of("/said")],
         ),
         asked(
-            "fetch -t said -F jsonl --clock publish --between -1s end --count",
+            "fetch -t said --clock publish --between -1s end --count",
             _number,
             lambda k: len(ranged(k, "/said", "publish", -SECOND, None)),
         ),
