@@ -54,9 +54,9 @@ def _with_short_notes(
 ) -> tuple[Sequence[output.Column], Sequence[Sequence[str]]]:
     """The same table, where notes are cut short if the terminal has no room for them."""
     headings = [heading for heading, _ in columns]
-    room = output.room(headings, [row[:-1] for row in rows]) + len(headings[-1])
     if output.fits(headings, rows):
         return columns, rows
+    room = output.room(headings, [row[:-1] for row in rows]) + len(headings[-1])
     return columns, [[*row[:-1], output.cut(row[-1], max(room, _LEAST_NOTE))] for row in rows]
 
 
