@@ -21,7 +21,10 @@ def main() -> NoReturn:
     signals.install()
     block_imports()
     # A shell may have closed them: `hybridlog ls >&-`.
-    sys.stdout = sys.stdout or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    # What is written then fails, so that no answer is lost in silence.
+    if sys.stdout is None:
+        fd = os.open(os.devnull, os.O_RDONLY)
+        sys.stdout = os.fdopen(fd, "w", encoding="utf-8")
     sys.stderr = sys.stderr or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         # Characters that the terminal's encoding lacks are shown as escapes.
@@ -46,7 +49,8 @@ def _run() -> int:
         return 0
     except OSError as error:
         # The library maps most of these; the rest are such as a failing disk.
-        _complain(str(error))
+        where = "standard output, or a temporary file, cannot be written: "
+        _complain(str(error) if error.filename else f"{where}{error.strerror or error}")
         return of_os_error(error)
     except MemoryError:
         _complain("there is not enough memory for this: ask for less at a time.")

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.socket_directory import is_our_socket, new_socket
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.remote import address_of
 from hybridlog_storage.settings import NAME
 from hybridlog_storage.stopping import pause
 
@@ -258,6 +259,11 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
     if named:
         return list(dict.fromkeys(_resolve(name, names) for name in named))
     if not names:
+        if address_of(store) is not None:
+            raise UsageError(
+                f"No recorder runs in the bucket of {store}; `hybridlog mark --at` marks "
+                "recordings there."
+            )
         where = f"{store} is no store: no recorder runs there"
         if (store / NAME).is_file():
             where = "No recorder runs on this store"

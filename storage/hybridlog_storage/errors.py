@@ -9,6 +9,7 @@ they are caught.
 from __future__ import annotations
 
 import errno
+import re
 from typing import TYPE_CHECKING, ClassVar, Final
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """System errors that mean a full disk."""
 NO_HANDLES: Final = frozenset({errno.EMFILE, errno.ENFILE})
 """System errors that mean too few file handles."""
+_ADDRESS: Final = re.compile(r"\b(s3|gs|az):/(?!/)")
 
 
 def exhausted(number: int | None, doing: str) -> ResourceError | None:
@@ -53,6 +55,10 @@ class HybridlogError(Exception):
     """Root of the tree."""
 
     exit_code: ClassVar[int] = 1
+
+    def __str__(self) -> str:
+        """The message; what was a path in a bucket is an address again."""
+        return _ADDRESS.sub(r"\1://", super().__str__())
 
 
 class UsageError(HybridlogError):

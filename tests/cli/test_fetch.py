@@ -343,7 +343,13 @@ def test_head_is_quiet(store: Path) -> None:
 
 
 def test_a_full_disk_behind_standard_output(store: Path) -> None:
-    for command in (["fetch", "-t", "scan", "-F", "csv"], ["ls"]):
+    asked = (
+        ["fetch", "-t", "scan", "-F", "csv"],
+        ["ls"],
+        ["ls", "--json"],
+        ["diff", "robot", "torn"],
+    )
+    for command in asked:
         with Path("/dev/full").open("wb") as full:
             ended = subprocess.run(
                 [*COMMAND, *command, "--store", str(store)],
@@ -353,7 +359,12 @@ def test_a_full_disk_behind_standard_output(store: Path) -> None:
                 check=False,
             )
         assert ended.returncode == 7
+        assert b"No space left" in ended.stderr
+        assert b"[Errno" not in ended.stderr
         assert b"Traceback" not in ended.stderr
+    shell = ["sh", "-c", 'exec "$@" >&-', "sh", *COMMAND, "ls", "--store", str(store)]
+    ended = subprocess.run(shell, stderr=subprocess.PIPE, env=environment(), check=False)
+    assert (ended.returncode, b"standard output cannot" in ended.stderr) == (1, True)
 
 
 def test_the_answer_says_how_complete_it_is(store: Path) -> None:

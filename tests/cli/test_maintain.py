@@ -138,7 +138,7 @@ def test_the_default_store_is_in_the_working_directory(
 
 
 def test_a_closed_output_is_no_error(tmp_path: Path) -> None:
-    """As by `hybridlog ls >&-`."""
+    """As by `hybridlog ls >&-`, where there is nothing to print."""
     with hl.open(tmp_path / "store", create=True):
         pass
     command = [sys.executable, "-m", "hybridlog", "ls", "--store", str(tmp_path / "store")]

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog.live.control_server import choose
 from hybridlog.maintenance.bucket_place import BucketPlace
 from hybridlog.maintenance.copying import CopyOptions, run
 from hybridlog_storage.disk import files
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -42,6 +44,11 @@ def states(address: str | Path) -> dict[str, int]:
     files.mounted.clear()
     with hl.open(address) as store:
         return dict(Counter(str(one.state) for one in store.topic("scan")))
+
+
+def test_messages_have_addresses(address: str) -> None:
+    with pytest.raises(UsageError, match=f"bucket of {address};"):
+        choose(Path(address), [])
 
 
 def lose(address: str, *names: str) -> None:
