@@ -325,9 +325,16 @@ def _print_recording(
     channels = sorted(shown_channels(entry.channels), key=lambda c: c.topic)
 
     def rows_with(*, short: bool) -> list[list[str]]:
-        known = entry.is_decoded
+        known, gone = entry.is_decoded, "not copied yet" if entry.lacks_payloads else "expired"
         return [
-            _channel_row(c, is_decoded=known, narrow=narrow, short=short, video=videos.get(c.topic))
+            _channel_row(
+                c,
+                is_decoded=known,
+                narrow=narrow,
+                short=short,
+                gone=gone,
+                video=videos.get(c.topic),
+            )
             for c in channels
         ]
 
@@ -404,6 +411,7 @@ def _channel_row(
     is_decoded: bool,
     narrow: bool,
     short: bool,
+    gone: str = "expired",
     video: VideoSummary | None = None,
 ) -> list[str]:
     from hybridlog.query.latching import depth_of
@@ -423,7 +431,7 @@ def _channel_row(
         notes.append(f"{stats.surplus} with bytes left over")
     state = state_of(channel.message_encoding)
     if state is not State.WHOLE:
-        notes.append("fields only" if state is State.REDUCED else "fields only, expired")
+        notes.append("fields only" if state is State.REDUCED else f"fields only, {gone}")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
     if video is not None and video.frames:

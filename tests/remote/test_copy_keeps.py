@@ -18,6 +18,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.cli.within import answer
 from tests.copying.conftest import expire
 from tests.remote.conftest import BEGIN, SCAN
 from tests.remote.server import Proxy
@@ -149,6 +150,7 @@ def test_nothing_is_deleted_there_while_it_is_deleted_here(robot: hl.Store, addr
 
 def test_a_removed_mark_there_is_no_mark(robot: hl.Store, address: str) -> None:
     robot.copy(address, options=CopyOptions(only_fields=True))
+    assert "fields only, not copied yet" in answer("info", "run", store=Path(address)).out
     with hl.open(address) as there:
         there.mark("run", "+1s", "lab")
         there.unmark("run", "lab")
