@@ -210,7 +210,7 @@ def _about(results: Results) -> str:
     last = results.headers[-1]
     quick = {
         "full": "",
-        "quick": "\n\n> **A quick run: short trials, searched once. Do not cite its figures.**",
+        "quick": "\n\n> **A short run: loads are only doubled, and each is searched once.**",
         "tiny": "\n\n> **A test of the command. Its figures mean nothing.**",
     }[results.scale]
     option = "" if results.scale == "full" else f" --{results.scale}"
@@ -494,12 +494,13 @@ def readme(journal: Journal) -> str:
         lines.append(_line([what, shown(OURS) if OURS in values else "", rival, bag]))
         if bag and OURS in values:
             two = {name: values[name].median for name in (OURS, "bagfile")}
-            if two[OURS] != two["bagfile"] and best(two, key=two.__getitem__) == "bagfile":
+            if shown(OURS) != bag and best(two, key=two.__getitem__) == "bagfile":
                 bags.append(short)
     ahead = f"A ROS bag is ahead in {' and '.join(bags)}. " if bags else ""
     option = "" if results.scale == "full" else f" --{results.scale}"
+    short = "It was a short run, in which loads are only doubled. " if option else ""
     text = (
-        f"{conditions(results)} `python -m benchmarks{option}` makes them again in under an hour. "
+        f"{conditions(results)} `python -m benchmarks{option}` makes them again in under an hour. {short}"
         "The best database is the best of MongoDB, PostgreSQL and SQLite. "
         f"{ahead}A ROS bag neither compresses nor indexes; to count in it is a loop over its "
         "messages. The [benchmarks](docs/benchmarks.md) have the other systems, the spread of "
