@@ -117,13 +117,16 @@ def of_one_moment(
 
     @wraps(work)
     def pinned(self: _Owner, /, *args: _P.args, **options: _P.kwargs) -> _T:
-        with self.session.at_one_moment():
+        session = self.session
+        with session.at_one_moment():
+            before = session.invalidations
             try:
                 return work(self, *args, **options)
             except StoreError:
-                if not self.session.has_changed():
-                    raise
-                self.session.invalidate()
+                if session.invalidations == before:  # no stream within it noticed it
+                    if not session.has_changed():
+                        raise
+                    session.invalidate()
                 return work(self, *args, **options)
 
     return pinned
@@ -167,6 +170,7 @@ class Session:
         connection: The connection to MongoDB.
         repairs: Repairs made when the store was opened.
         cache: What was read or worked out; chunks of single messages are a kind of it.
+        invalidations: How often everything that was read was dropped.
         field_indexes: The indexes on fields in MongoDB; empty without a connection.
     """
 
@@ -200,6 +204,7 @@ class Session:
         self._names: list[str] = []  # in `recordings`
         self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._running: dict[str, RunningRecording] = {}
+        self.invalidations = 0
         self._following = threading.RLock()
         self._mending = threading.Lock()
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
@@ -573,9 +578,13 @@ class Session:
         """True if files of recordings that were read look different by now."""
         if self._has_names_changed():
             return True
-        running = [one for key, one in [*self._running.items()] if key in self._moment.entries]
-        if any(one.is_cut() for one in running):
-            return True
+        for recording, entry in [*self._moment.entries.items()]:
+            running = self._running.get(recording)
+            if running is None:
+                if entry.flushed:
+                    return True
+            elif running.entry is not entry or running.is_cut():  # another thread has looked
+                return True
         read = self._entries.keys() | self._moment.entries.keys()
         summaries = [one for one in self.snapshot().summaries if one.id in read]
         looks = self.directory.looks([one.label for one in summaries])
@@ -1353,6 +1362,7 @@ class Session:
 
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
+        self.invalidations += 1
         self._begin(_Moment())
         self._entries = {}
         self._channels.clear()

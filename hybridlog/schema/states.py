@@ -40,7 +40,7 @@ class State(StrEnum):
 CAUSES: Final = {
     State.REDUCED: "dropped under pressure",
     State.EXPIRED: "deleted to make room",
-    State.NOT_COPIED: "not copied yet (`hybridlog copy` without --only-fields brings it)",
+    State.NOT_COPIED: "not copied yet (`hybridlog copy` without --only-fields brings what is left)",
 }
 """Reasons why messages have no payload."""
 _STATES: Final = {REDUCED: State.REDUCED, EXPIRED: State.EXPIRED}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +28,7 @@ from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.index_bodies import index_fields
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
-from hybridlog_storage.catalog import ChannelStats
+from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 from hybridlog_storage.messages import Batch, Channel, Schema
 from tests.schema.wire_oracle import oracle
 
@@ -561,6 +560,7 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     payload = reduce(codec_for(channel), json.dumps({"r": [*range(1000)]}).encode())
     zero = np.zeros(1, np.int64)
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
-    recorded = RecordedChannel(cast("Any", None), 0, reduced_channel(channel), ChannelStats(), None)
+    entry = RecordingEntry("0", "a", "a", {}, {}, 0, "complete")
+    recorded = RecordedChannel(entry, 0, reduced_channel(channel), ChannelStats(), None)
     found = MessageFilter(parse(where), None).matches(recorded, batch, zero)
     assert found.holds.tolist() == [holds]
