@@ -500,8 +500,8 @@ def readme(journal: Journal) -> str:
     option = "" if results.scale == "full" else f" --{results.scale}"
     short = "It was a short run, in which loads are only doubled. " if option else ""
     text = (
-        f"{conditions(results)} `python -m benchmarks{option}` makes them again in under an hour. {short}"
-        "The best database is the best of MongoDB, PostgreSQL and SQLite. "
+        f"{conditions(results)} `python -m benchmarks{option}` makes them again in under an hour. "
+        f"{short}The best database is the best of MongoDB, PostgreSQL and SQLite. "
         f"{ahead}A ROS bag neither compresses nor indexes; to count in it is a loop over its "
         "messages. The [benchmarks](docs/benchmarks.md) have the other systems, the spread of "
         "each figure, and what a store costs in use."
