@@ -238,7 +238,7 @@ def _greatest(values: Iterator[float | None]) -> float | None:
 
 
 def _share(a: Value, b: Value) -> float:
-    """How far two values differ, as a share of the greater one; infinite if no number says so."""
+    """The difference of two values, as a share of the greater one; infinite if there is none."""
     if isinstance(a, str) or isinstance(b, str) or a is None or b is None:
         return 0.0 if a == b else math.inf
     if a == b or (math.isnan(a) and math.isnan(b)):

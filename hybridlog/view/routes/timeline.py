@@ -1,4 +1,4 @@
-"""What is drawn over time: messages by pixel, gaps and marks, and the fields of plots."""
+"""Routes of what is drawn over time: messages by pixel, gaps, marks, and fields of plots."""
 
 from __future__ import annotations
 
