@@ -116,6 +116,7 @@ def _watch(store: Store, given: _Copy, how: CopyOptions) -> NoReturn:
             held: list[str] = []
             if new:
                 report = _copied(store, given, new, how, is_short=True)
+                sys.stdout.flush()
                 output.notes([*report.refused.values(), *report.problems])
                 held = report.held
             done.update(one for one in new if one not in held)

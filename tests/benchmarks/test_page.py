@@ -107,7 +107,7 @@ def test_the_page_has_every_part_within_three_screens(tmp_path: Path) -> None:
     assert len(tables) == 11
     for table in tables:
         assert len({line.count(" | ") for line in table.splitlines()}) == 1, table
-    assert "A quick run" not in text
+    assert "A short run" not in text
     head, *rows = table_of(text, "kept of 819 MB/s")
     found = {row[0]: row[1:] for row in rows}
     assert head[1:] == ["5 kB", "40 kB", "640 kB", "a robot's log, times", "kept of 819 MB/s"]
@@ -134,7 +134,7 @@ def test_the_readme_names_the_strongest_rival_and_where_a_bag_is_ahead(tmp_path:
     assert "`python -m benchmarks` makes them again" in text
 
 
-@pytest.mark.parametrize(("scale", "words"), [("quick", "A quick run"), ("tiny", "mean nothing")])
+@pytest.mark.parametrize(("scale", "words"), [("quick", "A short run"), ("tiny", "mean nothing")])
 def test_what_is_not_to_be_cited_says_so(tmp_path: Path, scale: str, words: str) -> None:
     made = journal(tmp_path, samples(), scale)
     assert words in page.page(made)

@@ -37,8 +37,9 @@ class Done(NamedTuple):
 
 
 def environment(**extra: str) -> dict[str, str]:
-    """No store or MongoDB by accident, and output that does not depend on the terminal."""
-    kept = {k: v for k, v in os.environ.items() if k not in {"HYBRIDLOG_STORE", "COLUMNS"}}
+    """No store or MongoDB by accident, and output as users have it, whatever the terminal is."""
+    without = {"HYBRIDLOG_STORE", "COLUMNS", "PYTHONUNBUFFERED"}
+    kept = {k: v for k, v in os.environ.items() if k not in without}
     return {**kept, "LC_ALL": "C.UTF-8", **extra}
 
 
