@@ -102,7 +102,7 @@ def opened_store(
 
 
 def _only_store_near() -> Path | None:
-    """The only store in the folders here and in theirs, where no other one is meant."""
+    """The only store up to two levels below this folder; None if one is named, or two are there."""
     from hybridlog.store import store_path
     from hybridlog_storage.settings import NAME
 

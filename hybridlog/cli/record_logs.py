@@ -102,7 +102,7 @@ def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
 
 
 def _is_topic(path: Path) -> bool:
-    """True where a path is none, and is more likely the name of a topic."""
+    """True if a path does not exist and looks like the name of a topic."""
     is_near = path.parent.exists() and path.parent != Path("/")
     return path.is_absolute() and not (path.suffix or is_near or path.exists())
 
@@ -354,7 +354,7 @@ class Results:
         self._current = path
 
     def finish(self, log: Log) -> None:
-        """Each part of a log is stored, or it has been said why not."""
+        """Note that a log is done: all of it is stored, or reported as left out."""
         if log.path in self._unfinished:
             self._unfinished.remove(log.path)
 

@@ -283,7 +283,7 @@ class BucketPlace:
         self._own.put(describe(self._own, inventory))
 
     def hold(self, recordings: Sequence[str]) -> bool:
-        """True: nobody locks anything, but pins keep payloads. After a crash the pins stay."""
+        """Pin the recordings there: a bucket has no locks. Always true; a crash leaves the pins."""
         self.leave()
         reason = "held for a copy that deletes payloads at its source; unpin it if none runs"
         pins = {one: pin_of(secrets.token_hex(4), (None, None), None, reason) for one in recordings}
@@ -351,10 +351,8 @@ class BucketPlace:
             size = files.status(path, depth=IN_TYPE).st_size
         except OSError as error:
             raise unreadable(error, path) from error
-        upload = Upload(self._target.source.bucket, name, size)
-        for piece in pieces_of(path, 0, size, _PIECE, depth=IN_TYPE):
-            upload.write(piece)
-        return upload.close()
+        pieces = pieces_of(path, 0, size, _PIECE, depth=IN_TYPE)
+        return self._target.source.bucket.send(name, size, pieces)
 
     def _fields(self, entry: RecordingEntry, root: Path) -> Mapping[str, Sequence[Path]]:
         """Files with its fields by folder; of shared ones its rows alone, below `root`."""

@@ -292,6 +292,17 @@ class Bucket:
         tag = _tag(about) if self._has_digests else ""
         return tag or digest_like("", self.pieces(about))
 
+    def send(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
+        """Create an object from pieces of its content; see `Upload`.
+
+        Raises:
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        upload = Upload(self, name, size)
+        for piece in pieces:
+            upload.write(piece)
+        return upload.close()
+
     def in_parts(self, name: str) -> Any:
         """A writer of an object, which takes the place of one of its name."""
         import obstore

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -30,7 +31,7 @@ from hybridlog_storage.errors import ObjectChangedError, ObjectExistsError, Stor
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
-from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object, Upload
+from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object
 from hybridlog_storage.remote.lists import (
     LISTS,
     MAX_LIST,
@@ -52,6 +53,7 @@ _READ_NS: Final = 3600 * 10**9  # for so long a reader may need what a newer lis
 _DAY_NS: Final = 86_400 * 10**9
 _ALONE: Final = 4  # recordings that are compared with the bucket one by one; then all at once
 _MAX_SETTINGS: Final = 1 << 20
+_PIECE: Final = 1 << 20  # bytes of a file that are sent at once
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
 _Node = Mapping[str, Any]
@@ -486,7 +488,7 @@ class RemoteDirectory(StoreDirectory):
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
-        """True: who deletes and comes second begins again."""
+        """Always true: of two changes at once, the second begins again."""
         yield True
 
     @property
@@ -593,11 +595,9 @@ class RemoteDirectory(StoreDirectory):
             for path, about in after.items():
                 if before.get(path) != about:
                     name = f"{RECORDINGS}/{self._now.recordings[label].id}/{path}"
-                    upload = Upload(bucket, name, about[0])
                     with (folder / path).open("rb") as file:
-                        while piece := file.read(1 << 20):
-                            upload.write(piece)
-                    listed[path] = upload.close()
+                        pieces = iter(partial(file.read, _PIECE), b"")
+                        listed[path] = bucket.send(name, about[0], pieces)
             for path in before.keys() - after.keys():
                 del listed[path]
             self._relist(label, replace(self._now.recordings[label], files=listed))
@@ -605,7 +605,7 @@ class RemoteDirectory(StoreDirectory):
                 self._append(label, added)
 
     def fetch(self, about: Object, path: Path) -> None:
-        """Write an object to a file, whatever the cache has of it.
+        """Write an object to a file, past the cache.
 
         Raises:
             FileNotFoundError: It does not exist.
