@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
@@ -14,18 +16,16 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
 from hybridlog.cli.progress import LateBar
 from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.watching import watch
 from hybridlog.wording import parse_size
-from hybridlog_storage.errors import BucketError, ResourceError, StoreError, TopicError, UsageError
-from hybridlog_storage.stopping import pause
+from hybridlog_storage.errors import StoreError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.query.choice import Choice
     from hybridlog.store import Store
 
-_WATCH_S = 2.0  # between two looks at a store that is followed
 _RUNNING: Final = frozenset({"open", "unfinished"})
-_RETRY_S = 10.0  # after a broken connection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,9 @@ def copy_command(given: _Copy) -> None:
         if_stopped("What arrived stays there: run the command again."),
     ):
         if given.watch:
-            _watch(store, given, how)
+            look = partial(_look, store, given, how, set[str]())
+            watch(store.directory.place, look, quiet=given.quiet)
+            return
         report = _copied(store, given, given.choice, how)
     _check(report)
 
@@ -102,31 +104,22 @@ def _copied(
     return report
 
 
-def _watch(store: Store, given: _Copy, how: CopyOptions) -> NoReturn:
-    """Copy what ends, until a signal ends the command."""
-    done: set[str] = set()
-    seen = None
-    while True:
-        now = {(one.id, one.status) for one in store.summaries()}
-        ended = [
-            one.id for one in store.choose(given.choice).summaries if one.status not in _RUNNING
-        ]
-        new = [one for one in ended if one not in done] if now != seen else []
-        try:
-            held: list[str] = []
-            if new:
-                report = _copied(store, given, new, how, is_short=True)
-                sys.stdout.flush()
-                output.notes([*report.refused.values(), *report.problems])
-                held = report.held
-            done.update(one for one in new if one not in held)
-            seen = None if held else now
-            pause(_RETRY_S if held else _WATCH_S)
-        except TopicError:
-            pause(_WATCH_S)  # one was removed since it was chosen
-        except (StoreError, BucketError, ResourceError) as error:
-            output.note(f"{error} Trying again in {_RETRY_S:.0f} s.")
-            pause(_RETRY_S)
+def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Iterator[StoreError]:
+    """Copy what has ended and is not `done`; yields why something was not copied."""
+    store.summaries()  # as they are now
+    chosen = store.choose(given.choice).summaries
+    new = [one.id for one in chosen if one.id not in done and one.status not in _RUNNING]
+    if not new:
+        return
+    try:
+        report = _copied(store, given, new, how, is_short=True)
+    except TopicError:
+        return  # one was removed since it was chosen
+    done.update({*new}.difference(report.held))
+    problems = [*report.refused.values(), *report.problems]
+    if report.held:
+        raise StoreError(" ".join(problems))
+    yield from map(StoreError, problems)
 
 
 def _receive(path: Path) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -14,9 +15,9 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
 from hybridlog.cli.progress import Stages, progress_bar
-from hybridlog.cli.signals import Stopped, if_stopped
-from hybridlog_storage.errors import DatabaseError, StoreError, UsageError
-from hybridlog_storage.stopping import at_safe_points, pause
+from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.watching import watch
+from hybridlog_storage.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.index.field_indexes import FieldIndex
@@ -163,8 +164,8 @@ class _Watch(_Shared):
     )
 
 
-@command(_Watch, to=index_command)
-def watch(given: _Watch) -> None:
+@command(_Watch, "watch", to=index_command)
+def watch_command(given: _Watch) -> None:
     """Index recordings as they come into the store, until Ctrl-C.
 
     For a server into whose store robots copy. While MongoDB is unavailable, it tries again.
@@ -175,53 +176,29 @@ def watch(given: _Watch) -> None:
     pause_s = parse_duration(given.every) / 1e9
     if pause_s <= 0:
         raise UsageError(f"--every {given.every} is no time to wait. Give a duration such as 2s.")
-    with (
-        given.opened(needs_database=True, quiet=given.quiet, is_lasting=True) as store,
-        at_safe_points(),
-    ):
-        try:
-            if not given.quiet:
-                output.note(f"Watching {store.directory.path}. Ctrl-C ends it.")
-            told: set[str] = set()
-            while True:
-                _look(store, told, as_json=given.as_json, quiet=given.quiet)
-                pause(pause_s)
-        except Stopped:
-            return
+    with given.opened(needs_database=True, quiet=given.quiet, is_lasting=True) as store:
+        look = partial(_look, store, given)
+        watch(store.directory.path, look, pause_s=pause_s, quiet=given.quiet)
 
 
-def _look(store: Store, told: set[str], *, as_json: bool, quiet: bool) -> None:
-    """Index what has come since the last look, and report it.
-
-    Args:
-        store: The store.
-        told: Problems that were reported and are not over; changed.
-        as_json: A line of JSON a recording.
-        quiet: Problems only.
-    """
+def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
+    """Index what has come since the last look, and print it; yields what cannot be read."""
     if store.session.snapshot().is_open.any() or store.session.has_changed():
         store.refresh()
-    problems = set()
+    repairs = store.repairs
     try:
         store.connect()
-    except (DatabaseError, StoreError) as error:
-        problems.add(str(error))
-    repairs = store.repairs
-    for label, problem in [*repairs.unreadable.items()]:
-        problems.add(f"Recording {label} cannot be read: {problem}")
-    for label in [*repairs.indexed]:
-        chunks = repairs.indexed.pop(label)
-        if not chunks:  # another process was faster
-            continue
-        if as_json:
-            output.print_json_line({"recording": label, "chunks": chunks})
-        elif not quiet:
-            output.say(f"{label}  {output.counted(chunks, 'chunk')}")
-            sys.stdout.flush()
-    for problem in sorted(problems - told):
-        output.note(problem)
-    told.clear()
-    told.update(problems)
+    finally:
+        for label in [*repairs.indexed]:
+            chunks = repairs.indexed.pop(label)
+            if not chunks:  # another process was faster
+                continue
+            if given.as_json:
+                output.print_json_line({"recording": label, "chunks": chunks})
+            elif not given.quiet:
+                output.say(f"{label}  {output.counted(chunks, 'chunk')}")
+    for label, problem in sorted(repairs.unreadable.items()):
+        yield StoreError(f"Recording {label} cannot be read: {problem}")
 
 
 @dataclass(frozen=True, kw_only=True)

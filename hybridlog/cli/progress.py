@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 from hybridlog.cli.output import console, printable
+from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -77,7 +78,8 @@ class LateBar:
         self._task: TaskID | None = None
 
     def __call__(self, recording: str, done: int, total: int) -> None:
-        """Report `done` of `total` bytes of a recording."""
+        """Report `done` of `total` bytes of a recording; a safe point."""
+        safe_point()
         if self._quiet:
             return
         if self._bar is None:

@@ -65,7 +65,7 @@ def record_command(choices: RecordChoices) -> None:
 
         record_live(choices)
     elif choices.watch:
-        from hybridlog.cli.record_watch import record_watched
+        from hybridlog.cli.record_logs import record_watched
 
         record_watched(choices)
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -19,6 +18,7 @@ from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
 from hybridlog.cli.signals import if_stopped
+from hybridlog.cli.watching import watch
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.errors import (
@@ -34,13 +34,14 @@ from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from hybridlog.cli.progress import Bar
-    from hybridlog.formats.find import Found, Log
+    from hybridlog.formats.find import Found, Log, Watch
     from hybridlog.formats.reading import Source
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.store import Store
 
 _MAX_FAILED = 20  # errors that are repeated at the end
+_MAX_UNFINISHED = 10
 
 
 def record_logs(choices: RecordChoices) -> None:
@@ -72,6 +73,67 @@ def record_logs(choices: RecordChoices) -> None:
     finally:
         done.show()
     done.exit()
+
+
+def record_watched(choices: RecordChoices) -> None:
+    """Record what lies in directories, and what comes into them, until a signal ends it."""
+    from hybridlog.formats.find import Watch
+    from hybridlog.query.times import parse_duration
+
+    settle_s = parse_duration(choices.settle) / 1e9
+    recorder = LogRecorder(choices)
+    check_new_store(choices, [])
+    watches = [Watch(path, settle_s) for path in choices.paths]
+    for one in watches:
+        one.check()
+    done = recorder.results
+    done.report_each()
+    try:
+        with if_stopped(done.on_stop), opened_to_record(choices) as store:
+            look = partial(_look, recorder, store, watches, set[Path]())
+            places = ", ".join(map(str, choices.paths))
+            watch(places, look, quiet=choices.quiet, report=partial(done.fail, None))
+            _print_unfinished([path for one in watches for path in one.unfinished()])
+    finally:
+        done.show()
+    done.exit()
+
+
+def _look(
+    recorder: LogRecorder, store: Store, watches: Sequence[Watch], met: set[Path]
+) -> Iterator[SourceError]:
+    """Record logs that have become complete; yields what cannot be read.
+
+    Args:
+        recorder: Records them.
+        store: The store.
+        watches: The directories.
+        met: Stores in them that were named; changed.
+    """
+    for one in watches:
+        try:
+            found = one.look()
+        except SourceError as error:  # the directory may come back
+            yield error
+            continue
+        print_stores(path for path in found.stores if path not in met)
+        met.update(found.stores)
+        yield from found.problems
+        for place, log in enumerate(found.logs):
+            safe_point()
+            try:
+                recorder.record(store, log, lambda _read, _messages: None)
+            except HybridlogError:  # these are tried again
+                for left in found.logs[place:]:
+                    one.put_back(left)
+                raise
+
+
+def _print_unfinished(paths: Sequence[Path]) -> None:
+    for path in paths[:_MAX_UNFINISHED]:
+        output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")
+    if len(paths) > _MAX_UNFINISHED:
+        output.note(f"and {len(paths) - _MAX_UNFINISHED} more that are not complete")
 
 
 def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
@@ -373,7 +435,6 @@ class Results:
                 f"{entry.label}: {output.counted(entry.messages, 'message')}, "
                 f"{output.size(entry.stored_bytes)}, from {path}"
             )
-            sys.stdout.flush()
 
     def known(self, path: Path, error: AlreadyRecordedError) -> None:
         """Add a log whose content is in the store.

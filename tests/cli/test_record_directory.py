@@ -12,10 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 import hybridlog as hl
-from hybridlog.cli import record_watch
+from hybridlog.cli import watching
 from hybridlog.cli.app import app
 from hybridlog.cli.signals import Stopped
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import DatabaseError, HybridlogError
 from tests.calls import Calls
 from tests.formats.test_find import METADATA, mcap
 
@@ -150,7 +150,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                 raise Stopped(signal.SIGINT)
             step()
 
-        monkeypatch.setattr(record_watch, "pause", pause)
+        monkeypatch.setattr(watching, "pause", pause)
 
     return set_steps
 
@@ -181,7 +181,7 @@ def test_a_watched_bag_grows(tmp_path: Path, store: Path, looks: Callable[..., N
     assert [line.partition(",")[0] for line in out.splitlines()] == [
         "old: 1 message", "bag_0: 2 messages", "bag_1: 3 messages",
     ]  # fmt: skip
-    assert "Watching. Ctrl-C ends it." in err
+    assert f"Watching {bag.parent}. Ctrl-C ends it." in err
     assert f"{bag.parent / 'going.mcap'} is not complete" in err
     assert err.endswith("3 logs recorded, 0 in the store already, 0 not recorded.\n")
     # The next watch, and a search, find all of it in the store.
@@ -199,7 +199,7 @@ def test_a_watch_goes_on_after_errors(
 
     def sometimes(*_: object, **__: object) -> None:
         if next(away, False):
-            raise record_watch.DatabaseError("MongoDB is on holiday.")
+            raise DatabaseError("MongoDB is on holiday.")
 
     calls(hl.Store, "record", sometimes)
     looks(nothing, nothing, nothing)

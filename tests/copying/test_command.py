@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.cli import watching
+from hybridlog.cli.signals import Stopped
 from hybridlog.schema.states import State
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
@@ -148,10 +150,42 @@ def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
     run("record", robots.parent / "noted.mcap", "--store", store, "--mongo", "none")
     words = ("copy", lab, "--store", store, "--watch")
     with started(*words, output=told) as process:
-        wait_for(lambda: told.read_text().splitlines() == ["copied noted"])
+        wait_for(lambda: told.read_text().splitlines()[1:] == ["copied noted"])
         run("record", robots.parent / "dropped.mcap", "--store", store, "--mongo", "none")
-        wait_for(lambda: told.read_text().splitlines() == ["copied noted", "copied dropped"])
+        wait_for(lambda: told.read_text().splitlines()[1:] == ["copied noted", "copied dropped"])
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
+        assert process.wait(60) == 0
     assert "What arrived stays there" in told.read_text()
     assert answers(lab, "dropped") == answers(store, "dropped")
+
+
+def test_a_watch_goes_on_after_a_cut(
+    robots: Path, tmp_path: Path, ssh: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses = []
+
+    def pause(seconds: float) -> None:
+        monkeypatch.delenv("CUT", raising=False)  # the connection is there again
+        pauses.append(seconds)
+        if len(pauses) == 2:
+            raise Stopped(signal.SIGINT)
+
+    monkeypatch.setattr(watching, "pause", pause)
+    monkeypatch.setenv("CUT", "9000")
+    words = ("copy", "dropped", "ssh://me@lab/~/lab", "--ssh", ssh, "--program", HYBRIDLOG)
+    told = answer(*words, "--watch", "--json", store=robots)
+    assert pauses == [10, 2]
+    assert "The next try is in 10 s." in told.err
+    assert [line for line in told.lines if '"copied": ["dropped"]' in line] == told.lines[-1:]
+    assert answers(tmp_path / "lab", "dropped") == answers(robots, "dropped")
+
+
+def test_a_signal_ends_a_watch_amid_a_recording(robots: Path, tmp_path: Path) -> None:
+    lab, told = tmp_path / "lab", tmp_path / "told"
+    words = ("copy", "dropped", lab, "--store", robots, "--watch")
+    with started(*words, "--limit-rate", "1kB/s", output=told) as process:
+        wait_for(lambda: any(file.stat().st_size for file in lab.rglob("*.mcap*")))
+        process.terminate()
+        assert process.wait(60) == 0
+    assert "What arrived stays there" in told.read_text()
+    assert run("copy", "dropped", lab, "--store", robots).lines == ["copied dropped"]

@@ -1,0 +1,82 @@
+"""The loop of `record --watch`, `copy --watch` and `index watch`."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from hybridlog.cli import output
+from hybridlog.cli.signals import Stopped
+from hybridlog_storage.errors import (
+    BucketError,
+    DatabaseError,
+    HybridlogError,
+    ResourceError,
+    StoreError,
+)
+from hybridlog_storage.stopping import at_safe_points, pause, safe_point
+
+_AWAY: Final = (BucketError, DatabaseError, ResourceError, StoreError)
+"""What may be over at a later look."""
+_LONGER: Final = 5
+"""Pause after such an error, as a multiple of the usual one."""
+
+
+def watch(
+    place: object,
+    look: Callable[[], Iterable[HybridlogError]],
+    *,
+    pause_s: float = 2.0,
+    quiet: bool,
+    report: Callable[[HybridlogError], None] = lambda error: output.note(str(error)),
+) -> None:
+    """Look at a store or directories again and again; a signal ends this normally.
+
+    Args:
+        place: What is looked at, for the person.
+        look: Acts on what has changed since its last call and prints that; yields problems. If
+            it fails because a place or a database is away, it is called again, later.
+        pause_s: Seconds between two looks.
+        quiet: Problems only.
+        report: Called once with a problem, as long as it lasts.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
+        sys.stdout.reconfigure(line_buffering=True)
+    told: set[str] = set()
+    try:
+        with at_safe_points():
+            if not quiet:
+                output.note(f"Watching {place}. Ctrl-C ends it.")
+            while True:
+                is_away = _look(look, told, report, _LONGER * pause_s)
+                pause(_LONGER * pause_s if is_away else pause_s)
+    except Stopped as stopped:
+        if stopped.consequence:
+            output.note(stopped.consequence)
+
+
+def _look(
+    look: Callable[[], Iterable[HybridlogError]],
+    told: set[str],
+    report: Callable[[HybridlogError], None],
+    longer_s: float,
+) -> bool:
+    """Look once; `told` has the problems that last. True if something is away."""
+    met: set[str] = set()
+    try:
+        for problem in look():
+            met.add(str(problem))
+            if str(problem) not in told:
+                report(problem)
+    except _AWAY as error:
+        safe_point()  # Ctrl-C may have ended a program that the other side needs
+        if str(error) not in told:
+            report(error)
+            output.note(f"The next try is in {longer_s:g} s.")
+        told |= {*met, str(error)}
+        return True
+    told.intersection_update(met)
+    told |= met
+    return False
