@@ -911,6 +911,8 @@ class Store:
         query: str,
         params: Sequence[Any] | Mapping[str, Any] | None = None,
         *,
+        recordings: Choice | Names | None = None,
+        between: During = None,
         memory: int | None = None,
         timeout: float | None = None,
     ) -> SqlAnswer:
@@ -920,6 +922,10 @@ class Store:
             query: A query on views of topics (`base__scan`, or `scan` where that is
                 unambiguous) and on `recordings`, `topics`, `losses` and `marks`.
             params: Values of `?` or `$name` in it.
+            recordings: The recordings that views and tables show, or what they must satisfy;
+                None for all.
+            between: Range `[begin, end)` of log time, as for `Query.between`, of the messages
+                that views show, and of the beginnings of marks.
             memory: Bytes that DuckDB may use by its own count, from 64 MiB; 1 GiB by default.
                 Lists and texts while they are made, and what is read for it, are not counted:
                 `hybridlog sql` and the page limit their whole process.
@@ -930,9 +936,13 @@ class Store:
 
         Raises:
             UsageError: The query is refused.
+            TopicError: No recording satisfies the choice.
+            TimeError: `between` is no range of time, or outside all recordings.
             MissingDependencyError: DuckDB is not installed.
         """
-        return self.sql_engine.connect(memory).query(query, params, timeout)
+        ids = None if recordings is None else tuple(one.id for one in self._chosen(recordings))
+        scope = Question((), ids, Choice.of(during=between).during)
+        return self.sql_engine.connect(memory, scope=scope).query(query, params, timeout)
 
     # Changes.
 

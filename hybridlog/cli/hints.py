@@ -50,12 +50,6 @@ MOVED: Final = {
     **dict.fromkeys(
         ("diff --last", "diff --older-than"), "diff RECORDING RECORDING --between T0 T1"
     ),
-    **dict.fromkeys(("sql -r", "sql --recording"), "sql \"... where recording = 'NAME'\""),
-    "sql --tag": "sql \"... where tags['KEY'] = 'VALUE'\"",
-    **dict.fromkeys(
-        ("sql --last", "sql --older-than", "sql --between"),
-        "sql \"... where log_time > '2025-06-03'\"",
-    ),
 }
 """Other names and options that people try, and the commands that do this."""
 

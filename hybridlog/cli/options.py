@@ -216,7 +216,25 @@ def topics(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Topics(Between, Choosing, InStore, Quiet):
+class Ranged(Between, Choosing, InStore, Quiet):
+    """Options of commands about a time of some recordings."""
+
+    @property
+    def span(self) -> tuple[TimeLike, TimeLike | None] | None:
+        """The range of `--between` or `--last`; None for all times.
+
+        Raises:
+            UsageError: Both are given.
+        """
+        if self.between is None:
+            return None if self.last is None else (self.since, None)
+        if self.last is not None:
+            raise UsageError("--last is a range of time, as --between: give one of them.")
+        return self.between
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topics(Ranged):
     """Options of commands about messages of some topics.
 
     Attributes:
@@ -260,19 +278,6 @@ class Topics(Between, Choosing, InStore, Quiet):
         if self.strict:
             query.completeness().check()
         return query
-
-    @property
-    def span(self) -> tuple[TimeLike, TimeLike | None] | None:
-        """The range of `--between` or `--last`; None for all times.
-
-        Raises:
-            UsageError: Both are given.
-        """
-        if self.between is None:
-            return None if self.last is None else (self.since, None)
-        if self.last is not None:
-            raise UsageError("--last is a range of time, as --between: give one of them.")
-        return self.between
 
     def bounded(self, query: Query) -> Query:
         """The messages of a query in that range."""

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, Self
 
-from hybridlog.cli.answers import Destination, Tabular, answer_sql
+from hybridlog.cli.answers import Tabular, answer_sql
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import InStore, Quiet, Strict
+from hybridlog.cli.options import Ranged, Strict
 from hybridlog.cli.output import note, notes, parse_size, say
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import HybridlogError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(InStore, Tabular, Strict, Quiet):
+class _Given(Strict, Ranged, Tabular):
     query: str | None = argument(
         "A query; without, a prompt on a terminal, else standard input.", "[QUERY]"
     )
@@ -40,8 +40,10 @@ def sql_command(given: _Given) -> None:
     """Ask in SQL: a view a topic, with nested fields as structs.
 
     Views are named as in `select view, short from topics`: base__scan, or scan where that is
-    unambiguous. Tables: recordings, topics, losses, marks. Needs no MongoDB.
+    unambiguous. Tables: recordings, topics, losses, marks. All show the chosen recordings alone,
+    and views and marks only the time of --between or --last. Needs no MongoDB.
     """
+    from hybridlog.query.question import Question
     from hybridlog.query.times import parse_duration
     from hybridlog.sql.duck import limited_memory
 
@@ -52,24 +54,24 @@ def sql_command(given: _Given) -> None:
     if query is None and not is_prompt:
         query = sys.stdin.read()
     with given.opened(is_lasting=is_prompt) as store:
-        connection = store.sql_engine.connect(most)
+        ids = None if given.choice.is_everything else given.recordings_in(store).ids
+        connection = store.sql_engine.connect(most, scope=Question((), ids, given.span))
 
-        def check(text: str) -> None:
-            known = set(store.topics())
-            topics = [topic for topic in connection.topics(text) if topic in known]
-            if given.strict and topics:
-                store.query(topics).completeness().check()
+        def run(text: str) -> None:
+            with limited_memory(connection.memory):
+                if given.strict:
+                    connection.check(text)
+                answer = connection.query(text, timeout=seconds)
+                answer_sql(answer, to)
+            sys.stdout.flush()
+            if not given.quiet:
+                notes(answer.sentences())
 
         if is_prompt:
-            run_prompt(connection, to, seconds, check)
+            run_prompt(connection, run)
             return
-        with if_stopped("The query was stopped."), limited_memory(connection.memory):
-            check(query or "")
-            answer = connection.query(query or "", timeout=seconds)
-            answer_sql(answer, to)
-        sys.stdout.flush()
-        if not given.quiet:
-            notes(answer.sentences())
+        with if_stopped("The query was stopped."):
+            run(query or "")
 
 
 _PROMPT: Final = "sql> "
@@ -81,24 +83,15 @@ _HISTORY: Final = "sql_history"
 _MAX_HISTORY: Final = 1000
 
 
-def run_prompt(
-    connection: SqlConnection,
-    to: Destination,
-    timeout: float | None,
-    check: Callable[[str], None],
-) -> None:
+def run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
     """Read statements, which end with a semicolon, and print their answers.
 
     Ctrl-C stops a query, or clears what was typed; Ctrl-D ends the prompt.
 
     Args:
-        connection: Runs the statements.
-        to: Format and place of the answers.
-        timeout: Seconds that one may take; None for no limit.
-        check: Refuses a statement whose answer would not be complete.
+        connection: Knows views and columns.
+        run: Runs a statement and prints its answer.
     """
-    from hybridlog.sql.duck import limited_memory
-
     say(_HINT)
     completer = Completer(connection)
     with _Keys() as keys, _line_editing(completer):
@@ -106,12 +99,8 @@ def run_prompt(
             if not text.strip():
                 continue
             try:
-                with keys.heard(), at_safe_points(), limited_memory(connection.memory):
-                    check(text)
-                    answer = connection.query(text, timeout=timeout)
-                    answer_sql(answer, to)
-                    sys.stdout.flush()
-                    notes(answer.sentences())
+                with keys.heard(), at_safe_points():
+                    run(text)
             except HybridlogError as error:
                 for line in str(error).splitlines():
                     note(line)

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.pieces import TopicOfRecording
 from hybridlog.sql.topic_view import TopicView
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -20,44 +27,60 @@ if TYPE_CHECKING:
 _SAMPLED: Final = 20  # recordings that tell how many messages a topic has
 
 
-def current_content(session: Session, known: StoreContent | None) -> StoreContent:
-    """The content of a store as it is now.
-
-    Args:
-        session: The open store.
-        known: The content before; it is returned if nothing has changed.
-    """
-    if known is not None and known.snapshot is session.look():
-        return known
-    return StoreContent(session)
-
-
 class StoreContent:
     """Recordings and views of a store at one moment. Thread safe.
 
     Args:
         session: The open store.
+        scope: The recordings and times of this question alone, whatever its topics.
 
     Attributes:
         session: The open store.
-        snapshot: Its recordings.
+        scope: The recordings and times.
+        snapshot: All recordings of the store.
+        summaries: Those of the scope, oldest first.
         names: Names of the views.
+
+    Raises:
+        TopicError: A recording does not exist any more.
+        TimeError: The range of time is empty, or outside all recordings.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, scope: Question) -> None:
         self.session = session
+        self.scope = scope
         self.snapshot = session.look()
+        self._places = np.arange(len(self.snapshot))
+        if scope.recordings is not None:
+            self._places = session.chosen(scope)
+        self.summaries = [self.snapshot.summaries[place] for place in self._places.tolist()]
+        topics = self.snapshot.topics_at(self._places)
+        self._windows: dict[str, Span] | None = None
+        if scope.bounds is not None:
+            found = RangeResolver(session, replace(scope, topics=tuple(topics))).resolve()
+            self._windows = {one.summary.id: one.bounds for one in found if one.bounds}
         self._views: dict[str, TopicView] = {}
         self._lock = threading.RLock()
         # DuckDB asks on threads of its own, which see a later moment.
-        unfinished = (one for one in self.snapshot.summaries if one.status in UNFINISHED)
+        unfinished = (one for one in self.summaries if one.status in UNFINISHED)
         self._running = {one.id: session.entry_of(one) for one in unfinished}
-        self.names = ViewNames(self.snapshot.topics)
+        self.names = ViewNames(topics)
 
     def summaries_of(self, topic: str) -> list[RecordingSummary]:
         """Recordings that have a topic, oldest first."""
-        places = self.snapshot.having([topic]).tolist()
-        return [self.snapshot.summaries[place] for place in places]
+        return [self.snapshot.summaries[place] for place in self._having(topic).tolist()]
+
+    def _having(self, topic: str) -> NDArray[np.intp]:
+        return np.intersect1d(self.snapshot.having([topic]), self._places)
+
+    def having(self, topics: Iterable[str]) -> list[str]:
+        """Ids of the recordings that may have rows of some topics."""
+        found = {one.id for topic in topics for one in self.summaries_of(topic)}
+        return [one for one in found if self._windows is None or one in self._windows]
+
+    def window(self, recording: str) -> Span | None:
+        """The log time `[begin, end)` of a recording in the scope, ns; None for all times."""
+        return None if self._windows is None else self._windows.get(recording, (0, 0))
 
     def topic_of(self, summary: RecordingSummary, topic: str) -> TopicOfRecording:
         """A topic in a recording."""
@@ -73,12 +96,15 @@ class StoreContent:
 
     def _view(self, topic: str) -> TopicView:
         found = self.summaries_of(topic)
+        kinds = self._kinds(topic, found)
+        found = [one for one in found if self._windows is None or one.id in self._windows]
         return TopicView(
             topic,
             recordings=[partial(self.topic_of, summary, topic) for summary in found],
             labels=[summary.label for summary in found],
             spans=[self._span(summary) for summary in found],
-            kinds=self._kinds(topic, found),
+            windows=[self.window(summary.id) for summary in found],
+            kinds=kinds,
             size=self._size(topic, found),
         )
 
@@ -93,8 +119,8 @@ class StoreContent:
 
     def _kinds(self, topic: str, found: Sequence[RecordingSummary]) -> list[Any]:
         """Types of the messages; recordings with equal definitions have equal ones."""
-        places = self.snapshot.having([topic])
-        some = [self.topic_of(one, topic) for one in self.snapshot.differing(places)]
+        differing = self.snapshot.differing(self._having(topic))
+        some = [self.topic_of(one, topic) for one in differing]
         if not all(one.is_fixed for one in some):
             some = [self.topic_of(one, topic) for one in found]
         return [kind for one in some for kind in one.kinds]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.query.question import Question
 from hybridlog.schema.states import without_fields
-from hybridlog.sql.content import StoreContent, current_content
+from hybridlog.sql.content import StoreContent
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
@@ -31,11 +32,14 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+    from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Session
     from hybridlog.sql.pieces import ScanCounts
     from hybridlog.sql.topic_view import Remarks
 
 Params = Sequence[Any] | Mapping[str, Any] | None
+EVERYWHERE: Final = Question(())
+"""A scope of all recordings and times."""
 _BATCH_ROWS: Final = 65_536
 _FIRST_ROWS: Final = 64
 _TREE: Final = (
@@ -69,12 +73,19 @@ class SqlEngine:
         self._trees: dict[str, str] = {}
         self._lock = threading.RLock()
 
-    def connect(self, memory: int | None = None, *, only_reads: bool = False) -> SqlConnection:
+    def connect(
+        self,
+        memory: int | None = None,
+        *,
+        only_reads: bool = False,
+        scope: Question = EVERYWHERE,
+    ) -> SqlConnection:
         """A connection; what is created in it is there until it is closed.
 
         Args:
             memory: Limit of DuckDB's memory, bytes; None for 1 GiB.
             only_reads: Nothing can be created in it.
+            scope: The recordings and times that views and tables show, whatever its topics.
 
         Raises:
             MissingDependencyError: DuckDB is not installed.
@@ -84,13 +95,16 @@ class SqlEngine:
         with self._lock:
             if most not in self._bases:
                 self._bases[most] = open_duckdb(most)
-            return SqlConnection(self, self._bases[most].cursor(), most, only_reads=only_reads)
+            cursor = self._bases[most].cursor()
+            return SqlConnection(self, cursor, most, scope, only_reads=only_reads)
 
-    def content(self) -> StoreContent:
-        """Recordings and views as they are now."""
-        with self._lock:
-            self._content = current_content(self.session, self._content)
-            return self._content
+    def content(self, scope: Question = EVERYWHERE) -> StoreContent:
+        """Recordings and views of a scope as they are now."""
+        with self._lock, self.session.at_one_moment():
+            known = self._content
+            if known is None or known.scope != scope or known.snapshot is not self.session.look():
+                known = self._content = StoreContent(self.session, scope)
+            return known
 
     def tree(self, cursor: Any, text: str) -> str:
         """The syntax tree of a query as JSON; those of the last queries are kept.
@@ -131,6 +145,7 @@ class SqlConnection:
         engine: The engine.
         cursor: A connection of DuckDB.
         memory: Limit of its memory, bytes.
+        scope: The recordings and times that views and tables show.
         only_reads: Statements other than queries are refused.
 
     Attributes:
@@ -138,11 +153,18 @@ class SqlConnection:
     """
 
     def __init__(
-        self, engine: SqlEngine, cursor: Any, memory: int, *, only_reads: bool = False
+        self,
+        engine: SqlEngine,
+        cursor: Any,
+        memory: int,
+        scope: Question,
+        *,
+        only_reads: bool = False,
     ) -> None:
         self.engine = engine
         self.cursor = cursor
         self.memory = memory
+        self.scope = scope
         self.stopped = threading.Event()
         self._only_reads = only_reads
         self.reading = Reading()
@@ -151,21 +173,43 @@ class SqlConnection:
         self._names: set[str] = set()
         self._registered: set[str] = set()
 
+    @property
+    def content(self) -> StoreContent:
+        """Recordings and views as they are now."""
+        return self.engine.content(self.scope)
+
     def names(self) -> list[str]:
         """Names of all views and tables of the store."""
-        return list(self.engine.content().names)
+        return list(self.content.names)
 
-    def topics(self, text: str) -> list[str]:
-        """Topics of the views that a query may read by name."""
-        names = self.engine.content().names
-        found = (names.topic(name) for name in names.named(text))
-        return list(dict.fromkeys(topic for topic in found if topic is not None))
+    def check(self, text: str) -> None:
+        """Check that the answer of a query lacks nothing, by the views that it may read.
+
+        Raises:
+            IncompleteError: Messages are lost, or not written yet.
+        """
+        content = self.content
+        named = (content.names.topic(name) for name in content.names.named(text))
+        topics = {topic for topic in named if topic is not None}
+        self.completeness(topics, content.having(topics)).check()
+
+    def completeness(self, topics: Collection[str], recordings: Collection[str]) -> Completeness:
+        """Completeness of the answer of a query.
+
+        Args:
+            topics: Topics that it reads.
+            recordings: Ids of the recordings that it reads.
+        """
+        from hybridlog.query.answers.lost import completeness_of
+
+        asked = replace(self.scope, topics=tuple(topics), recordings=tuple(recordings))
+        return completeness_of(self.engine.session, asked)
 
     def schema(self, view: str) -> pa.Schema:
         """Columns of a view or table of the store; none without such a view."""
         import pyarrow as pa
 
-        content = self.engine.content()
+        content = self.content
         topic = content.names.topic(view)
         if topic is not None:
             return content.view(topic).schema
@@ -194,7 +238,7 @@ class SqlConnection:
             )
         if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
             raise UsageError("Only queries are possible here, such as select and show.")
-        self._names.update(self.engine.content().names.named(text))
+        self._names.update(self.content.names.named(text))
         self.register()
         answers = [
             self._prepared(statement, params if statement is statements[-1] else None, timeout)
@@ -214,7 +258,7 @@ class SqlConnection:
 
     def register(self) -> None:
         """Register the views that were named so far, if they are not the current ones."""
-        content = self.engine.content()
+        content = self.content
         known = set() if content is not self._content else self._registered
         for name in self._names - known:
             topic = content.names.topic(name)
@@ -290,16 +334,14 @@ class SqlAnswer:
 
     def sentences(self) -> list[str]:
         """Sentences about what the computed answer may lack."""
-        from hybridlog.query.answers.lost import completeness_of
-
         found = self.remarks
         lines = []
         for topic, reason in found.undefined.items():
             lines.append(f"{topic} has no columns of fields: {reason}.")
         for (topic, state), count in found.absent.items():
             lines.append(f"{topic}: {without_fields(count, state)}.")
-        question = Question(tuple(found.topics), tuple(found.recordings))
-        return [*lines, *completeness_of(self._connection.engine.session, question).sentences]
+        lacks = self._connection.completeness(found.topics, found.recordings)
+        return [*lines, *lacks.sentences]
 
     def run(self) -> None:
         """Compute a statement that changes something; the answer is its result."""

@@ -67,7 +67,7 @@ def store_table(name: str, content: StoreContent) -> pa.Table:
         content: The store.
     """
     if name == "recordings":
-        return recordings_table(content.snapshot.summaries)
+        return recordings_table(content.summaries)
     rows, schema = _TABLES[name]
     return pa.Table.from_pylist(list(rows(content)), schema=schema)
 
@@ -103,7 +103,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 
 def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
-    for summary in content.snapshot.summaries:
+    for summary in content.summaries:
         entry = content.session.entry_of(summary)
         for loss in entry.end.get("losses", ()):
             yield {
@@ -118,8 +118,11 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 
 def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
-    labels = {one.id: one.label for one in content.snapshot.summaries}
+    labels = {one.id: one.label for one in content.summaries}
     for mark in marks_in(content.session, [*labels], Counters()):
+        window = content.window(mark.recording)
+        if window is not None and not window[0] <= mark.begin < window[1]:
+            continue
         yield {
             "log_time": mark.begin // 1000,
             "t": mark.begin,

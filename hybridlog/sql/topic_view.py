@@ -28,6 +28,7 @@ from hybridlog.sql.columns import (
 )
 from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,6 +85,7 @@ class TopicView:
             query first reads it.
         labels: Label of each recording.
         spans: First and last log time of each recording, ns; None if unknown.
+        windows: The log time `[begin, end)` of each that has rows, ns; None for all times.
         kinds: Types of the messages.
         size: Number of rows, nearly.
     """
@@ -95,12 +97,14 @@ class TopicView:
         recordings: Sequence[Callable[[], TopicOfRecording]],
         labels: Sequence[str],
         spans: Sequence[tuple[int, int] | None],
+        windows: Sequence[tuple[int, int] | None],
         kinds: Sequence[Any],
         size: int,
     ) -> None:
         self.topic = topic
         self.size = size
         self._recordings = recordings
+        self._windows = windows
         self._made: dict[int, tuple[TopicOfRecording, _Chooser]] = {}
         kind = merged(list(kinds)) if kinds else pa.struct([])
         self._columns = {column.name: column for column in view_columns(kind)}
@@ -118,11 +122,16 @@ class TopicView:
             where: Expression that holds for all of them; None for all rows.
             reading: Collects what is read.
         """
-        plan = _Plan(self.schema, self._columns, columns, where, reading)
+        plans: dict[tuple[int, int] | None, _Plan] = {}
         for number in self._chooser.chosen(where):
+            window = self._windows[number]
+            plan = plans.get(window)
+            if plan is None:
+                holds = _in_window(where, window)
+                plan = plans[window] = _Plan(self.schema, self._columns, columns, holds, reading)
             recording, chooser = self._parts_of(number)
             self._remark(recording, reading.remarks)
-            for place in chooser.chosen(where):
+            for place in chooser.chosen(plan.where):
                 yield from plan.read(recording, recording.sources[place])
 
     def _parts_of(self, number: int) -> tuple[TopicOfRecording, _Chooser]:
@@ -223,6 +232,17 @@ def _within(span: tuple[int, int] | None) -> Any:
     return (t >= first) & (t <= last) & (log_time >= low) & (log_time <= high)
 
 
+def _in_window(where: Any, window: tuple[int, int] | None) -> Any:
+    """An expression that holds for rows of a window of log time for which another one holds."""
+    if window is None:
+        return where
+    begin, end = window
+    inside = pc.field("t") >= begin
+    if end < END:  # a range without an end holds the last time, too
+        inside &= pc.field("t") < end
+    return inside if where is None else inside & where
+
+
 def _within_source(source: RowSource) -> Any:
     known = source.first is not None and source.last is not None
     return _within((source.first, source.last) if known else None)  # type: ignore[arg-type]
@@ -237,6 +257,9 @@ class _Plan:
         columns: Names of the columns to return.
         where: Expression that holds for all rows; None for all.
         reading: Collects what is read.
+
+    Attributes:
+        where: The expression.
     """
 
     def __init__(
@@ -247,7 +270,7 @@ class _Plan:
         where: Any,
         reading: Reading,
     ) -> None:
-        self._where = where
+        self.where = where
         self._reading = reading
         self._columns = list(columns)
         self._schema = schema
@@ -272,7 +295,7 @@ class _Plan:
             if absent:
                 yield from self._with_payloads(recording, rows, absent)
             else:
-                yield from self._finished(recording, rows, {}, self._where)
+                yield from self._finished(recording, rows, {}, self.where)
 
     def _with_payloads(
         self,
@@ -282,7 +305,7 @@ class _Plan:
     ) -> Iterator[pa.RecordBatch]:
         """Rows with arrays from payloads, which are read of as few messages as possible."""
         chosen = np.arange(rows.size)
-        where = self._where
+        where = self.where
         tests_them = _named(str(where), [leaf.name for leaf in absent.values()])
         if where is not None and not tests_them:
             known = self._batch(recording, rows, dict.fromkeys(absent), self._tested)

@@ -67,6 +67,8 @@ def answers(path: Path) -> dict[str, Any]:
         found["table"] = scans.fields("angle_min", "header.stamp").to_arrow().to_pylist()
         text = "select t, seq, angle_min, ranges_summary.max from scan order by seq"
         found["sql"] = store.sql(text).rows()
+        found["sql between"] = store.sql(text, between=("+1s", "+3s")).rows()
+        assert len(found["sql between"]) == found["/scan between"]
     return found
 
 

@@ -647,8 +647,11 @@ EXEMPT_METHODS: dict[str, str] = {
 """Methods without a rule here, and why."""
 
 
-def _sql(store: hl.Store, query: str) -> Any:
-    return store.sql(query).rows()
+EDGES = "+1s", "-500ms"
+
+
+def _sql(store: hl.Store, query: str, **scope: Any) -> Any:
+    return store.sql(query, **scope).rows()
 
 
 def _aligned(found: Any) -> Any:
@@ -704,6 +707,7 @@ STORE: dict[str, Rule] = {
             _sql(s, "select name, status, messages from recordings"),
             _sql(s, "select text from marks order by log_time"),
             _sql(s, "select cause, messages from losses"),
+            _sql(s, "select seq from said order by t, seq", recordings=[LABEL], between=EDGES),
         ),
         lambda k: (
             [
@@ -722,6 +726,7 @@ STORE: dict[str, Rule] = {
             [(LABEL, "open", len(k.of()))],
             [(m.fields["text"],) for m in k.of("/hybridlog/marks")],  # type: ignore[index]
             [("transport", 3)],
+            [(one[3],) for one in ranged(k, "/said", "log", SECOND, -SECOND // 2)],
         ),
     ),
     "summaries": Rule(

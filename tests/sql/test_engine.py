@@ -18,6 +18,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.columns.parquet_file import ParquetFileReader
+from hybridlog.query.choice import Choice
 from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import (
@@ -25,11 +26,13 @@ from hybridlog_storage.errors import (
     ResourceError,
     SegmentError,
     StoreError,
+    TimeError,
     TopicError,
     UsageError,
 )
 from tests.limits import Limit
-from tests.sql.conftest import LARGE, SCANS
+from tests.sql.conftest import LARGE, SCANS, scan
+from tests.tables.logs import BASE, SECOND
 
 ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
 
@@ -230,6 +233,37 @@ def test_missing_and_damaged_tables_are_made_again(own: hl.Store, limit: Limit) 
         assert again.sql(query).rows() == wanted
         again.mend()
         assert again.repairs.tables
+
+
+def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
+    """Views and tables show these alone, and only files of them are read."""
+    count = "select count(*) from large"
+    some = store.sql(count, recordings=["second"])
+    assert (some.rows(), len(some.counts.files)) == ([(40,)], 1)
+    chosen = store.recordings(tag="site=hall")
+    assert store.sql(count, recordings=chosen).rows() == [(LARGE,)]
+    known = ("recording from recordings", "distinct recording from topics")
+    for names in known:
+        assert store.sql(f"select {names}", recordings=["second"]).rows() == [("second",)]
+    with pytest.raises(TopicError, match="There is no view 'scan'"):
+        store.sql("select * from scan", recordings=["second"])
+    # 300 rows a row group, a message a millisecond
+    part = store.sql(f"{count} where i8 > -999", between=("+310ms", "+0.4s"))
+    whole = f"t >= {BASE + 310_000_000} and t < {BASE + 400_000_000}"
+    assert part.rows() == store.sql(f"{count} where {whole}").rows() == [(90,)]
+    assert part.counts.row_groups == 2  # one of each recording
+    first = store.sql(count, between=(BASE, BASE + SECOND))
+    assert (first.rows(), len(first.counts.files)) == ([(1000,)], 1)
+    assert [*first.remarks.recordings] == [store.entry("first").id]
+    # A view has all its columns, and no row of a recording that lies outside.
+    none = store.sql("select angle from scan", between=(BASE + 3600 * SECOND, None))
+    assert (none.rows(), none.counts.files) == ([], set())
+    arrays = store.sql("select max(ranges[1]), count(*) from scan", between=("start", "+21ms"))
+    assert (arrays.rows(), arrays.counts.payload_bytes) == ([(10.0, 11)], 11 * len(scan(0)))
+    with pytest.raises(TimeError, match="Nothing was recorded between"):
+        store.sql(count, between=("2001-01-01", "2001-01-02"))
+    with pytest.raises(TopicError, match="There is no recording with the tag site=park"):
+        store.sql(count, recordings=Choice.of(tag="site=park"))
 
 
 def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
