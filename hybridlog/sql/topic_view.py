@@ -288,7 +288,10 @@ class _Plan:
     def read(self, recording: TopicOfRecording, source: RowSource) -> Iterator[pa.RecordBatch]:
         """The rows of a source."""
         absent = {key: leaf for key, leaf in self._leaves.items() if _is_absent(leaf, source)}
-        held = [leaf for key, leaf in self._leaves.items() if key not in absent]
+        # The summary of a nested array tells where the struct above it is missing.
+        held = [
+            leaf for key, leaf in self._leaves.items() if key not in absent or len(leaf.source) > 1
+        ]
         own = self._own | ({"ref", "channel"} if absent else set())
         for rows in source.read(_paths(held), own, self._reading.counts):
             self._remark(recording.topic, rows, lacks_arrays=bool(absent))

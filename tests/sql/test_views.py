@@ -213,6 +213,8 @@ def test_arrays_come_from_payloads_only_when_they_are_named(store: hl.Store) -> 
     ).rows()
     expected = [(n + 2.0, n + 40.0, n / 4, n % 256, 50, n % 7, n + 99.0, 50) for n in range(SCANS)]
     assert found == expected
+    nested = "select sum(echo.far[1]) from scan"  # no other field of the struct is read
+    assert store.sql(nested).rows() == [(sum(n / 4 for n in range(SCANS)),)]
     near = "select count(*) from scan where list_min(ranges[41:60]) < 50"
     language = store.topic("scan").where("ranges[40:60] < 50").count()
     assert store.sql(near).rows() == [(language,)] == [(10,)]
