@@ -31,10 +31,6 @@ _STORES: Final = "stores"
 def trusted_uri(settings: StoreSettings, store: Path | None = None) -> str:
     """The URI that a store may use, `embedded`, or `none`.
 
-    Args:
-        settings: The store's settings.
-        store: Its directory, for the message.
-
     Raises:
         DatabaseError: the store names a server that this user has not agreed to.
     """

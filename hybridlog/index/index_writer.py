@@ -75,11 +75,6 @@ class IndexTarget:
 class DocumentSender:
     """Sends the documents of a recording's chunks to the index, in the order of the file.
 
-    Args:
-        entry: The recording.
-        database: The index.
-        through: What the index has.
-
     Attributes:
         through: What the index has.
         added: The same with what is being sent, or waits for more.

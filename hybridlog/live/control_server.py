@@ -135,11 +135,7 @@ class ControlServer:
 
 
 def running(store: Path) -> list[str]:
-    """Names of the recorders that run on a store, in the order of their start.
-
-    Args:
-        store: The store's directory.
-    """
+    """Names of the recorders that run on a store, in the order of their start."""
     found: list[tuple[float, str]] = []
     try:
         socket_files = files.names(store / _SOCKET_FILES, depth=files.IN_STORE)
@@ -158,12 +154,6 @@ def running(store: Path) -> list[str]:
 
 def request(store: Path, name: str, ask: str, **content: Any) -> dict[str, Any]:
     """Send a request to a running recorder.
-
-    Args:
-        store: The store's directory.
-        name: The recorder's name.
-        ask: Kind of the request.
-        content: Further fields of the request.
 
     Raises:
         StoreError: The recorder does not answer.

@@ -115,9 +115,6 @@ class Throttle:
 
     Time is the messages' receive time. A message may come a quarter of an interval early.
     Without that tolerance a jittering topic of 10 Hz gives 3.3 Hz instead of 5.
-
-    Args:
-        hz: The rate.
     """
 
     def __init__(self, hz: float) -> None:

@@ -43,9 +43,6 @@ class SilenceWatch:
     """Follows the topics that have a longest gap in a contract. Thread safe.
 
     Its times are steady ones, so that a clock that is set is no silence.
-
-    Args:
-        contract: The rules.
     """
 
     def __init__(self, contract: Contract) -> None:

@@ -321,12 +321,6 @@ def _difference(
 ) -> str:
     """Compare messages of a chunk with those in columns, byte for byte.
 
-    Args:
-        payloads: The columns of their topic.
-        chunk: The chunk.
-        rows: The messages of the topic in it.
-        seen: Counts compared messages by file.
-
     Returns:
         The difference; empty if there is none, or if the chunk is not in the columns.
     """

@@ -445,13 +445,6 @@ def rebuild(
     The other recordings can be asked meanwhile. The next opening finishes an interrupted
     rebuild.
 
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        database: The index.
-        entries: The recordings.
-        progress: Called after each chunk.
-
     Returns:
         Why some are unchanged, by id: another process holds them, or they are gone.
 

@@ -530,11 +530,6 @@ def copied_of(directory: StoreDirectory, label: str) -> Copied:
 def edits_of(data: bytes, state: JournalState, place: str) -> tuple[list[journal.Event], list[str]]:
     """Lines that users added to a copy, and the files of the marks that they set there.
 
-    Args:
-        data: The journal of the copy.
-        state: The journal that takes its place.
-        place: Where the copy is.
-
     Raises:
         RefusedError: A mark that was set here has the number of one there.
     """

@@ -56,12 +56,6 @@ def repair(
 ) -> list[Repaired]:
     """Repair files, journals and the catalog.
 
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        repairs: The report of the store's opening.
-        entries: The recordings; None for all.
-
     Raises:
         StoreError: The store cannot be written.
     """

@@ -104,15 +104,7 @@ def sizes_of(
     database: Database | None,
     places: TopicPlaces | None,
 ) -> Sizes:
-    """Sizes of some recordings.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        entries: The recordings.
-        database: The index; None if it is unavailable.
-        places: The places of topics there.
-    """
+    """Sizes of some recordings."""
     index: dict[tuple[str, str], int] = {}
     if database is not None and places is not None:
         index = _index_bytes(entries, database, places)
@@ -144,11 +136,7 @@ def sizes_of(
 
 
 def disk_bytes(root: Path) -> int:
-    """Bytes that everything below a folder takes; links are not followed.
-
-    Args:
-        root: The folder.
-    """
+    """Bytes that everything below a folder takes; links are not followed."""
     found, folders = 0, [os.fspath(root)]
     while folders:
         with suppress(OSError), os.scandir(folders.pop()) as entries:  # it may go meanwhile

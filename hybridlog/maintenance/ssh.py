@@ -103,11 +103,6 @@ def ssh_place(url: str, ssh: str | None, program: str) -> Iterator[Server]:
 class Server:
     """A store behind a connection: as of `Place`.
 
-    Args:
-        name: What people call it.
-        requests: Takes what is asked.
-        answers: Has what is answered.
-
     Raises:
         StoreError: There is no hybridlog on the other side.
     """
@@ -254,11 +249,6 @@ def _words(url: str, program: str) -> list[str]:
 
 def serve(place: DirectoryPlace, requests: IO[bytes], answers: IO[bytes]) -> None:
     """Do what the other side asks until it ends.
-
-    Args:
-        place: The store.
-        requests: What it asks; unbuffered.
-        answers: What it is told.
 
     Raises:
         StoreError: It does not speak this protocol, or is silent.

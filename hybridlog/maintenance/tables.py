@@ -124,14 +124,6 @@ def make_noted(
     Missing tables of topics that share chunks with them are created with them, so that no
     chunk is read for each of them.
 
-    Args:
-        directory: The store.
-        entry: The recording's entry in the catalog.
-        topics: Full names.
-        tables: Finds the tables.
-        report: Collects the tables that were created.
-        until: When this is given up, by `time.monotonic`.
-
     Returns:
         False if time was short.
     """
@@ -175,11 +167,7 @@ def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:
 
 
 class TableChecker:
-    """Checks the tables of recordings; each file once.
-
-    Args:
-        directory: The store.
-    """
+    """Checks the tables of recordings; each file once."""
 
     def __init__(self, directory: StoreDirectory) -> None:
         from hybridlog.columns.tables import Tables
@@ -231,11 +219,6 @@ def announce_removal(directory: StoreDirectory, recording: str) -> None:
 def remove(directory: StoreDirectory, recording: str, types: Collection[str] | None = None) -> None:
     """Remove all tables of a recording.
 
-    Args:
-        directory: The store.
-        recording: Id of the recording.
-        types: Types of its messages; None if unknown.
-
     Raises:
         OSError: a table cannot be removed.
     """
@@ -277,12 +260,7 @@ def are_left(directory: StoreDirectory, snapshot: Snapshot) -> bool:
 
 
 def remove_orphans(directory: StoreDirectory, present: Collection[str]) -> None:
-    """Remove tables of removed recordings.
-
-    Args:
-        directory: The store.
-        present: Keys of all recordings with a directory.
-    """
+    """Remove tables of removed recordings."""
     from hybridlog.columns.folders import recordings_of
 
     there = unfinished(directory) | recordings_of(directory.path)

@@ -93,15 +93,7 @@ def verify(
     """Check every byte of segments, journals and tables, and compare the index with them.
 
     The documents of each chunk are made again and compared with those in the database. This
-    proves that each reference leads to its message.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        database: The index; None to skip it.
-        repairs: The report of the store's opening.
-        labels: The recordings; None for all.
-        progress: Called after each part of a segment.
+    proves that each reference leads to its message. Without a database, only files are checked.
     """
     result = Verification(index=database is not None)
     labels = None if labels is None else [*labels]

@@ -193,10 +193,6 @@ class Capture:
     ) -> DatabaseError | None:
         """Complete the recording on a full disk.
 
-        Args:
-            end: As for `close`.
-            lost: Rows of the loss ledger.
-
         Returns:
             Why the index is not complete, None when it is.
 

@@ -256,11 +256,7 @@ def _rounded(size: int) -> int:
 
 
 def new_memory(size: int) -> mmap.mmap:
-    """Private memory in huge pages, allocated when it is first written.
-
-    Args:
-        size: Bytes.
-    """
+    """Private memory in huge pages, allocated when it is first written."""
     memory = mmap.mmap(-1, size, flags=_PRIVATE)
     if _HUGE is not None:
         memory.madvise(_HUGE)

@@ -20,9 +20,6 @@ class Cache:
 
     A key is the kind of value and all that the value depends on, such as a digest.
     Those that were not used for longest make room for others.
-
-    Args:
-        max_bytes: Bytes of all values together.
     """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:

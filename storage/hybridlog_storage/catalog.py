@@ -991,10 +991,7 @@ class Catalog:
             return all(whole) and not self._odd and not self._damaged
 
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
-        """Summaries of recordings, unordered; without damaged ones.
-
-        Args:
-            recordings: Their ids; None for all.
+        """Summaries of recordings by id, None for all; unordered, without damaged ones.
 
         Raises:
             StoreError: It cannot be read.
@@ -1225,11 +1222,6 @@ class Catalog:
         self, entry: RecordingEntry, segment: int, number: int
     ) -> dict[int, ChannelStats]:
         """Statistics of the channels in a chunk.
-
-        Args:
-            entry: The recording.
-            segment: Number of the segment.
-            number: Number of the chunk in it.
 
         Raises:
             CatalogError: As for `table`.

@@ -186,9 +186,6 @@ class DiskFolder(MemoryFolder):
     """The folder of a catalog in a store.
 
     A reader sees each file as it was before a change, or after it. Writers take turns.
-
-    Args:
-        path: The folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -254,9 +251,6 @@ class DiskFolder(MemoryFolder):
     @contextmanager
     def lock(self, wait_s: float) -> Iterator[None]:
         """Keep other writers away.
-
-        Args:
-            wait_s: Seconds to wait for them.
 
         Raises:
             BlockingIOError: Another process has been writing for longer.

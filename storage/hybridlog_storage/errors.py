@@ -23,12 +23,7 @@ _ADDRESS: Final = re.compile(r"\b(s3|gs|az):/(?!/)")
 
 
 def exhausted(number: int | None, doing: str) -> ResourceError | None:
-    """The error for a system error that means too few handles or too little memory.
-
-    Args:
-        number: The system's number of the error.
-        doing: The activity, for the message.
-    """
+    """The error for a system error that means too few handles or too little memory."""
     if number in NO_HANDLES:
         return ResourceError(
             f"Out of file handles while {doing}: raise the limit with `ulimit -n 8192`, or close "

@@ -405,9 +405,6 @@ def parse(data: bytes) -> JournalState:
 def read(recording: Path) -> JournalState | None:
     """Read the journal of a recording; None if it does not exist.
 
-    Args:
-        recording: Its directory.
-
     Raises:
         StoreError: It cannot be read.
     """

@@ -37,9 +37,6 @@ class lazy(Generic[_T]):  # noqa: N801 - a decorator
 class RowType:
     """The type of rows with named numbers, which numpy takes as a `dtype`.
 
-    Args:
-        fields: Name and type of each, in order.
-
     Attributes:
         names: Names of the fields.
         itemsize: Bytes of a row.

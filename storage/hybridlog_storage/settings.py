@@ -78,9 +78,6 @@ class StoreSettings:
 def read_settings(path: Path) -> StoreSettings:
     """Read the settings of a store.
 
-    Args:
-        path: The store's directory.
-
     Raises:
         StoreError: It is not a store, has another format, or requires an unknown feature;
             or the settings are damaged, or hold a password.
@@ -138,10 +135,6 @@ def _table(file: Path, values: Mapping[str, Any], name: str) -> dict[str, Any] |
 def write_settings(path: Path, settings: StoreSettings) -> None:
     """Write the settings of a store, without a password in its URI.
 
-    Args:
-        path: The store's directory.
-        settings: The settings.
-
     Raises:
             UsageError: The URI is not a MongoDB connection string.
             OSError: They cannot be written.
@@ -181,10 +174,6 @@ def is_uri(mongo: str | None) -> TypeGuard[str]:
 def checked_cache_mb(value: object, name: str) -> int:
     """A size of the embedded MongoDB's cache in MiB.
 
-    Args:
-        value: The size.
-        name: The setting, for the message.
-
     Raises:
         UsageError: It is not an integer, or MongoDB does not accept it.
     """
@@ -211,9 +200,6 @@ def cache_mb_from_environment() -> int | None:
 def without_password(uri: str) -> str:
     """A connection string with the user's name, but without secrets.
 
-    Args:
-        uri: MongoDB connection string.
-
     Raises:
         UsageError: It is invalid, so a password may be anywhere in it. The message does not
             show it.
@@ -233,9 +219,6 @@ def with_password(uri: str) -> str:
 
     HYBRIDLOG_MONGO_PASSWORD holds it, or the file named by HYBRIDLOG_MONGO_PASSWORD_FILE. A
     URI without a user, or with a password of its own, is unchanged.
-
-    Args:
-        uri: MongoDB connection string.
 
     Raises:
         UsageError: The file cannot be read, or others can read it.

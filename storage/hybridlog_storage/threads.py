@@ -77,12 +77,7 @@ _imports: dict[str, Any] = getattr(import_module("importlib._bootstrap"), "_modu
 
 
 def begins_anew(thing: object, *arguments: object) -> None:
-    """Make an object anew in forked processes, without the locks that threads may hold.
-
-    Args:
-        thing: The object.
-        arguments: Those of its class.
-    """
+    """Make an object anew in forked processes, without the locks that threads may hold."""
     _begun[thing] = arguments
 
 

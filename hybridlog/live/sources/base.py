@@ -38,11 +38,7 @@ class Sink(Protocol):
         ...
 
     def expect(self, channel: Channel) -> None:
-        """Prepare for a channel, before its first message. Takes some milliseconds.
-
-        Args:
-            channel: The object that `take` will get.
-        """
+        """Prepare for a channel, before its first message. Takes some milliseconds."""
         ...
 
     def take(
@@ -178,12 +174,7 @@ _MAX_LENGTH = 400
 
 
 def one_line(text: str | bytes, limit: int = _MAX_LENGTH) -> str:
-    """Text from a peer as one line: bounded, and without control characters.
-
-    Args:
-        text: Text, or bytes that should be UTF-8.
-        limit: Number of characters; the rest becomes `...`.
-    """
+    """Text from a peer as one line: bounded, and without control characters."""
     if isinstance(text, bytes):
         text = text[: limit * 4].decode(errors="replace")
     # The end of a far longer text is not read.

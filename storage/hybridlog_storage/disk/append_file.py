@@ -172,9 +172,6 @@ class AppendFile:
     def finish(self, *, sync: bool) -> None:
         """Set the file's exact length and close it.
 
-        Args:
-            sync: Return once everything is on the disk.
-
         Raises:
             OSError: when the system refuses.
         """

@@ -319,12 +319,7 @@ class StoreDirectory:
 
     @contextmanager
     def at_hand(self, label: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
-        """A directory where files of a recording can be changed, within `writing`: this one.
-
-        Args:
-            label: The recording.
-            segments: Numbers of segments that must be there.
-        """
+        """A directory where files of a recording can be changed, within `writing`: this one."""
         yield self
 
     def has(self, label: str) -> bool:
@@ -700,11 +695,7 @@ def _look(about: os.stat_result, journal: str, fd: int) -> str:
 
 
 def is_stable(look: str) -> bool:
-    """False if the look is so new that it would be the same after another change.
-
-    Args:
-        look: Of `StoreDirectory.looks`.
-    """
+    """False if the look is so new that it would be the same after another change."""
     times = look.split()[2::4]  # of the directory, and of the journal if there is one
     return all(_is_a_tick_ago(int(one)) for one in times)
 
@@ -716,10 +707,6 @@ def _is_a_tick_ago(changed: int) -> bool:
 
 def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_result]:
     """Files of payloads of a recording, by path below their folder.
-
-    Args:
-        recording: The recording's directory.
-        folder: Name of the folder.
 
     Raises:
         OSError: It cannot be read.

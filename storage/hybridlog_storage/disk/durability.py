@@ -83,11 +83,6 @@ def publish(temporary: Path, final: Path, *, depth: int) -> None:
 def write_new(final: Path, content: bytes, *, depth: int) -> None:
     """Write a small file atomically.
 
-    Args:
-        final: The file.
-        content: Its whole content.
-        depth: As for `files.open_file`.
-
     Raises:
         HybridlogError: It cannot be written.
     """

@@ -214,13 +214,6 @@ def write_file(
 ) -> None:
     """Write a small file atomically. It replaces a file or symlink of its name.
 
-    Args:
-        path: The file.
-        content: Its whole content.
-        mode: Its permissions; the umask applies.
-        depth: As for `open_file`.
-        sync: Whether to force it to the disk.
-
     Raises:
         OSError: It cannot be written; no part of it remains.
     """
@@ -420,12 +413,6 @@ def rename(
 
 def link(old: Path, new: Path, *, depth: int = IN_RECORDING, new_depth: int) -> None:
     """Give a file of the store a second name.
-
-    Args:
-        old: Its name.
-        new: The second one.
-        depth: As for `open_file`.
-        new_depth: The same of `new`.
 
     Raises:
         OSError: It does not exist, or the file system has no links.

@@ -50,10 +50,6 @@ def is_socket_of(path: str, directory: Path) -> bool:
 def link_of(path: Path, directory: Path) -> Path:
     """A path that always leads to the present socket of a directory: a link to it.
 
-    Args:
-        path: The socket, from `new_socket`.
-        directory: The directory that it belongs to.
-
     Raises:
         OSError: The link cannot be made.
     """

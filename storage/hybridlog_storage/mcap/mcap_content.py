@@ -230,11 +230,6 @@ def parse_content(
 def parse_parts(compression: str, data: FilePart, size: int) -> Iterator[ChunkContent]:
     """Decompress and read a chunk from a foreign file in parts, in bounded memory.
 
-    Args:
-        compression: MCAP name of the codec.
-        data: The compressed content, or its beginning.
-        size: Bytes of the whole content.
-
     Yields:
         The records, in order, in parts of at least `_PART` bytes.
 
@@ -260,12 +255,7 @@ def parse_parts(compression: str, data: FilePart, size: int) -> Iterator[ChunkCo
 
 
 class _Parts:
-    """Collects content until its records can be read together.
-
-    Args:
-        size: Bytes of the whole content.
-        compressed: Bytes of its compressed form.
-    """
+    """Collects content until its records can be read together."""
 
     def __init__(self, size: int, compressed: int) -> None:
         self._size = size

@@ -265,10 +265,6 @@ def scan(
 def read_summary(file: BinaryIO, size: int) -> Summary | None:
     """The summary at the end of a closed file.
 
-    Args:
-        file: Seekable; its position is moved.
-        size: Bytes of the file.
-
     Returns:
         None if it is missing or damaged.
 

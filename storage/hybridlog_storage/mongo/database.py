@@ -561,9 +561,6 @@ class Database:
 
         Meant for questions with a range of `_id`: MongoDB tries for each whether that range
         or another index is faster.
-
-        Args:
-            questions: Collection and filter of each.
         """
         numbers = [0] * len(questions)
         for place, number in self._grouped(questions, lambda place: {"$literal": place}):

@@ -94,11 +94,7 @@ def _prefix_bytes(batch: bytes) -> int:
 
 @cache
 def _key_layout(prefix: int) -> tuple[np.dtype[np.void], np.void]:
-    """The layout of a projected document, and the bytes before its key.
-
-    Args:
-        prefix: Bytes before the key.
-    """
+    """The layout of a projected document, and the bytes before its key."""
     size = KEY_BYTES + prefix
     head = struct.pack("<i", size + 15) + b"\x05_id\0" + struct.pack("<iB", size, 0)
     fields = [("head", f"V{len(head)}"), ("prefix", f"V{prefix}"), ("key", _KEY_VALUE)]

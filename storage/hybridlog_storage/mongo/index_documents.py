@@ -68,12 +68,7 @@ def with_prefix(documents: NDArray[np.uint8], prefix: bytes) -> NDArray[np.uint8
 
 
 def _head(width: int, prefix: bytes = b"") -> bytes:
-    """The beginning of a document with a key, up to the key, and its prefix.
-
-    Args:
-        width: Bytes of the document without the prefix.
-        prefix: Its prefix.
-    """
+    """The beginning of a document with a key, up to the key, and its prefix."""
     key = struct.pack("<iB", KEY_BYTES + len(prefix), 0)
     return struct.pack("<i", width + len(prefix)) + b"\x05_id\x00" + key + prefix
 

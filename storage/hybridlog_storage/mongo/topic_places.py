@@ -92,11 +92,7 @@ def text_of(topic: str) -> str:
 
 
 class TopicPlaces:
-    """The places of topics in one database. Thread safe.
-
-    Args:
-        database: The index.
-    """
+    """The places of topics in one database. Thread safe."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -58,13 +58,7 @@ class CachedFile(int):
 
 
 class Blocks:
-    """The blocks of an object.
-
-    Args:
-        cache: Has its files.
-        bucket: Where it is.
-        about: The object.
-    """
+    """The blocks of an object."""
 
     def __init__(self, cache: BlockCache, bucket: Bucket, about: Object) -> None:
         self._cache = cache
@@ -97,10 +91,6 @@ class Blocks:
 
     def fetch(self, fd: int, ranges: Iterable[tuple[int, int]]) -> None:
         """Fetch the missing blocks of some ranges of bytes.
-
-        Args:
-            fd: A handle of its file.
-            ranges: Begin and end of each.
 
         Raises:
             OSError: The object is missing, or has another version, as a disk says of a bad sector.

@@ -87,12 +87,6 @@ class StoreList:
     def from_bytes(cls, store: str, number: int, data: bytes, place: str) -> StoreList:
         """A list, of which nothing is believed that does not fit.
 
-        Args:
-            store: Id of the store.
-            number: Its number, by its name.
-            data: The content of its object.
-            place: How messages call it.
-
         Raises:
             StoreError: It is damaged, of another store, or of a newer version.
         """

@@ -63,10 +63,6 @@ _Node = Mapping[str, Any]
 class BucketFiles:
     """The files of a store in a bucket, by the newest list that was seen.
 
-    Args:
-        bucket: The place of the store.
-        cache: Keeps what was read.
-
     Attributes:
         path: What stands for it among paths.
         list: What the store holds; replaced whole.
@@ -89,11 +85,7 @@ class BucketFiles:
     # Lists.
 
     def look(self, store: str, *, now: bool = False) -> None:
-        """Look for a newer list, if that is a while ago.
-
-        Args:
-            store: Id of the store.
-            now: Look in any case.
+        """Look for a newer list, `now` or if the last look is a while ago.
 
         Raises:
             StoreError: It is damaged.
@@ -128,10 +120,6 @@ class BucketFiles:
 
     def commit(self, before: StoreList, after: StoreList) -> None:
         """Create the next list.
-
-        Args:
-            before: The list that the change began with.
-            after: What the store holds from now on.
 
         Raises:
             ObjectExistsError: Another process was faster; `list` has its change.

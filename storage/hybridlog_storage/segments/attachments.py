@@ -97,12 +97,7 @@ class Attachment:
         yield _CRC.pack(crc)
 
     def index(self, offset: int, length: int) -> AttachmentIndex:
-        """The record of the summary that lists it.
-
-        Args:
-            offset: Byte at which its record starts.
-            length: Bytes of its record.
-        """
+        """The record of the summary that lists it."""
         return AttachmentIndex(
             offset=offset,
             length=length,
@@ -164,9 +159,6 @@ class FileHandle:
     """Reads a file by position, beside its other users and after they have closed it.
 
     It closes when nothing refers to it any more.
-
-    Args:
-        fd: The open file.
     """
 
     def __init__(self, fd: int) -> None:

@@ -349,12 +349,7 @@ class TableBuilder:
         self.unproven = 0, 0
 
     def stretch(self, length: int, crc: int) -> None:
-        """Add bytes outside of chunks, in a row of their own.
-
-        Args:
-            length: Their number; 0 adds nothing.
-            crc: Their CRC-32.
-        """
+        """Add bytes outside of chunks, in a row of their own."""
         self._finish_stretch()
         if length:
             self._others += _OTHER_ROW.pack(self.end, length, crc)

@@ -159,10 +159,6 @@ class FilePart:
 def decompress_pieces(compression: str, data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
     """Decompress piece by piece, in memory independent of the size.
 
-    Args:
-        compression: MCAP name of the codec.
-        data: The compressed data.
-
     Yields:
         Pieces of up to 256 KiB.
 

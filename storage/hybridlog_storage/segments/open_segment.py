@@ -436,10 +436,6 @@ class OpenSegment:
 def _parts_by_index(trailer: memoryview, size: int) -> NDArray[np.void]:
     """Statistics of each channel in a chunk, from its checked message indexes.
 
-    Args:
-        trailer: The message indexes and the arrival record.
-        size: Bytes of its content.
-
     Returns:
         `PART`[c], by channel id.
     """

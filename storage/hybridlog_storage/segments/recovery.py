@@ -542,10 +542,6 @@ def rebuild_summary(path: Path, digest: str) -> bool:
     The summary is a function of the data before it. It is rebuilt in a copy, which replaces
     the segment only if it has the original digest.
 
-    Args:
-        path: The sealed segment.
-        digest: Digest of its original summary.
-
     Returns:
         Whether the segment was repaired; otherwise it is unchanged.
 

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 class SegmentCheck:
     """Checks one sealed segment; a context manager.
 
-    Args:
-        path: The segment.
-
     Raises:
         SegmentError: It cannot be opened.
     """

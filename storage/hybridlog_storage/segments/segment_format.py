@@ -236,11 +236,7 @@ def compression_of(record: Buffer) -> tuple[str, int]:
 
 
 def head_length(record: Buffer) -> int:
-    """Bytes of a chunk record before its content; all of that of a moved or expired chunk.
-
-    Args:
-        record: The record, or its beginning.
-    """
+    """Bytes of a chunk record before its content; all of that of a moved or expired chunk."""
     if record[0] in _CONTENT_ELSEWHERE:
         return _CONTENT_ELSEWHERE[record[0]]
     (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
@@ -312,12 +308,7 @@ def message_indexes(
 
 
 def index_offsets(sizes: Mapping[int, int], start: int) -> dict[int, int]:
-    """Start of the message index of each channel, by channel id.
-
-    Args:
-        sizes: Bytes of each, in file order.
-        start: Byte where the first begins.
-    """
+    """Start of the message index of each channel, by channel id."""
     return dict(zip(sizes, accumulate(sizes.values(), initial=start), strict=False))
 
 

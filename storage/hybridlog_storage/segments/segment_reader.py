@@ -804,15 +804,7 @@ def open_chunk(record: memoryview) -> tuple[Buffer, int]:
 
 
 def right_head(batch: Batch, size: int, crc: int, compression: str, compressed: int) -> bytes:
-    """The correct head of a chunk record.
-
-    Args:
-        batch: The messages of its content.
-        size: Bytes of the content.
-        crc: CRC-32 of the content.
-        compression: MCAP name of the codec.
-        compressed: Bytes of compressed content.
-    """
+    """The correct head of a chunk record."""
     return chunk_head(
         first=int(batch.log_time.min()),
         last=int(batch.log_time.max()),

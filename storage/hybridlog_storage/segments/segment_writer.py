@@ -316,9 +316,6 @@ class RecordingWriter:
     def close_truncated(self, extras: Sequence[Metadata]) -> None:
         """Seal the chunks in the file and drop the others, after a failed write.
 
-        Args:
-            extras: Last records, written if they fit.
-
         Raises:
             DiskFullError: No room; the next opening of the store seals the segment. Or no
                 message is in the files.

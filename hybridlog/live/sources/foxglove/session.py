@@ -44,12 +44,7 @@ _NUMBER: Final = Struct("<I").unpack_from
 
 
 class Notifier:
-    """Reports problems of one server to the user, one line each.
-
-    Args:
-        sink: Shows the lines.
-        name: Name of the server for the user.
-    """
+    """Reports problems of one server to the user, one line each."""
 
     def __init__(self, sink: Sink, name: str) -> None:
         self._sink = sink
@@ -355,13 +350,6 @@ _STABLE_S: Final = 10.0  # after a connection of this length the pauses are shor
 
 class Client:
     """The client, which runs in the thread of a Foxglove source.
-
-    Args:
-        sink: Takes the messages.
-        address: The server.
-        max_message_bytes: Largest payload.
-        stop: Set to stop the client.
-        reached: Called after each handshake.
 
     Raises:
         UsageError: The address is invalid.

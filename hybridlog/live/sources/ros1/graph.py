@@ -117,14 +117,7 @@ _Item = TypeVar("_Item")
 
 
 class Graph:
-    """The topics of a master, and the subscriptions to them.
-
-    Args:
-        master: The master.
-        uri: Its address, for the user.
-        poll_s: Polling interval, seconds.
-        reached: Called after each answer.
-    """
+    """The topics of a master, and the subscriptions to them."""
 
     def __init__(
         self, master: Master, uri: str, poll_s: float, reached: Callable[[], None]

@@ -76,12 +76,7 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 def channel_of(topic: str, fields: Mapping[str, str]) -> Channel:
-    """The channel that a publisher's header describes, as in a bag.
-
-    Args:
-        topic: Name as the master spells it.
-        fields: The publisher's header.
-    """
+    """The channel that a publisher's header describes, as in a bag."""
     metadata = dict(fields)
     definition = metadata.pop("message_definition", None)
     name = metadata.pop("type", "")
@@ -106,12 +101,6 @@ async def subscribe(
     network: Network, caller: str, topic: str, uri: str
 ) -> tuple[socket.socket, dict[str, str]]:
     """Connects to a publisher of a topic, whatever its type.
-
-    Args:
-        network: Makes connections.
-        caller: Our node's name.
-        topic: Name as the master spells it.
-        uri: The publisher's address for calls.
 
     Returns:
         The socket, positioned at the first message, and the fields of the publisher's

@@ -26,11 +26,6 @@ async def listen(
     Without these variables it listens on loopback. A master on another computer then cannot
     announce publishers, and polling finds them.
 
-    Args:
-        network: Looks up names.
-        environment: Environment variables.
-        say: Reports problems with them.
-
     Returns:
         The socket, and the host name for peers.
 

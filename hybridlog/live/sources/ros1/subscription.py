@@ -35,9 +35,6 @@ class ErrorAggregator:
     """Collects errors of a node's topics for a moment, and reports them in one line.
 
     A repeated error is not reported again, even with another reason.
-
-    Args:
-        say: Reports a line to the user.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:

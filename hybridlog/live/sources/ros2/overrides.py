@@ -34,9 +34,6 @@ _POLICIES = {
 def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     """Reads the overrides: fields of `Profile` by topic.
 
-    Args:
-        path: The YAML file.
-
     Raises:
         UsageError: The file is unreadable or not YAML, or a policy is unknown.
     """

@@ -37,14 +37,7 @@ _FLUSH_S = 2.0
 
 
 class Child:
-    """Moves messages from ROS into the outbox, and the outbox into the socket.
-
-    Args:
-        middleware: ROS.
-        topics: The topics of the graph.
-        outbox: Takes messages and events.
-        events: Puts events into the outbox.
-    """
+    """Moves messages from ROS into the outbox, and the outbox into the socket."""
 
     def __init__(
         self, middleware: Middleware, topics: Topics, outbox: Outbox, events: EventSender

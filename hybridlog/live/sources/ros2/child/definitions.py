@@ -125,9 +125,6 @@ class Definitions:
     def find(self, name: str) -> Definition:
         """The definition of a type.
 
-        Args:
-            name: Type name such as `sensor_msgs/msg/Image`.
-
         Raises:
             UnknownTypeError: The package, the type or a required type is not installed.
         """

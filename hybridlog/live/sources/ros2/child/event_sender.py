@@ -14,11 +14,7 @@ MAX_REPORTS = 10_000
 
 
 class EventSender:
-    """Puts events into the outbox, after earlier messages.
-
-    Args:
-        outbox: Takes the events.
-    """
+    """Puts events into the outbox, after earlier messages."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox

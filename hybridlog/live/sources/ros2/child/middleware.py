@@ -218,12 +218,7 @@ class Middleware:
         return self._nodes[-1]
 
     def remove(self, subscription: Subscription, inner: Any) -> None:
-        """Ends a subscription; only `Subscription.close` calls it.
-
-        Args:
-            subscription: The subscription.
-            inner: Its rclpy object.
-        """
+        """Ends a subscription; only `Subscription.close` calls it."""
         self._open = [other for other in self._open if other is not subscription]
         self._wait_set = None
         subscription.node.destroy_subscription(inner)

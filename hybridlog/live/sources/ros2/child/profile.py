@@ -80,11 +80,7 @@ def is_set_up(environment: MutableMapping[str, str], folder: Path) -> bool:
 
 @contextmanager
 def default_profile(environment: MutableMapping[str, str] = os.environ) -> Iterator[bool]:
-    """Provides the profile while Fast DDS starts; yields False if it does not apply.
-
-    Args:
-        environment: Variables, which are set meanwhile.
-    """
+    """Provides the profile while Fast DDS starts; yields False if it does not apply."""
     if is_set_up(environment, Path.cwd()):
         yield False
         return

@@ -244,9 +244,6 @@ class MiddlewareLossCounter:
     def before_first(self, sent: int) -> int:
         """Take the first message of a publisher.
 
-        Args:
-            sent: Messages that the publisher sent before it.
-
         Returns:
             Number of these that were lost. The others were sent before the subscription.
         """

@@ -84,12 +84,7 @@ def request(offers: Sequence[Profile], depth: int, override: Mapping[str, Any]) 
 
 
 def conflicts(offer: Profile, wanted: Profile) -> list[str]:
-    """Names of the policies that make a publisher incompatible.
-
-    Args:
-        offer: The publisher's.
-        wanted: The subscription's.
-    """
+    """Names of the policies that make a publisher incompatible."""
     found = []
     if wanted.reliability == RELIABLE and offer.reliability == BEST_EFFORT:
         found.append("reliability")

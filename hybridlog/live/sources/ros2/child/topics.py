@@ -294,11 +294,7 @@ class Topics:
             self._events.lost(topic.name, "unreadable", None, detail=topic.problem)
 
     def account(self, *, final: bool = False) -> None:
-        """Reports losses in transport and in the outbox.
-
-        Args:
-            final: The recording ends.
-        """
+        """Reports losses in transport and in the outbox."""
         self._list()
         ended = (self._ended or time.time_ns()) if final else None
         for topic in self._live:
