@@ -1583,6 +1583,7 @@ class Store:
             expired = keeper.expire_all(recording, digests, rules, reason, progress)
         except HeldError as error:
             report.problems.append(f"Payloads stay: {error}")
+            report.held.append(recording)
             return
         finally:
             self.session.catch_up(recording)

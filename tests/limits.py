@@ -57,6 +57,8 @@ PLACES = {
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
     "ros2_term_s": "hybridlog.live.sources.ros2.source._TERM_S",
+    "copy_beat_s": "hybridlog.maintenance.ssh._BEAT_S",
+    "copy_idle_s": "hybridlog.maintenance.ssh._IDLE_S",
     "shown_bytes": "hybridlog.message._MAX_SHOWN",
     "max_second_look": "hybridlog.query.answers.rates._MAX_SECOND_LOOK",
     "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",

@@ -80,7 +80,8 @@ class CopyReport:
         known: Labels of recordings that were there already.
         lacking: Those of them whose payloads were deleted there, and are here.
         refused: Why recordings were not copied, by their labels here.
-        held: Ids of those of them that another process held: they can be copied when it is done.
+        held: Ids of recordings that another process held, here or there: what is left of them can
+            be done later.
         bytes_copied: Bytes copied now, without those that were there after an interruption.
         freed_bytes: Bytes that became free here, because payloads were proved there.
         problems: Why payloads did not expire here, in sentences.
@@ -193,6 +194,7 @@ class _Copying:
         name, problems = self._place.name, self._report.problems
         if not self._place.hold([*self._proven]):
             problems.append(f"Payloads stay: another process makes room in {name}. Run it again.")
+            self._report.held += self._proven
             return
         there: dict[str, Copied] = {}
         ids = [*self._proven]

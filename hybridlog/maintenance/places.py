@@ -258,11 +258,6 @@ class DirectoryPlace:
         self._opened: tuple[str, int, int] = "", -1, 0  # file, its handle, bytes of it
 
     @property
-    def is_begun(self) -> bool:
-        """True between `begin` and `leave`."""
-        return bool(self._recording)
-
-    @property
     def _path(self) -> Path:
         """The hidden directory that the recording is copied into."""
         if not self._recording:
@@ -481,7 +476,7 @@ class DirectoryPlace:
 
     def drop(self) -> None:
         """As of `Place`."""
-        if self.is_begun:
+        if self._recording:
             self._close()
             self._directory.sweep(self._path.name)
 

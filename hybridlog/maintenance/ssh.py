@@ -3,7 +3,8 @@
 Both sides talk over standard input and output in frames: two lengths, a JSON object, and
 bytes. The client asks what a `Place` can do; every question has one answer, in order. Bytes of
 files are sent on while a few answers are outstanding. Neither side trusts the other: frames
-are bounded, names and sizes are checked, and the server writes only into its store.
+are bounded, names and sizes are checked, and the server writes only into its store. The client
+says all the while that it is there, and a server that hears nothing gives up.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from threading import Event, Lock
 from typing import IO, TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
@@ -27,6 +29,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.threads import Threads, taken_by_forks
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.places import DirectoryPlace
@@ -41,7 +44,10 @@ _MAX_BODY: Final = 256 << 20  # of a journal; pieces of files are smaller
 _MAX_AHEAD: Final = 16  # pieces of files without an answer
 _MAX_TEXT: Final = 2000  # characters of a message of the other side
 _IDLE_S: Final = 60.0
-"""Seconds of silence after which a copy that was begun is given up: the connection is cut."""
+"""Seconds of silence after which the server gives up: the connection is cut."""
+_BEAT_S: Final = 10.0
+"""Seconds between two signs of life, however long the client reads its own files."""
+_BEAT: Final = {"do": "beat"}
 _ERRORS: Final = {"full": DiskFullError, "refused": RefusedError}
 """Errors that the other side is told by a word."""
 _NOT_FOUND: Final = 127  # exit code of a shell
@@ -79,7 +85,8 @@ def ssh_place(url: str, ssh: str | None, program: str) -> Iterator[Server]:
     server = None
     try:
         server = Server(url, requests, answers)
-        yield server
+        with server.beating():
+            yield server
     except StoreError as error:
         code = None
         with suppress(subprocess.TimeoutExpired):
@@ -113,11 +120,30 @@ class Server:
         self.name = name
         self._requests = requests
         self._answers = answers
+        self._sending = taken_by_forks(Lock())
         self._ahead = 0  # requests without an answer
         self._is_cut = self._is_met = False
         if self._receive().get("hybridlog") != _PROTOCOL:
             raise StoreError(f"hybridlog of {self.name} is of another version.")
         self._is_met = True
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Say all the while that this side is there."""
+        ended = Event()
+
+        def beat() -> None:
+            with suppress(OSError, ValueError):  # it is cut, as the next request finds
+                while not ended.wait(_BEAT_S):
+                    with self._sending:
+                        _write(self._requests, _BEAT)
+
+        with Threads(1, "beat") as threads:
+            threads.submit(beat)
+            try:
+                yield
+            finally:
+                ended.set()
 
     def sees(self, mark: str) -> bool:
         """As of `Place`."""
@@ -188,7 +214,8 @@ class Server:
 
     def _send(self, value: Mapping[str, Any], body: Buffer) -> None:
         try:
-            _write(self._requests, value, body)
+            with self._sending:
+                _write(self._requests, value, body)
         except (OSError, ValueError) as error:  # a stream that is closed raises ValueError
             raise self._cut() from error
         self._ahead += 1
@@ -253,10 +280,13 @@ def serve(place: DirectoryPlace, requests: IO[bytes], answers: IO[bytes]) -> Non
     Raises:
         StoreError: It does not speak this protocol, or is silent.
     """
+    heard = _Heard(requests)
     _write(answers, {"hybridlog": _PROTOCOL})
     try:
-        while (found := _next(place, requests)) is not None:
+        while (found := _read(heard)) is not None:
             request, body = found
+            if request == _BEAT:
+                continue
             try:
                 _write(answers, {"value": _ANSWERS[request["do"]](place, request, body)})
             except HybridlogError as error:
@@ -269,10 +299,16 @@ def serve(place: DirectoryPlace, requests: IO[bytes], answers: IO[bytes]) -> Non
         place.leave()
 
 
-def _next(place: DirectoryPlace, requests: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
-    if place.is_begun and not select.select([requests], [], [], _IDLE_S)[0]:
-        raise StoreError("The other side is silent; what it has sent stays.")
-    return _read(requests)
+class _Heard:
+    """What the other side says, unless it is silent for too long."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+
+    def read(self, size: int) -> bytes:
+        if not select.select([self._stream], [], [], _IDLE_S)[0]:
+            raise StoreError("The other side is silent; what it has sent stays.")
+        return self._stream.read(size)
 
 
 def _kind(error: HybridlogError) -> str:
@@ -325,7 +361,7 @@ def _write(stream: IO[bytes], value: Mapping[str, Any], body: Buffer = b"") -> N
     stream.flush()
 
 
-def _read(stream: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
+def _read(stream: IO[bytes] | _Heard) -> tuple[dict[str, Any], bytes] | None:
     """The next frame; None at the end.
 
     Raises:
@@ -346,7 +382,7 @@ def _read(stream: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
     return value, body
 
 
-def _exactly(stream: IO[bytes], size: int) -> bytes | None:
+def _exactly(stream: IO[bytes] | _Heard, size: int) -> bytes | None:
     """So many bytes; None if the stream ends before."""
     parts = []
     while size:

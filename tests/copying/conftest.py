@@ -83,7 +83,9 @@ def server_at(path: Path, bytes_sent: int | None = None) -> Iterator[Place]:
     thread.start()
     try:
         sent = to_server if bytes_sent is None else _Cut(to_server, bytes_sent)
-        yield Server("server", cast("IO[bytes]", sent), answers)  # type: ignore[arg-type]
+        server = Server("server", cast("IO[bytes]", sent), answers)  # type: ignore[arg-type]
+        with server.beating():
+            yield server
     finally:
         to_server.close()
         thread.join(60)

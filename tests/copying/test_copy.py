@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import io
+import os
 import random
 import shutil
 import threading
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -15,6 +18,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from hybridlog.maintenance import copying, ssh
 from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
 from hybridlog.maintenance.places import CopiedFile, Place
 from hybridlog_storage.disk import files
@@ -31,10 +35,17 @@ from tests.copying.conftest import (
     files_in,
     server_at,
 )
+from tests.limits import Limit
 
 PLACES: dict[str, PlaceAt] = {"directory": directory_at, "server": server_at}
 ROUNDS = 10
 SEED = 20_261_128
+
+
+def _frame(request: dict[str, object]) -> bytes:
+    stream = io.BytesIO()
+    ssh._write(stream, request)
+    return stream.getvalue()
 
 
 @pytest.fixture(params=PLACES)
@@ -306,6 +317,7 @@ def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: Pl
     with StoreDirectory(lab).retaining():
         report = run_to(lab)
     assert "another process makes room" in report.problems[0]
+    assert len(report.held) == 2
     assert not told
     report = run_to(lab, lambda: expire_in(lab, "recorded"))
     assert ["recorded stay" in one for one in report.problems] == [True]
@@ -430,3 +442,33 @@ def test_the_rate_is_limited(robots: Path, tmp_path: Path) -> None:
     with directory_at(tmp_path / "lab") as place:
         copied(robots, Counted(place), "recorded", limit_rate=100_000)
     assert max(sizes) <= 25_000
+
+
+def test_a_side_that_reads_for_long_is_not_silent(
+    robots: Path, tmp_path: Path, limit: Limit, calls: Calls
+) -> None:
+    lab = tmp_path / "lab"
+    with suppress(StoreError), server_at(lab, 9_000) as place:
+        copied(robots, place, "recorded", piece=1000)
+    limit(copy_beat_s=0.05, copy_idle_s=0.5)
+    slow = calls(copying, "digest_like", lambda *_: time.sleep(1))
+    with server_at(lab) as place:
+        assert copied(robots, place, "recorded").copied == ["recorded"]
+    assert slow
+
+
+@pytest.mark.parametrize("said", [_frame({"do": "hold", "recordings": []}), b"\0\0\0\7"])
+def test_a_silent_side_holds_nothing(tmp_path: Path, limit: Limit, said: bytes) -> None:
+    """Also one that goes amid a request."""
+    limit(copy_idle_s=0.1)
+    to_read, to_write = os.pipe()
+    os.write(to_write, said)
+    with (
+        directory_at(tmp_path / "lab") as place,
+        os.fdopen(to_read, "rb", 0) as requests,
+        pytest.raises(StoreError, match="is silent"),
+    ):
+        ssh.serve(place, requests, io.BytesIO())  # type: ignore[arg-type]
+    os.close(to_write)
+    with StoreDirectory(tmp_path / "lab").retaining() as is_free:
+        assert is_free
