@@ -12,7 +12,12 @@ import click
 
 from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_cost
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.completion import complete_recording, complete_topic
+from hybridlog.cli.completion import (
+    complete_condition,
+    complete_path,
+    complete_recording,
+    complete_topic,
+)
 from hybridlog.cli.options import Asking, in_frame, parse_fields, query_of
 from hybridlog.cli.output import notes
 from hybridlog.query.choice import Choice
@@ -24,6 +29,14 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 _BESIDE = ("asof", "nearest", "interpolate")
+
+
+def _complete_of_topic(
+    context: click.Context, param: click.Parameter, incomplete: str
+) -> list[str]:
+    """Fields with --step, else a topic and its fields."""
+    complete = complete_condition if context.params.get("step") is None else complete_path
+    return complete(context, param, incomplete)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +67,7 @@ class _Given(Asking, Tabular):
     where: tuple[str, ...] = option(  # type: ignore[misc]
         "Only messages of this topic that satisfy a predicate; with --step a predicate alone.",
         "TOPIC: PREDICATE",
+        shell_complete=_complete_of_topic,
     )
     beside: tuple[str, ...] = option(
         "With --to: the topics beside it are of these recordings, whose time may overlap: a "
@@ -65,6 +79,7 @@ class _Given(Asking, Tabular):
         "Only these fields of a topic, with commas between them; with --step of all topics, "
         "without their names.",
         "TOPIC: A,B.C",
+        shell_complete=_complete_of_topic,
     )
     frame: str | None = in_frame()
 

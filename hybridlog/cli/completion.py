@@ -1,16 +1,14 @@
-"""Completion of recordings and topics, and the scripts that teach it to a shell.
+"""Completion of recordings, topics, fields and frames; the scripts that teach it to a shell.
 
-The names come from directories and the catalog: nothing is repaired, no MongoDB is started.
+Nothing is repaired for it, and no MongoDB is started.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
-from operator import itemgetter
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,11 +18,14 @@ if TYPE_CHECKING:
     import click
     from click.shell_completion import ShellComplete
 
-    from hybridlog.snapshot import Snapshot
+    from hybridlog.session import Session
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.summary import RecordingSummary
 
 VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
 """Environment variable in which a shell asks for completions."""
+_TRANSFORMS: Final = 100
+"""Messages of a topic that are read to complete frames."""
 _SCRIPTS: Final = {
     "bash": ".local/share/hybridlog/completion.bash",
     "zsh": ".zfunc/_hybridlog",
@@ -47,8 +48,8 @@ def complete_recording(context: click.Context, _: click.Parameter, incomplete: s
 
 def complete_tag(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
     """Tags of recordings: keys, and values after the equals sign."""
-    with _nothing_on_error():
-        tags = _snapshot(_store(context)).tags
+    with _nothing_on_error(), _opened(context) as session:
+        tags = session.look().tags
         if "=" in incomplete:
             key = incomplete.partition("=")[0]
             offered = [f"{key}={value}" for value in tags.get(key, ())]
@@ -60,15 +61,8 @@ def complete_tag(context: click.Context, _: click.Parameter, incomplete: str) ->
 
 def complete_type(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
     """Types of messages, whole or by the name behind the package."""
-    from contextlib import closing
-
-    from hybridlog.maintenance.opening import open_catalog
-
-    with _nothing_on_error():
-        directory = _store(context)
-        with closing(open_catalog(directory)) as catalog:
-            schemas = catalog.schemas(_snapshot(directory).schemas)
-        names = {schema.name for schema in schemas.values()}
+    with _nothing_on_error(), _opened(context) as session:
+        names = {*session.type_names().values()}
         names |= {name.rpartition("/")[2] for name in names if incomplete}
         return sorted(name for name in names if name.startswith(incomplete))
     return []
@@ -83,31 +77,15 @@ def complete_running(context: click.Context, _: click.Parameter, incomplete: str
     return []
 
 
-def complete_field(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """Topics, with the colon that a field follows."""
-    if ":" in incomplete:
-        return []
-    return [f"{topic}:" for topic in complete_topic(context, param, incomplete)]
-
-
-def complete_condition(
-    context: click.Context, param: click.Parameter, incomplete: str
-) -> list[str]:
-    """Topics, with the colon and space that a predicate follows."""
-    if ":" in incomplete:
-        return []
-    return [f"{topic}: " for topic in complete_topic(context, param, incomplete)]
-
-
 def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
     """Topics that begin with what was typed; without a slash, short names as well.
 
     A short name is offered when it stands for one topic only. With `--recording`, the
     topics of those recordings are offered.
     """
-    with _nothing_on_error():
-        given = context.params.get("recording") or ()
-        topics = _topics(_store(context), (given,) if isinstance(given, str) else tuple(given))
+    with _nothing_on_error(), _opened(context) as session:
+        chosen, topics_of = _chosen(context, session), session.look().topics_of
+        topics = {topic for one in chosen for topic in topics_of(one)}
         found = {topic for topic in topics if topic.startswith(incomplete)}
         if incomplete and not incomplete.startswith("/"):
             found.update(n for n in _short_names(topics) if n.startswith(incomplete))
@@ -115,21 +93,48 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
     return []
 
 
+def complete_field(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Topics, with the colon that a field follows; then its fields."""
+    if ":" in incomplete:
+        return complete_path(context, param, incomplete)
+    return [f"{topic}:" for topic in complete_topic(context, param, incomplete)]
+
+
+def complete_condition(
+    context: click.Context, param: click.Parameter, incomplete: str
+) -> list[str]:
+    """Topics, with the colon and space that fields or a predicate follow; then its fields."""
+    if ":" in incomplete:
+        return complete_path(context, param, incomplete)
+    return [f"{topic}: " for topic in complete_topic(context, param, incomplete)]
+
+
 def complete_path(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-    """Fields of the topics of the command, for the last name in a list or a predicate."""
+    """Fields of a topic, for the last name in a list or a predicate.
+
+    The topic is that before a colon; without, those of the command.
+    """
     last = re.findall(r"[\w.]*$", incomplete)[0]
     before = incomplete.removesuffix(last)
-    # The parser leaves words where a value is missing, as that of the option that is completed.
-    given = [*context.args, *(context.params.get("words") or ())]
-    given += context.params.get("topic") or ()
-    if not context.resilient_parsing:  # what is completed was taken for a topic
-        given = [topic for topic in given if topic != incomplete]
-    with _nothing_on_error():
+    named = re.match(r"([^\s:]+):", before)
+    if named is not None:
+        given = [named[1]]
+    else:
+        # The parser leaves words where a value is missing, as that of the option that is
+        # completed.
+        given = [*context.args, *(context.params.get("words") or ())]
+        given += context.params.get("topic") or ()
+        if not context.resilient_parsing:  # what is completed was taken for a topic
+            given = [topic for topic in given if topic != incomplete]
+    with _nothing_on_error(), _opened(context) as session:
         from hybridlog.frames.names import SUMMARIES, is_summary
-        from hybridlog.store import Store
+        from hybridlog.query.question import field_types
+        from hybridlog.query.topics import resolve
 
-        with Store(_store(context, read_only=True), mongo="none", recover=False) as store:
-            known = (store.topic(*given).field_types() if given else None) or {}
+        chosen = [session.entry_of(one) for one in _chosen(context, session)]
+        topics = resolve(given, {one.topic for entry in chosen for one in entry.channels})
+        channels = (one for entry in chosen for one in session.channels_of(entry, topics))
+        known = field_types(tuple(channels)) or {}
         array = last.rpartition(".")[0]
         summaries = (f"{array}.{name}" for name in SUMMARIES)
         names = [*known, *(name for name in summaries if is_summary(name, known))]
@@ -137,7 +142,24 @@ def complete_path(context: click.Context, _: click.Parameter, incomplete: str) -
     return []
 
 
-def _store(context: click.Context, *, read_only: bool = False) -> StoreDirectory:
+def complete_frame(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+    """Coordinate frames in the first transforms of the chosen recordings, or all."""
+    with _nothing_on_error(), _opened(context) as session:
+        from hybridlog.query.query import Query
+        from hybridlog.query.question import Question
+        from hybridlog.tf import frames_named, is_of_transforms
+
+        found: set[str] = set()
+        for one in _chosen(context, session):
+            for channel in session.entry_of(one).channels:
+                if is_of_transforms(channel.type):
+                    asked = Question((channel.topic,), (one.id,), limit=_TRANSFORMS)
+                    found.update(*(frames_named(each.fields) for each in Query(session, asked)))
+        return sorted(name for name in found if name.startswith(incomplete))
+    return []
+
+
+def _store(context: click.Context) -> StoreDirectory:
     from hybridlog_storage.lazy import import_numpy_late
 
     import_numpy_late()
@@ -147,43 +169,28 @@ def _store(context: click.Context, *, read_only: bool = False) -> StoreDirectory
     value: Path | None = context.params.get("store")
     # The shell has not expanded the tilde of the line that is being completed.
     path = store_path(None if value is None else os.path.expanduser(value))  # noqa: PTH111
-    return directory_of(path, read_only=read_only)
+    return directory_of(path)
 
 
-def _topics(directory: StoreDirectory, recordings: Sequence[str]) -> set[str]:
-    """Topics in the catalog, of some recordings or of all; nothing is repaired for it."""
-    snapshot = _snapshot(directory)
-    named = [
-        place
-        for name in recordings
-        for place in snapshot.called(name) or snapshot.matching(name) or snapshot.named(name)
-    ]
-    if not named:
-        return set(snapshot.topics)
-    return {topic for place in named for topic in snapshot.topics_of(snapshot.summaries[place])}
+@contextmanager
+def _opened(context: click.Context) -> Iterator[Session]:
+    """The store, with what is flushed of running recordings; nothing is repaired for it."""
+    directory = _store(context)
+    from hybridlog.store import Store
+
+    with closing(Store(directory, mongo="none", recover=False).session) as session:
+        yield session
 
 
-def _snapshot(directory: StoreDirectory) -> Snapshot:
-    """The recordings in the catalog, with what is flushed; nothing is repaired for it."""
-    from contextlib import closing
+def _chosen(context: click.Context, session: Session) -> list[RecordingSummary]:
+    """The recordings of `--recording` or all, one for each set of topics and types."""
+    from hybridlog.query.choosing import placed
 
-    from hybridlog.entries import summary_of
-    from hybridlog.maintenance.opening import open_catalog, snapshot_of
-
-    with closing(open_catalog(directory)) as catalog:
-        found = snapshot_of(catalog, catalog.summaries())
-        for summary in [found.summaries[place] for place in found.unfinished]:
-            from hybridlog.record.running import RunningRecording
-
-            known = catalog.recording(summary.id)
-            if known is None:
-                continue
-            running = RunningRecording(directory, summary.label, partial(itemgetter(1), known))
-            running.follow()
-            if running.entry is not None:
-                now = summary_of(running.entry, summary.look)
-                found = found.with_changes([now], {now.topics: running.topics})
-        return found
+    given = context.params.get("recording") or ()
+    snapshot = session.look()
+    places = placed(session, (given,) if isinstance(given, str) else given)
+    found = [snapshot.summaries[n] for n in places] if given else snapshot.summaries
+    return [*{one.topics: one for one in found}.values()]
 
 
 def _short_names(topics: set[str]) -> Iterator[str]:

@@ -15,6 +15,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import argument, option
 from hybridlog.cli.completion import (
     complete_condition,
+    complete_frame,
     complete_path,
     complete_recording,
     complete_running,
@@ -389,6 +390,7 @@ def in_frame() -> Any:
         "Points and poses in this frame, such as map, at the times of their headers.",
         "FRAME",
         name="--in-frame",
+        shell_complete=complete_frame,
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
 from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.completion import complete_frame
 from hybridlog.cli.options import Strict, Topics, Verbose, topics
 from hybridlog.cli.output import notes, print_table, short_duration
 from hybridlog.wording import counted, listed
@@ -26,9 +27,13 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Given(Strict, Topics, Tabular, Verbose):
     words: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
-    target: str | None = argument("The frame of the results.", "[TARGET]")
+    target: str | None = argument(
+        "The frame of the results.", "[TARGET]", shell_complete=complete_frame
+    )
     source: str | None = argument(
-        "The frame to transform from; with -t, without, that of the topic's messages.", "[SOURCE]"
+        "The frame to transform from; with -t, without, that of the topic's messages.",
+        "[SOURCE]",
+        shell_complete=complete_frame,
     )
     at: tuple[str, ...] = option("At this time.", "TIME")
     step: str | None = option("At regular times, such as 100ms.", "DURATION")

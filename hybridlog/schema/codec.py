@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from hybridlog.schema.objects import Objects
     from hybridlog_storage.messages import Batch, Buffer
 
-NO_ROWS: NDArray[np.intp] = np.empty(0, np.intp)
+
+def no_rows() -> NDArray[np.intp]:
+    """No row."""
+    return np.empty(0, np.intp)
 
 
 @dataclass(slots=True)
@@ -174,7 +177,7 @@ class OpaqueCodec:
         Raises:
             DefinitionError: Always.
         """
-        self.columns(payload, NO_ROWS, NO_ROWS)
+        self.columns(payload, no_rows(), no_rows())
 
 
 def decode_each(
@@ -206,7 +209,7 @@ def decode_each(
         else:
             rows.append(row)
     unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
-    return Decoded(np.array(rows, np.intp), form(objects), unreadable, NO_ROWS)
+    return Decoded(np.array(rows, np.intp), form(objects), unreadable, no_rows())
 
 
 def one_message(codec: Codec, payload: Buffer) -> Decoded:

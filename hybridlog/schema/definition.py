@@ -54,11 +54,22 @@ class Primitive:
 
     Attributes:
         name: Its name in the definition.
-        dtype: Native numpy type; `byte` and `char` differ between ROS 1 and ROS 2.
+        code: Its kind and size in bytes, such as `u1`; those of `byte` and `char` differ between
+            ROS 1 and ROS 2.
     """
 
     name: str
-    dtype: np.dtype[np.generic]
+    code: str
+
+    @property
+    def size(self) -> int:
+        """Its bytes."""
+        return int(self.code[1:] or 1)
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """Native numpy type."""
+        return np.dtype(self.code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,8 +413,8 @@ class _Resolver:
             return Text(raw.text_bound), _Extent(0, 0, 0, 4)
         if kind in _WORDS:
             code = "i1" if kind == "byte" and self._ros == 1 else DTYPES[kind]
-            dtype: np.dtype[np.generic] = np.dtype(code)
-            return Primitive(kind, dtype), _Extent(0, 0, 0, dtype.itemsize)
+            primitive = Primitive(kind, code)
+            return primitive, _Extent(0, 0, 0, primitive.size)
         name = self._name(owner, kind)
         if (instant := self._instant(name)) is not None:
             return instant, _Extent(0, 0, 0, 8)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import NO_ROWS
+from hybridlog.schema.codec import no_rows
 from hybridlog.schema.column import Records, header_stamps
 from hybridlog.schema.document import TooLarge, bodies
 
@@ -40,7 +40,7 @@ class BodyGroup(NamedTuple):
     body: NDArray[np.uint8]
     error: str | None
     stamps: NDArray[np.int64] | None = None
-    surplus: NDArray[np.intp] = NO_ROWS
+    surplus: NDArray[np.intp] = no_rows()
 
 
 def index_bodies(
@@ -75,7 +75,7 @@ def decoded_bodies(decoded: Decoded, *, array_limit: int = ARRAY_LIMIT) -> Itera
     else:
         for made, own in decoded.records.bodies(array_limit, MAX_BYTES):
             rows = decoded.rows[own]
-            left = np.intersect1d(rows, surplus) if len(surplus) else NO_ROWS
+            left = np.intersect1d(rows, surplus) if len(surplus) else no_rows()
             if isinstance(made, str):
                 yield _error(rows, made)
             else:
@@ -92,7 +92,7 @@ def _of_columns(decoded: Decoded, records: Records, array_limit: int) -> Iterato
             yield _error(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
             continue
         own = None if stamps is None else stamps[group.rows]
-        surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else NO_ROWS
+        surplus = np.intersect1d(rows, decoded.surplus) if len(decoded.surplus) else no_rows()
         yield BodyGroup(rows, group.body, None, own, surplus)
 
 

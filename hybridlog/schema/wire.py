@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hybridlog.schema.codec import NO_ROWS, Decoded, Unreadable
+from hybridlog.schema.codec import Decoded, Unreadable, no_rows
 from hybridlog.schema.column import Records, concatenate, take
 from hybridlog.schema.wire_gather import Source
 from hybridlog.schema.wire_program import Wire, compile_type
@@ -103,7 +103,7 @@ class WireReader:
         else:
             good, records = self._read_cdr(buffer, rows, offset, end, odd)
         unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
-        surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else NO_ROWS
+        surplus = np.sort(np.concatenate(odd.surplus)) if odd.surplus else no_rows()
         return Decoded(good, records, unreadable, surplus)
 
     def message_in(self, payload: Buffer) -> memoryview:

@@ -335,7 +335,7 @@ class _Compiler:
     def _fixed(
         self, kind: Primitive | Instant, path: str, slot: int | None, width: int | None
     ) -> None:
-        size, align = (8, 4) if isinstance(kind, Instant) else (kind.dtype.itemsize,) * 2
+        size, align = (8, 4) if isinstance(kind, Instant) else (kind.size,) * 2
         total = size * (1 if width is None else width)
         self._run.append(Fixed(path, self._align(align), total, slot, kind, width))
 
@@ -361,7 +361,7 @@ class _Compiler:
         if isinstance(element, Primitive):
             leaf = self._leaf(wanted)
             slot = leaf.slot if leaf is not None else None
-            align = self._align(element.dtype.itemsize)
+            align = self._align(element.size)
             self._steps.append(NumbersStep(path, slot, element, align))
             return leaf
         inner = _Compiler(self._wire).program(element, f"{path}[]", wanted)

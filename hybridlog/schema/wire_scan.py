@@ -103,7 +103,7 @@ class Scanner:
             return at
         room = end - at
         at += (origin - at) & (step.align - 1)
-        size = count * step.kind.dtype.itemsize
+        size = count * step.kind.size
         if size > end - at:
             raise MisfitError(f"{step.path} claims {count} elements, {room} bytes remain")
         return at + size

@@ -233,7 +233,7 @@ class Walker:
         claims = self._claims(cursor)
         source = self._source
         gather = slots is not None and step.slot is not None
-        item_size = step.kind.dtype.itemsize
+        item_size = step.kind.size
         data: NDArray[np.uint8] | None = None
         if isinstance(claims, int):
             if claims:

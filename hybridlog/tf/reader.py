@@ -11,13 +11,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
+from hybridlog.tf import is_of_transforms
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import Frame, FrameTree
 from hybridlog.wording import listed
@@ -30,22 +30,9 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
-TYPES: Final = (
-    "tf2_msgs/TFMessage",
-    "tf/tfMessage",
-    "geometry_msgs/TransformStamped",
-    "foxglove.FrameTransform",
-    "foxglove.FrameTransforms",
-)
-"""Message types with transforms, as `plain_type` names them."""
 _STATIC: Final = "tf_static"
 _MAX_NORM_ERROR: Final = 1e-2
 """How far the norm of a quaternion may be from 1; that of tf2."""
-
-
-def is_of_transforms(type_name: str) -> bool:
-    """True for a type of `TYPES`, as ROS 1, ROS 2 or Foxglove name it."""
-    return plain_type(type_name) in TYPES
 
 
 def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[str]) -> FrameTree:

@@ -343,7 +343,8 @@ class FrameTree:
         """
         wanted = name.removeprefix("/")
         if wanted not in self.frames and all(wanted not in f.parents for f in self.frames.values()):
-            raise TopicError(f"There is no frame {name}; there are {listed(self.names) or 'none'}.")
+            known = listed(self.names) or "none"
+            raise TopicError(f"There is no frame {name!r}; there are {known}.")
         return wanted
 
     def _paths(

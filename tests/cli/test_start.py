@@ -72,7 +72,12 @@ def test_looking_imports_neither_numbers_nor_tables(store: Path) -> None:
         ((*words, "--store", store), {})
         for words in (("ls",), ("ls", "--tag", "place"), ("info", "robot"), ("info", "--losses"))
     ]
-    for line in (f"info --store {store} ro", f"fetch --store {store} sc"):
+    for line in (
+        f"info --store {store} ro",
+        f"fetch --store {store} sc",
+        f"fetch --store {store} scan --fields ra",
+        f"align --store {store} --to odom scan --fields scan:ra",
+    ):
         words = {"COMP_WORDS": f"hybridlog {line}", "COMP_CWORD": str(len(line.split()))}
         asked.append(((), {"_HYBRIDLOG_COMPLETE": "bash_complete", **words}))
     for arguments, variables in [*asked, (("--version",), {})]:
@@ -200,6 +205,16 @@ def test_completion(store: Path) -> None:
     assert complete(f"top --store {store} --field /base/s") == ["/base/scan:"]
     assert complete(f"trigger x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
+    assert complete(f"ls --store {store} --tag p") == ["place"]
+    assert complete(f"ls --store {store} --type Laser") == ["LaserScan"]
+    assert complete(f"tf --store {store} -r robot base_l") == ["base_laser_link", "base_link"]
+    assert complete(f"fetch --store {store} -r robot scan --in-frame o") == ["odom"]
+    assert complete(f"align --store {store} --to odom scan --fields sc") == ["scan: "]
+    assert complete(f"align --store {store} --to odom scan --where scan:range_mi") == [
+        "scan:range_min"
+    ]
+    assert complete(f"align --store {store} scan --step 1s --fields range_mi") == ["range_min"]
+    assert complete(f"top --store {store} --field scan:range_mi") == ["scan:range_min"]
     assert "scan_time" in complete(f"fetch --store {store} scan --fields scan")
     assert "ranges,scan_time" in complete(f"stats --store {store} scan --fields ranges,scan")
     assert complete(f"fetch --store {store} -t scan --where range_m") == ["range_min", "range_max"]
@@ -267,6 +282,8 @@ def test_paths_are_checked_by_the_library() -> None:
         ("tf --toleranse x", "No such option '--toleranse'.\n"),
         ("ls robot", "Did you mean -r robot?"),
         ("keep --pin robot", "Did you mean -r robot?"),
+        ("tf -r robot battery odom", "There is no frame 'battery'; there are map, odom"),
+        ("tf -r robot battery odom", "\nDid you mean -t battery?\n"),
         ("fetch -t scan --between +10s --count", ": --between takes two times: --between +10s end"),
         ("fetch scan --between +1s --where n>1", ": --between takes two times: --between +1s end"),
         ("ls --during +1s -r robot", ": --during takes two times: --during +1s end"),

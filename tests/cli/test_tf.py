@@ -58,7 +58,7 @@ def test_times_without_a_transform(store: Path) -> None:
     ("args", "said"),
     [
         (("odom", "base_link", "--at", "+99s"), "There is no transform from base_link to odom"),
-        (("odom", "wheel"), "There is no frame wheel; there are map, odom"),
+        (("odom", "wheel"), "There is no frame 'wheel'; there are map, odom"),
         (("odom",), "name TARGET and SOURCE"),
         (("--at", "+1s"), "name its TARGET and SOURCE"),
         (("odom", "base_link", "--at", "+1s", "--step", "1s"), "exclude each other"),

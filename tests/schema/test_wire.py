@@ -623,7 +623,7 @@ def test_no_rows(wire):
 
 
 def test_rows_outside_of_the_buffer_are_refused():
-    message_type = MessageType("T", (("a", Primitive("uint8", np.dtype("u1"))),))
+    message_type = MessageType("T", (("a", Primitive("uint8", "u1")),))
     decoded = WireReader(message_type, "ros1").read(
         b"\x01\x02", np.array([0, -1, 2, 1]), np.array([1, 1, 1, 1])
     )
@@ -645,7 +645,7 @@ def test_long_arrays_of_one_row_are_aligned():
     values = np.arange(5000, dtype="<f8")
     for junk in range(8):
         buffer = bytes(junk) + u4(len(values)) + values.tobytes()
-        message_type = MessageType("T", (("v", ArrayOf(Primitive("float64", np.dtype("f8")))),))
+        message_type = MessageType("T", (("v", ArrayOf(Primitive("float64", "f8"))),))
         decoded = WireReader(message_type, "ros1").read(
             buffer, np.array([junk]), np.array([len(buffer) - junk])
         )
@@ -656,7 +656,7 @@ def test_long_arrays_of_one_row_are_aligned():
 
 
 def test_long_and_short_blocks_of_several_rows():
-    message_type = MessageType("T", (("v", ArrayOf(Primitive("uint8", np.dtype("u1")))),))
+    message_type = MessageType("T", (("v", ArrayOf(Primitive("uint8", "u1"))),))
     for sizes in ([70_000] * 3, [70_000, 3, 0, 5], [5, 0] * 40, list(range(100))):
         payloads = [u4(size) + bytes([size % 251]) * size for size in sizes]
         decoded = WireReader(message_type, "ros1").read(*pack(payloads))
@@ -668,7 +668,7 @@ def test_long_and_short_blocks_of_several_rows():
 @pytest.mark.parametrize("between", [[0, 0, 0], [9, 9, 9], [1, 7, 0]])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_long_blocks_of_one_size_at_any_distance(between, backwards):
-    message_type = MessageType("T", (("v", ArrayOf(Primitive("uint16", np.dtype("u2")))),))
+    message_type = MessageType("T", (("v", ArrayOf(Primitive("uint16", "u2"))),))
     arrays = np.random.default_rng(2).integers(0, 1 << 16, (4, 5000)).astype("<u2")
     payloads = [u4(5000) + array.tobytes() for array in arrays]
     buffer, offset = b"", []

@@ -246,7 +246,7 @@ def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:
     ]
     assert "pose" in run(*fetch, "-n", "1", "-F", "table", store=where).out
     assert "as they came" in run(*fetch, "-F", "mcap", "-o", "x.mcap", store=where, code=2).err
-    with pytest.raises(TopicError, match="no frame nowhere; there are map, odom"):
+    with pytest.raises(TopicError, match="no frame 'nowhere'; there are map, odom"):
         store.recordings("robot").topic("odom").in_frame("nowhere").to_arrow()
     with pytest.raises(UsageError, match="no points or poses"):
         store.recordings("robot").topic("battery").in_frame("map").to_arrow()

@@ -220,7 +220,7 @@ def test_static_and_moving(log: Log) -> None:
 
 def test_names(log: Log) -> None:
     tree = log.tree(said(0, "a", "b"))
-    with pytest.raises(TopicError, match="no frame c; there are a, b"):
+    with pytest.raises(TopicError, match="no frame 'c'; there are a, b"):
         tree.lookup("a", "c", at(0))
     with pytest.raises(TopicError, match="belong to one recording"):
         log.store.tf()
