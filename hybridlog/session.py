@@ -312,17 +312,14 @@ class Session:
                 self.field_indexes = field_indexes.listed(database)
                 self._uncertain = None
             if self.connection.may_write:
-                has_changed = index.bring_up_to_date(
-                    self.directory,
-                    self.catalog,
-                    database,
+                store = index.StoreIndex(self.directory, self.catalog, database, self._progress)
+                has_changed = store.bring_up_to_date(
                     self.snapshot(),
                     self.entry_of,
                     index=self.connection.index,
                     stale=self._stale,
                     wanted=None if wanted is None else wanted.keys(),
                     report=repairs,
-                    progress=self._progress,
                 )
         finally:
             self.repairs.damage += self.connection.damage

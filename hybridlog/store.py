@@ -1042,24 +1042,17 @@ class Store:
         Raises:
             StoreError: A named recording is being written.
         """
-        from hybridlog.maintenance import index
+        from hybridlog.maintenance.index import StoreIndex
 
         database = self.database_for("Rebuilding the index", writes=True)
         if recordings is None:
             self.catalog.mend()
         self.refresh()
         chosen = self.select(recordings)
-        left = index.rebuild(
-            self.directory,
-            self.catalog,
-            database,
-            chosen,
-            progress,
-        )
+        index = StoreIndex(self.directory, self.catalog, database, progress)
+        left = index.rebuild(chosen)
         if recordings is None:
-            index.remove_rest(
-                self.directory, self.catalog, database, self.session.recordings(), progress
-            )
+            index.remove_rest(self.session.recordings())
         elif left:
             raise next(iter(left.values()))
         self.refresh()

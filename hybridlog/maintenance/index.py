@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import walk
@@ -47,158 +47,339 @@ Place = tuple[int, int]
 _TRIES = 10
 
 
-def bring_up_to_date(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    snapshot: Snapshot,
-    entry_of: Callable[[RecordingSummary], RecordingEntry],
-    *,
-    index: str,
-    stale: Collection[str],
-    wanted: Collection[str] | None = None,
-    report: RepairReport,
-    progress: Progress | None = None,
-) -> bool:
-    """Index missing chunks, and remove documents of removed recordings.
+@dataclass(frozen=True, slots=True)
+class StoreIndex:
+    """The index of a store, brought up to date with its segments or rebuilt from them.
 
-    Recordings that the catalog knows to be in this index are not looked at, unless the
-    index has another number of recordings than these. Documents of removed recordings
-    are removed only if all recordings are wanted.
+    All methods raise `DatabaseError` if MongoDB fails.
 
-    Args:
+    Attributes:
         directory: The store.
         catalog: Its catalog.
         database: The index.
-        snapshot: All recordings.
-        entry_of: Returns the entry of a recording.
-        index: Id of the index.
-        stale: Ids of recordings to look at in any case.
-        wanted: Ids of the recordings that the index must have; None for all.
-        report: Collects the actions.
-        progress: Called while a recording is indexed.
-
-    Returns:
-        Whether an entry has changed.
-
-    Raises:
-        DatabaseError: MongoDB fails.
+        progress: Called after each chunk.
     """
-    tables.remove_unfinished(directory, snapshot)
-    state = IndexState(database)
-    behind = [one for one in snapshot.summaries if one.indexed_by != index or one.id in stale]
-    known = state.of([one.key for one in behind]) if behind else {}
-    is_other = state.count() - len(known) != len(snapshot) - len(behind)
-    if is_other:
-        behind = snapshot.summaries
-    if wanted is not None:
-        behind = [one for one in behind if one.id in wanted]
-    has_orphans = wanted is None and (is_other or tables.are_left(directory, snapshot))
-    if not behind and not has_orphans:
-        return False
-    if is_other or has_orphans:
-        known = state.of(None if has_orphans else [one.key for one in behind])
-    has_changed = False
-    current = []
-    for summary in behind:
-        entry = entry_of(summary)
-        indexed = known.get(entry.key)
-        is_whole = indexed is not None and indexed.is_whole(entry)
-        if indexed is not None and is_whole and _restore_damage(catalog, entry, indexed):
-            has_changed = True
-            entry = put_entry(directory, catalog, entry.label)
-            if entry.id != summary.id:  # another recording has the label now
-                continue
-        if is_whole and _is_current(indexed, entry):
-            current.append(entry.id)
-        elif directory.is_writable:  # else the segments answer, without an index
-            _bring_one(directory, catalog, database, entry, report=report, progress=progress)
-    if current:
-        catalog.put_indexed(current, index)
-    if has_orphans:
-        _remove_orphans(directory, database, known, report)
-    return has_changed or bool(report.indexed) or bool(current)
 
+    directory: StoreDirectory
+    catalog: Catalog
+    database: Database
+    progress: Progress | None = None
 
-def _bring_one(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    entry: RecordingEntry,
-    *,
-    report: RepairReport,
-    progress: Progress | None,
-) -> None:
-    """Bring one recording up to date, unless another process is writing it."""
-    # The process that holds the lock indexes it.
-    with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
-        try:
-            chunks = _bring_up(directory, catalog, database, replace(entry, label=label), progress)
-        except SegmentError as error:
-            report.unreadable[label] = str(error)
+    @property
+    def _state(self) -> IndexState:
+        return IndexState(self.database)
+
+    def bring_up_to_date(
+        self,
+        snapshot: Snapshot,
+        entry_of: Callable[[RecordingSummary], RecordingEntry],
+        *,
+        index: str,
+        stale: Collection[str],
+        wanted: Collection[str] | None,
+        report: RepairReport,
+    ) -> bool:
+        """Index missing chunks, and remove documents of removed recordings.
+
+        Recordings that the catalog knows to be in this index are not looked at, unless the
+        index has another number of recordings than these. Documents of removed recordings
+        are removed only if all recordings are wanted.
+
+        Args:
+            snapshot: All recordings.
+            entry_of: Returns the entry of a recording.
+            index: Id of the index.
+            stale: Ids of recordings to look at in any case.
+            wanted: Ids of the recordings that the index must have; None for all.
+            report: Collects the actions.
+
+        Returns:
+            Whether an entry has changed.
+        """
+        directory, state = self.directory, self._state
+        tables.remove_unfinished(directory, snapshot)
+        behind = [one for one in snapshot.summaries if one.indexed_by != index or one.id in stale]
+        known = state.of([one.key for one in behind]) if behind else {}
+        is_other = state.count() - len(known) != len(snapshot) - len(behind)
+        if is_other:
+            behind = snapshot.summaries
+        if wanted is not None:
+            behind = [one for one in behind if one.id in wanted]
+        has_orphans = wanted is None and (is_other or tables.are_left(directory, snapshot))
+        if not behind and not has_orphans:
+            return False
+        if is_other or has_orphans:
+            known = state.of(None if has_orphans else [one.key for one in behind])
+        has_changed = False
+        current = []
+        for summary in behind:
+            entry = entry_of(summary)
+            indexed = known.get(entry.key)
+            is_whole = indexed is not None and indexed.is_whole(entry)
+            if indexed is not None and is_whole and self._restore_damage(entry, indexed):
+                has_changed = True
+                entry = put_entry(directory, self.catalog, entry.label)
+                if entry.id != summary.id:  # another recording has the label now
+                    continue
+            if is_whole and _is_current(indexed, entry):
+                current.append(entry.id)
+            elif directory.is_writable:  # else the segments answer, without an index
+                self._bring_one(entry, report)
+        if current:
+            self.catalog.put_indexed(current, index)
+        if has_orphans:
+            self._remove_orphans(known, report)
+        return has_changed or bool(report.indexed) or bool(current)
+
+    def _restore_damage(self, entry: RecordingEntry, indexed: Indexed) -> bool:
+        """Copy the index's list of unreadable chunks to the catalog; True if it changed."""
+        if self.catalog.damage(entry.id) == indexed.damage:
+            return False
+        self.catalog.put_damage(entry.id, indexed.damage)
+        return True
+
+    def _bring_one(self, entry: RecordingEntry, report: RepairReport) -> None:
+        """Bring one recording up to date, unless another process is writing it."""
+        # The process that holds the lock indexes it.
+        with (
+            suppress(HeldError, TopicError),
+            self.directory.writing(entry.label, entry.id) as label,
+        ):
+            try:
+                chunks = self._bring_up(entry.key, label)
+            except SegmentError as error:
+                report.unreadable[label] = str(error)
+            else:
+                if chunks is not None:
+                    report.indexed[label] = chunks
+
+    def _bring_up(self, key: str, label: str) -> int | None:
+        """Bring one recording, locked by this process, up to date.
+
+        Returns:
+            Number of indexed chunks; None if all were in the index.
+        """
+        # Read again, now that it is locked: another process may have indexed it meanwhile.
+        indexed, entry = self._state.one(key), put_entry(self.directory, self.catalog, label)
+        if indexed is None or not indexed.is_whole(entry):
+            return self.catch_up(label)
+        if not entry.is_decoded:
+            self._state.show(decode_again(self.directory, self.catalog, entry, self.progress))
+            return 0
+        if not indexed.mirrors(entry):
+            self._state.show(entry)
+        return None
+
+    def _remove_orphans(self, known: Mapping[str, Indexed], report: RepairReport) -> None:
+        """Remove recordings without a directory from the index and the tables.
+
+        The directories are listed after the index, so they include recordings that have begun
+        meanwhile. If one cannot be read, nothing is removed.
+        """
+        present = ids_present(self.directory)
+        if present is None:
+            return
+        for key, indexed in known.items():
+            if key not in present:
+                remove_documents(self.database, key, indexed)
+                report.removed.append(indexed.id or key)
+        if self.directory.is_writable:
+            tables.remove_orphans(self.directory, present)
+
+    def catch_up(self, label: str) -> int:
+        """Index the missing chunks of a recording; return their number.
+
+        An unreadable chunk is noted in the catalog, and the others are indexed.
+
+        Args:
+            label: The recording, locked by this process for writing.
+
+        Raises:
+            SegmentError: A segment cannot be read.
+        """
+        directory, catalog = self.directory, self.catalog
+        entry = put_entry(directory, catalog, label)
+        indexed = self._prepare(entry)
+        whole = {int(number) for number in indexed.segments}
+        missing = {
+            (number, chunk)
+            for number, _, _ in entry.spans
+            if number not in whole
+            for chunk in range(len(catalog.table(entry, number).chunks))
+            if (number, chunk) > indexed.through[:2]
+        }
+        damage = catalog.damage(entry.id)
+        self._index(entry, indexed.through, missing, damage)
+        catalog.put_damage(entry.id, damage)
+        entry = finish(directory, catalog, self.database, label, turn=indexed.turn)
+        if not entry.is_decoded:  # documents indexed before
+            self._state.show(decode_again(directory, catalog, entry, self.progress))
+        return len(missing - damage.keys())
+
+    def _prepare(self, entry: RecordingEntry) -> Indexed:
+        """Remove documents from the index that do not fit the segments; return what it has."""
+        state = self._state
+        indexed = state.one(entry.key)
+        if (
+            indexed is not None
+            and indexed.state in {"open", "indexing"}
+            and self._fits(entry, indexed.through)
+            and all(entry.digests.get(n) == digest for n, digest in indexed.segments.items())
+        ):
+            return indexed
+        turn = 1 if indexed is None else indexed.turn + 1
+        left: dict[str, str] = {}
+        if indexed is not None and indexed.state in {"complete", "clearing"}:
+            left = {n: d for n, d in indexed.segments.items() if entry.digests.get(n) == d}
+        if indexed is not None and indexed.state == "complete" and left == dict(indexed.segments):
+            state.put(entry, "indexing", turn=turn, segments=left)
+            return Indexed(entry.id, "indexing", left, turn)
+        # If this is interrupted, the next opening repeats it.
+        state.put(entry, "clearing", turn=turn, segments=left)
+        if indexed is None:
+            # No documents are known. Unknown ones are within the same times.
+            state.clear(entry.key, _places(self.database, [entry]).values(), entry.span)
         else:
-            if chunks is not None:
-                report.indexed[label] = chunks
+            _clear_documents(self.database, entry.key, indexed, entry, but=[int(n) for n in left])
+        state.put(entry, "indexing", turn=turn, segments=left)
+        return Indexed(entry.id, "indexing", left, turn)
 
+    def _fits(self, entry: RecordingEntry, through: Through) -> bool:
+        """True if the last indexed chunk is in the segments.
 
-def _restore_damage(catalog: Catalog, entry: RecordingEntry, indexed: Indexed) -> bool:
-    """Copy the index's list of unreadable chunks to the catalog; True if it changed."""
-    if catalog.damage(entry.id) == indexed.damage:
-        return False
-    catalog.put_damage(entry.id, indexed.damage)
-    return True
+        A power cut may remove chunks whose index documents are on the disk already.
+        """
+        if through == NOTHING:
+            return True
+        if all(number != through.segment for number, _, _ in entry.spans):
+            return False
+        offsets = self.catalog.table(entry, through.segment).chunks["offset"]
+        return through.chunk < len(offsets) and bool(offsets[through.chunk] == through.offset)
+
+    def _index(
+        self,
+        entry: RecordingEntry,
+        through: Through,
+        missing: Collection[Place],
+        damage: dict[Place, str],
+    ) -> None:
+        """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
+        from hybridlog.index.index_writer import INTERVAL_S, DocumentSender
+
+        directory, catalog = self.directory, self.catalog
+        topics = tables.missing(directory, entry)
+        writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
+        indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, self.database, through)
+        sent = time.monotonic()
+        # A chunk that is indexed already may be missing in the tables all the same.
+        in_tables = tables.channels_of(entry, topics)
+        numbers = [number for number, _, _ in entry.spans]
+        report = reporter(self.progress, entry.label, entry.stored_bytes)
+        try:
+            for segment in walk(directory.recording(entry.label), numbers, report=report):
+                number, channels = segment.number, segment.summary.channels
+                stats: dict[int, Mapping[int, ChannelStats]] = {}
+                wanted = {
+                    place
+                    for place in segment.summary.chunks
+                    if (number, place.number) in missing or not in_tables.isdisjoint(place.channels)
+                }
+                for place, chunk in segment.chunks(wanted.__contains__):
+                    if isinstance(chunk, SegmentError):
+                        damage[number, place.number] = str(chunk)
+                        continue
+                    damage.pop((number, place.number), None)
+                    writer.add(chunk, channels)
+                    documents, entries = indexer.documents_of([chunk], channels)
+                    stats[chunk.number] = entries[0].stats
+                    if (number, chunk.number) in missing:
+                        sender.add(documents, entries)
+                    if time.monotonic() - sent > INTERVAL_S:
+                        sender.send()
+                        sent = time.monotonic()
+                writer.cut(number, entry.digests[str(number)])
+                if stats and len(stats) == len(catalog.table(entry, number).chunks):
+                    rows = decoded_rows(stats.values())
+                    catalog.put_stamps(entry.id, [(number, entry.digests[str(number)], rows)])
+            sender.end()
+            writer.close(entry)
+        finally:
+            sender.close()
+            writer.discard()
+
+    def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
+        """Rebuild the index of recordings from their segments, one after the other.
+
+        The other recordings can be asked meanwhile. The next opening finishes an interrupted
+        rebuild.
+
+        Returns:
+            Why some are unchanged, by id: another process holds them, or they are gone.
+        """
+        left: dict[str, HybridlogError] = {}
+        for chosen in entries:
+            try:
+                with self.directory.writing(chosen.label, chosen.id, wait_s=LOCK_WAIT_S) as label:
+                    self._clear(put_entry(self.directory, self.catalog, label))
+                    self.catch_up(label)
+            except (HeldError, TopicError) as error:
+                left[chosen.id] = error
+        return left
+
+    def _clear(self, entry: RecordingEntry, *, everywhere: bool = False) -> None:
+        """Remove the documents of a recording, `everywhere` if it is not known where they are."""
+        state = self._state
+        indexed = state.one(entry.key)
+        turn = 1 if indexed is None else indexed.turn + 1
+        # If this is interrupted, the next opening repeats it.
+        state.put(entry, "clearing", turn=turn)
+        _clear_documents(self.database, entry.key, None if everywhere else indexed, entry)
+        state.put(entry, "indexing", turn=turn)
+
+    def remove_rest(self, entries: Iterable[RecordingEntry]) -> None:
+        """Remove documents of no recording, and surplus documents of recordings.
+
+        Each collection is read once.
+
+        Args:
+            entries: All recordings.
+        """
+        state = self._state
+        known = {entry.key: entry for entry in entries}
+        places = _places(self.database, known.values())
+        expected = {entry.key: _documents(entry, places) for entry in known.values()}
+        again: set[str] = set()
+        orphans: list[object] = []
+        collections = state.document_collections()
+        counted = self.database.count_by(collections, "_meta.rec")
+        for collection, counts in zip(collections, counted, strict=True):
+            for key, count in counts:
+                entry = known.get(key) if isinstance(key, str) else None
+                if entry is None:
+                    orphans.append(key)
+                    continue
+                # Fewer, too: a document of no recording may have had the key of one.
+                missing = expected[entry.key][collection] - count
+                if missing < 0 or (missing > 0 and not self.catalog.damage(entry.id)):
+                    again.add(entry.key)
+        # Listed after the index: a recording that has begun meanwhile has a directory by now.
+        present = ids_present(self.directory) if orphans else None
+        for key in orphans:
+            if present is not None and not (isinstance(key, str) and key in present):
+                state.clear(key)
+        for key in sorted(again):
+            entry = known[key]
+            with (
+                suppress(HeldError, TopicError),
+                self.directory.writing(entry.label, entry.id) as label,
+            ):
+                self._clear(entry, everywhere=True)
+                self.catch_up(label)
 
 
 def _is_current(indexed: Indexed | None, entry: RecordingEntry) -> bool:
     """True if a completely indexed recording needs no further work."""
     return indexed is not None and indexed.mirrors(entry) and entry.is_decoded
-
-
-def _bring_up(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    entry: RecordingEntry,
-    progress: Progress | None,
-) -> int | None:
-    """Bring one recording, locked by this process, up to date.
-
-    Returns:
-        Number of indexed chunks; None if all were in the index.
-    """
-    state = IndexState(database)
-    # Both are read again, now that it is locked: another process may have indexed it meanwhile.
-    indexed, entry = state.one(entry.key), put_entry(directory, catalog, entry.label)
-    if indexed is None or not indexed.is_whole(entry):
-        return catch_up(directory, catalog, database, entry.label, progress)
-    if not entry.is_decoded:
-        state.show(decode_again(directory, catalog, entry, progress))
-        return 0
-    if not indexed.mirrors(entry):
-        state.show(entry)
-    return None
-
-
-def _remove_orphans(
-    directory: StoreDirectory,
-    database: Database,
-    known: Mapping[str, Indexed],
-    report: RepairReport,
-) -> None:
-    """Remove recordings without a directory from the index and the tables.
-
-    The directories are listed after the index, so they include recordings that have begun
-    meanwhile. If one cannot be read, nothing is removed.
-    """
-    present = ids_present(directory)
-    if present is None:
-        return
-    for key, indexed in known.items():
-        if key not in present:
-            remove_documents(database, key, indexed)
-            report.removed.append(indexed.id or key)
-    if directory.is_writable:
-        tables.remove_orphans(directory, present)
 
 
 def ids_present(directory: StoreDirectory) -> set[str] | None:
@@ -260,154 +441,6 @@ def _clear_documents(
     IndexState(database).clear(key, TopicPlaces(database).of(topics).values(), span, but)
 
 
-def catch_up(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    label: str,
-    progress: Progress | None = None,
-) -> int:
-    """Index the missing chunks of a recording; return their number.
-
-    An unreadable chunk is noted in the catalog, and the others are indexed.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        database: The index.
-        label: The recording, locked by this process for writing.
-        progress: Called after each chunk.
-
-    Raises:
-        DatabaseError: MongoDB fails.
-        SegmentError: A segment cannot be read.
-    """
-    entry = put_entry(directory, catalog, label)
-    indexed = _prepare(database, entry, catalog)
-    whole = {int(number) for number in indexed.segments}
-    missing = {
-        (number, chunk)
-        for number, _, _ in entry.spans
-        if number not in whole
-        for chunk in range(len(catalog.table(entry, number).chunks))
-        if (number, chunk) > indexed.through[:2]
-    }
-    damage = catalog.damage(entry.id)
-    _index(
-        directory,
-        catalog,
-        database,
-        entry,
-        through=indexed.through,
-        missing=missing,
-        damage=damage,
-        progress=progress,
-    )
-    catalog.put_damage(entry.id, damage)
-    entry = finish(directory, catalog, database, label, turn=indexed.turn)
-    if not entry.is_decoded:  # documents indexed before
-        IndexState(database).show(decode_again(directory, catalog, entry, progress))
-    return len(missing - damage.keys())
-
-
-def _prepare(database: Database, entry: RecordingEntry, catalog: Catalog) -> Indexed:
-    """Remove documents from the index that do not fit the segments; return what it has."""
-    state = IndexState(database)
-    indexed = state.one(entry.key)
-    if (
-        indexed is not None
-        and indexed.state in {"open", "indexing"}
-        and _fits(entry, catalog, indexed.through)
-        and all(entry.digests.get(n) == digest for n, digest in indexed.segments.items())
-    ):
-        return indexed
-    turn = 1 if indexed is None else indexed.turn + 1
-    left: dict[str, str] = {}
-    if indexed is not None and indexed.state in {"complete", "clearing"}:
-        left = {n: d for n, d in indexed.segments.items() if entry.digests.get(n) == d}
-    if indexed is not None and indexed.state == "complete" and left == dict(indexed.segments):
-        state.put(entry, "indexing", turn=turn, segments=left)
-        return Indexed(entry.id, "indexing", left, turn)
-    # If this is interrupted, the next opening repeats it.
-    state.put(entry, "clearing", turn=turn, segments=left)
-    if indexed is None:
-        # No documents are known. Unknown ones are within the same times.
-        state.clear(entry.key, _places(database, [entry]).values(), entry.span)
-    else:
-        _clear_documents(database, entry.key, indexed, entry, but=[int(n) for n in left])
-    state.put(entry, "indexing", turn=turn, segments=left)
-    return Indexed(entry.id, "indexing", left, turn)
-
-
-def _fits(entry: RecordingEntry, catalog: Catalog, through: Through) -> bool:
-    """True if the last indexed chunk is in the segments.
-
-    A power cut may remove chunks whose index documents are on the disk already.
-    """
-    if through == NOTHING:
-        return True
-    if all(number != through.segment for number, _, _ in entry.spans):
-        return False
-    offsets = catalog.table(entry, through.segment).chunks["offset"]
-    return through.chunk < len(offsets) and bool(offsets[through.chunk] == through.offset)
-
-
-def _index(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    entry: RecordingEntry,
-    *,
-    through: Through,
-    missing: Collection[Place],
-    damage: dict[Place, str],
-    progress: Progress | None,
-) -> None:
-    """Send what is missing to the index; chunks that cannot be read are noted in `damage`."""
-    from hybridlog.index.index_writer import INTERVAL_S, DocumentSender
-    from hybridlog.index.indexing import ChunkIndexer
-
-    topics = tables.missing(directory, entry)
-    writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
-    indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, database, through)
-    sent = time.monotonic()
-    # A chunk that is indexed already may be missing in the tables all the same.
-    in_tables = tables.channels_of(entry, topics)
-    numbers = [number for number, _, _ in entry.spans]
-    report = reporter(progress, entry.label, entry.stored_bytes)
-    try:
-        for segment in walk(directory.recording(entry.label), numbers, report=report):
-            number, channels = segment.number, segment.summary.channels
-            stats: dict[int, Mapping[int, ChannelStats]] = {}
-            wanted = {
-                place
-                for place in segment.summary.chunks
-                if (number, place.number) in missing or not in_tables.isdisjoint(place.channels)
-            }
-            for place, chunk in segment.chunks(wanted.__contains__):
-                if isinstance(chunk, SegmentError):
-                    damage[number, place.number] = str(chunk)
-                    continue
-                damage.pop((number, place.number), None)
-                writer.add(chunk, channels)
-                documents, entries = indexer.documents_of([chunk], channels)
-                stats[chunk.number] = entries[0].stats
-                if (number, chunk.number) in missing:
-                    sender.add(documents, entries)
-                if time.monotonic() - sent > INTERVAL_S:
-                    sender.send()
-                    sent = time.monotonic()
-            writer.cut(number, entry.digests[str(number)])
-            if stats and len(stats) == len(catalog.table(entry, number).chunks):
-                rows = decoded_rows(stats.values())
-                catalog.put_stamps(entry.id, [(number, entry.digests[str(number)], rows)])
-        sender.end()
-        writer.close(entry)
-    finally:
-        sender.close()
-        writer.discard()
-
-
 def finish(
     directory: StoreDirectory,
     catalog: Catalog,
@@ -431,103 +464,6 @@ def finish(
         state = IndexState(database)
         state.put(entry, "complete", turn=turn, segments=entry.digests, damage=damage)
     return entry
-
-
-def rebuild(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    entries: Iterable[RecordingEntry],
-    progress: Progress | None = None,
-) -> dict[str, HybridlogError]:
-    """Rebuild the index of recordings from their segments, one after the other.
-
-    The other recordings can be asked meanwhile. The next opening finishes an interrupted
-    rebuild.
-
-    Returns:
-        Why some are unchanged, by id: another process holds them, or they are gone.
-
-    Raises:
-        DatabaseError: MongoDB fails.
-    """
-    left: dict[str, HybridlogError] = {}
-    for chosen in entries:
-        try:
-            with directory.writing(chosen.label, chosen.id, wait_s=LOCK_WAIT_S) as label:
-                _clear(database, put_entry(directory, catalog, label))
-                catch_up(directory, catalog, database, label, progress)
-        except (HeldError, TopicError) as error:
-            left[chosen.id] = error
-    return left
-
-
-def _clear(database: Database, entry: RecordingEntry, *, everywhere: bool = False) -> None:
-    """Remove the documents of a recording before it is indexed from the beginning.
-
-    Args:
-        database: The index.
-        entry: The recording.
-        everywhere: True to look for them among all documents.
-    """
-    state = IndexState(database)
-    indexed = state.one(entry.key)
-    turn = 1 if indexed is None else indexed.turn + 1
-    # If this is interrupted, the next opening repeats it.
-    state.put(entry, "clearing", turn=turn)
-    _clear_documents(database, entry.key, None if everywhere else indexed, entry)
-    state.put(entry, "indexing", turn=turn)
-
-
-def remove_rest(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database,
-    entries: Iterable[RecordingEntry],
-    progress: Progress | None = None,
-) -> None:
-    """Remove documents of no recording, and surplus documents of recordings.
-
-    Each collection is read once.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        database: The index.
-        entries: All recordings.
-        progress: Called while a recording is indexed once more.
-
-    Raises:
-        DatabaseError: MongoDB fails.
-    """
-    state = IndexState(database)
-    known = {entry.key: entry for entry in entries}
-    places = _places(database, known.values())
-    expected = {entry.key: _documents(entry, places) for entry in known.values()}
-    again: set[str] = set()
-    orphans: list[object] = []
-    collections = state.document_collections()
-    counted = database.count_by(collections, "_meta.rec")
-    for collection, counts in zip(collections, counted, strict=True):
-        for key, count in counts:
-            entry = known.get(key) if isinstance(key, str) else None
-            if entry is None:
-                orphans.append(key)
-                continue
-            # Fewer, too: a document of no recording may have had the key of one.
-            missing = expected[entry.key][collection] - count
-            if missing < 0 or (missing > 0 and not catalog.damage(entry.id)):
-                again.add(entry.key)
-    # Listed after the index: a recording that has begun meanwhile has a directory by now.
-    present = ids_present(directory) if orphans else None
-    for key in orphans:
-        if present is not None and not (isinstance(key, str) and key in present):
-            state.clear(key)
-    for key in sorted(again):
-        entry = known[key]
-        with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
-            _clear(database, entry, everywhere=True)
-            catch_up(directory, catalog, database, label, progress)
 
 
 def _places(database: Database, entries: Iterable[RecordingEntry]) -> dict[str, TopicPlace]:

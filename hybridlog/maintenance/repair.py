@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from hybridlog.columns.payload_files import open_segment
 from hybridlog.entries import journal_from_segments, put_entry, take_inventory, unlisted_lines
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.index import catch_up, rebuild
+from hybridlog.maintenance.index import StoreIndex
 from hybridlog.maintenance.opening import finish_moves, moving_name
 from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.disk import durability, files
@@ -184,21 +184,21 @@ def repair_index(
     Raises:
         DatabaseError: MongoDB fails.
     """
-    state = IndexState(database)
-    known = state.of([entry.key for entry in entries])
+    index = StoreIndex(directory, catalog, database, progress)
+    known = IndexState(database).of([entry.key for entry in entries])
     done = []
     for entry in entries:
         indexed = known.get(entry.key)
         if entry.status == "open":
             continue
         if _is_restored(directory, catalog, entry):
-            if not rebuild(directory, catalog, database, [entry], progress):
+            if not index.rebuild([entry]):
                 done.append(Repaired(entry.label, "index", "damaged chunks are readable again"))
             continue
         if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
             continue
         with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
-            chunks = catch_up(directory, catalog, database, label, progress)
+            chunks = index.catch_up(label)
             done.append(Repaired(label, "index", f"{chunks} chunks indexed"))
     return done
 

@@ -218,7 +218,8 @@ def blocked(work):
         return work(*args, **options)
     return wait
 
-opening.recover, index._bring_one = blocked(opening.recover), blocked(index._bring_one)
+opening.recover = blocked(opening.recover)
+index.StoreIndex._bring_one = blocked(index.StoreIndex._bring_one)
 import_module("hybridlog.cli.main").main()
 """
 
