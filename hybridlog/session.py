@@ -24,7 +24,7 @@ import numpy as np
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
 from hybridlog.index.connection import Connection
-from hybridlog.maintenance.opening import catch_up, current_entry, look_at_all, mend, open_catalog
+from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
@@ -651,6 +651,10 @@ class Session:
         """Recordings, channels, chunks and schemas."""
         return open_catalog(self.directory)
 
+    @property
+    def _files(self) -> StoreFiles:
+        return StoreFiles(self.directory, self.catalog, self.repairs)
+
     def snapshot(self) -> Snapshot:
         """All recordings in short, at the moment."""
         return self._snapshot_of(self._moment)
@@ -666,13 +670,13 @@ class Session:
             self._changed = self.directory.changed()
             self._names = self.directory.names()
             try:
-                found = look_at_all(self.directory, self.catalog, self.repairs, mends=mends)
+                found = self._files.look_at_all(mends=mends)
             except DiskFullError as error:
                 # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
                 self.catalog.close()
                 self.catalog = open_catalog(self.directory, in_memory=True)
-                found = look_at_all(self.directory, self.catalog, self.repairs, mends=mends)
+                found = self._files.look_at_all(mends=mends)
             moment.snapshot = found
             ended = time.monotonic()
             self._looks_at = ended
@@ -725,7 +729,7 @@ class Session:
                 if entry is not None and entry.id == summary.id:
                     break
                 # Another process may have renamed it.
-                now = look_at_all(self.directory, self.catalog, self.repairs)
+                now = self._files.look_at_all()
                 if summary.id not in now.by_id:
                     return None
                 entry = self._current(now.summaries[now.by_id[summary.id]])
@@ -738,7 +742,7 @@ class Session:
 
     def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
         try:
-            entry, is_new = current_entry(self.directory, self.catalog, summary, self.repairs)
+            entry, is_new = self._files.current_entry(summary)
         except StoreError:
             if self.directory.has(summary.label):
                 raise
@@ -1171,7 +1175,7 @@ class Session:
                     reader = self._open_segment(entry, label, number)
                 except SegmentError:
                     # Another process may have renamed the recording.
-                    known = look_at_all(self.directory, self.catalog, self.repairs)
+                    known = self._files.look_at_all()
                     place = known.by_id.get(recording)
                     if place is None or known.summaries[place].label == label:
                         raise
@@ -1262,7 +1266,7 @@ class Session:
         repairs = self.repairs
         self.catalog.write_pending()
         self.catalog.drop_damaged()
-        mended = mend(self.directory, self.catalog, repairs, until)
+        mended = self._files.mend(until)
         if mended:
             with self._following:
                 for recording in mended:
@@ -1306,7 +1310,7 @@ class Session:
             labels = {*names}.symmetric_difference(before.by_label)  # copies are among them
             known = [before.by_id[one] for one in recordings if one in before.by_id]
             labels.update(before.summaries[place].label for place in known)
-            now = catch_up(self.directory, self.catalog, before, labels, self.repairs)
+            now = self._files.catch_up(before, labels)
             if now is None or self.directory.names() != names:
                 self.invalidate()
                 return

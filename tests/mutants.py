@@ -687,14 +687,14 @@ MAINTENANCE = [
         ),
         (
             "a-question-recovers-what-died",
-            "_refresh(directory, catalog, summary.label, report)",
-            "_mended(directory, catalog, summary.label, report)",
+            "self._refresh(summary.label)",
+            "self._mended(summary.label)",
             "tests/test_mending.py::test_a_question_about_a_recorder_that_died_writes_nothing",
         ),
         (
             "what-died-is-not-noted",
-            "        report.noted.add(label)\n",
-            "        pass\n",
+            "            self.report.noted.add(label)\n",
+            "            pass\n",
             "tests/test_mending.py::test_a_store_that_stays_open_is_repaired_meanwhile",
         ),
         (

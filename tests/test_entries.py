@@ -29,7 +29,7 @@ from hybridlog.entries import (
     take_inventory,
     text,
 )
-from hybridlog.maintenance.opening import current_entry, look_at_all
+from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -597,8 +597,9 @@ def test_names_are_text(made: Made) -> None:
 def opened(directory: StoreDirectory) -> tuple[list[RecordingEntry], RepairReport]:
     report = RepairReport()
     with closing(Catalog(directory.path, directory.settings.store_id)) as catalog:
-        found = look_at_all(directory, catalog, report, mends=True).summaries
-        entries = [current_entry(directory, catalog, summary, report)[0] for summary in found]
+        store = StoreFiles(directory, catalog, report)
+        found = store.look_at_all(mends=True).summaries
+        entries = [store.current_entry(summary)[0] for summary in found]
         return [entry for entry in entries if entry is not None], report
 
 

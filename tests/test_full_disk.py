@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog import session
+from hybridlog.maintenance.opening import StoreFiles
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DiskFullError
@@ -70,11 +70,11 @@ def test_nothing_is_said_to_have_crashed_on_a_full_disk(tmp_path: Path, calls: C
         with store.start("whole") as recording:
             recording.write(Channel("/a", "json", None, {}), b'{"n": 1}')
 
-    def full(_: Any, catalog: Any, *__: Any, **___: Any) -> None:
-        if not catalog.is_in_memory:
+    def full(store: StoreFiles, **_: Any) -> None:
+        if not store.catalog.is_in_memory:
             raise DiskFullError("No space left while writing the catalog.")
 
-    calls(session, "look_at_all", full)
+    calls(StoreFiles, "look_at_all", full)
     done = answer("fetch", "-t", "/a", "--count", store=tmp_path / "store")
     assert done.out == "1\n"
     assert "The disk of the store is full, so nothing in it is repaired or noted." in done.err

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog import session
+from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.snapshot import Snapshot
 from hybridlog_storage import journal
 from hybridlog_storage.errors import TopicError
@@ -252,7 +252,7 @@ def test_a_journal_that_has_grown_is_read_at_the_opening(tmp_path: Path) -> None
 
 def test_a_recording_is_read_when_its_turn_comes(overlapping: Any, calls: Calls) -> None:
     store, _ = overlapping
-    read = calls(session, "current_entry")
+    read = calls(StoreFiles, "current_entry")
     store.refresh()
     next(iter(store.topic("/n")))
     assert 1 <= len(read) < 6

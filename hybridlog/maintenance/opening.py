@@ -11,6 +11,7 @@ import time
 from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns import payload_files
@@ -75,106 +76,274 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
     )
 
 
-def look_at_all(
-    directory: StoreDirectory, catalog: Catalog, report: RepairReport, *, mends: bool = False
-) -> Snapshot:
-    """All recordings.
+@dataclass(frozen=True, slots=True)
+class StoreFiles:
+    """The recordings of a store, compared with their files, and recovered.
 
-    The files of a recording are read if it is new, or looks different from outside. All
-    others are compared with their files before they first answer, see `current_entry`.
-
-    Args:
+    Attributes:
         directory: The store.
         catalog: Its catalog.
         report: Collects problems and repairs.
-        mends: Repair what a crash has left, as when a store is opened; otherwise it is noted.
     """
-    for _ in range(_TRIES):
-        with suppress(CatalogError):  # another process has changed topics of a recording meanwhile
-            return _look_at_all(directory, catalog, report, mends=mends)
-    return _look_at_all(directory, catalog, report, mends=mends)
 
+    directory: StoreDirectory
+    catalog: Catalog
+    report: RepairReport
 
-def _look_at_all(
-    directory: StoreDirectory, catalog: Catalog, report: RepairReport, *, mends: bool
-) -> Snapshot:
-    from hybridlog.maintenance import tables
+    def look_at_all(self, *, mends: bool = False) -> Snapshot:
+        """All recordings.
 
-    mends = mends and not catalog.is_in_memory
-    # A recording has its directory before it has tables.
-    gone = tables.unfinished(directory) if mends else set()
-    if mends:
-        for name in directory.names():
-            if name.startswith(REMOVED):
-                directory.sweep(name)
-    rows = catalog.summaries()
-    if mends:  # before the index is compared with entries, which may be lost then
-        catalog.drop_damaged()
-    known = {summary.label: summary for summary in rows}
-    for _ in range(_TRIES):
-        names = directory.names()
-        looks = directory.looks(names)
-        report.unreadable.clear()
-        found = _find(directory, catalog, looks, known, report, mends=mends)
-        # A recording that was renamed meanwhile must not be missed. If it has exchanged its label
-        # with another one, that one may have been seen twice.
-        is_twice = any(len(copies) > 1 for copies in found.values())
-        if directory.names() == names and not (is_twice and directory.looks(names) != looks):
-            break
-    report.copies.clear()
-    for recording, copies in found.items():
-        if len(copies) > 1:
-            found[recording] = [_one_of(directory, catalog, copies, known, report)]
-    report.noted.difference_update(report.copies)
-    for summary in rows if mends or catalog.is_in_memory else ():
-        # The row of a recording that is unreadable now may be valid again later.
-        if summary.id not in found and summary.label not in report.unreadable:
-            catalog.remove(summary.id)
-            gone.add(summary.id)
-    snapshot = snapshot_of(catalog, [summary for (summary,) in found.values()])
-    if gone and mends and not report.unreadable:
-        tables.remove_unfinished(directory, snapshot)
-        tables.remove_all(directory, gone - found.keys())
-    return snapshot
+        The files of a recording are read if it is new, or looks different from outside. All
+        others are compared with their files before they first answer, see `current_entry`.
 
+        Args:
+            mends: Repair what a crash has left, as when a store is opened; otherwise it is noted.
+        """
+        for _ in range(_TRIES):
+            with suppress(
+                CatalogError
+            ):  # another process has changed topics of a recording meanwhile
+                return self._look_at_all(mends=mends)
+        return self._look_at_all(mends=mends)
 
-def catch_up(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    snapshot: Snapshot,
-    labels: AbstractSet[str],
-    report: RepairReport,
-) -> Snapshot | None:
-    """All recordings after changes of some of them, as of `look_at_all`.
+    def _look_at_all(self, *, mends: bool) -> Snapshot:
+        from hybridlog.maintenance import tables
 
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        snapshot: All recordings before.
-        labels: Names in the store that came, went, or whose files were changed.
-        report: Collects problems and repairs.
+        directory, catalog, report = self.directory, self.catalog, self.report
+        mends = mends and not catalog.is_in_memory
+        # A recording has its directory before it has tables.
+        gone = tables.unfinished(directory) if mends else set()
+        if mends:
+            for name in directory.names():
+                if name.startswith(REMOVED):
+                    directory.sweep(name)
+        rows = catalog.summaries()
+        if mends:  # before the index is compared with entries, which may be lost then
+            catalog.drop_damaged()
+        known = {summary.label: summary for summary in rows}
+        for _ in range(_TRIES):
+            names = directory.names()
+            looks = directory.looks(names)
+            report.unreadable.clear()
+            found = self._find(looks, known, mends=mends)
+            # A recording that was renamed meanwhile must not be missed. If it has exchanged its
+            # label with another one, that one may have been seen twice.
+            is_twice = any(len(copies) > 1 for copies in found.values())
+            if directory.names() == names and not (is_twice and directory.looks(names) != looks):
+                break
+        report.copies.clear()
+        for recording, copies in found.items():
+            if len(copies) > 1:
+                found[recording] = [self._one_of(copies, known)]
+        report.noted.difference_update(report.copies)
+        for summary in rows if mends or catalog.is_in_memory else ():
+            # The row of a recording that is unreadable now may be valid again later.
+            if summary.id not in found and summary.label not in report.unreadable:
+                catalog.remove(summary.id)
+                gone.add(summary.id)
+        snapshot = snapshot_of(catalog, [summary for (summary,) in found.values()])
+        if gone and mends and not report.unreadable:
+            tables.remove_unfinished(directory, snapshot)
+            tables.remove_all(directory, gone - found.keys())
+        return snapshot
 
-    Returns:
-        All recordings; None if only `look_at_all` can tell.
-    """
-    if report.copies or report.unreadable:
-        return None
-    known = labels & snapshot.by_label.keys()
-    old = {snapshot.summaries[snapshot.by_label[label]].id for label in known}
-    try:
-        looks = directory.looks(sorted(labels))
-        new = {directory.id_of(label) for label in looks.keys() - known}
-        rows = {summary.label: summary for summary in catalog.summaries(old | new)}
-        found = _find(directory, catalog, looks, rows, report)
-        is_twice = any(len(copies) > 1 for copies in found.values())
-        elsewhere = found.keys() & snapshot.by_id.keys() - old
-        if is_twice or elsewhere or report.unreadable:
+    def catch_up(self, snapshot: Snapshot, labels: AbstractSet[str]) -> Snapshot | None:
+        """All recordings after changes of some of them, as of `look_at_all`.
+
+        Args:
+            snapshot: All recordings before.
+            labels: Names in the store that came, went, or whose files were changed.
+
+        Returns:
+            All recordings; None if only `look_at_all` can tell.
+        """
+        directory, catalog, report = self.directory, self.catalog, self.report
+        if report.copies or report.unreadable:
             return None
-        changed = [summary for (summary,) in found.values()]
-        topics = {summary.topics: catalog.topics(summary.topics) for summary in changed}
-    except StoreError:
-        return None
-    return snapshot.with_changes(changed, topics, old)
+        known = labels & snapshot.by_label.keys()
+        old = {snapshot.summaries[snapshot.by_label[label]].id for label in known}
+        try:
+            looks = directory.looks(sorted(labels))
+            new = {directory.id_of(label) for label in looks.keys() - known}
+            rows = {summary.label: summary for summary in catalog.summaries(old | new)}
+            found = self._find(looks, rows)
+            is_twice = any(len(copies) > 1 for copies in found.values())
+            elsewhere = found.keys() & snapshot.by_id.keys() - old
+            if is_twice or elsewhere or report.unreadable:
+                return None
+            changed = [summary for (summary,) in found.values()]
+            topics = {summary.topics: catalog.topics(summary.topics) for summary in changed}
+        except StoreError:
+            return None
+        return snapshot.with_changes(changed, topics, old)
+
+    def _find(
+        self,
+        looks: Mapping[str, str],
+        known: Mapping[str, RecordingSummary],
+        *,
+        mends: bool = False,
+    ) -> dict[str, list[RecordingSummary]]:
+        """Summaries of recordings by id.
+
+        Args:
+            looks: The look of each directory, by label.
+            known: Summaries in the catalog, by label.
+            mends: Repair what a crash has left; otherwise it is noted.
+        """
+        found: dict[str, list[RecordingSummary]] = {}
+        unchanged: list[RecordingSummary] = []
+        for label, look in looks.items():
+            summary = known.get(label)
+            if summary is None or summary.look != look or summary.status in UNFINISHED:
+                try:
+                    before = summary
+                    summary = self._look_again(label, summary, mends=mends)
+                except DiskFullError:
+                    raise
+                except StoreError as error:
+                    if self.directory.has(label):  # another process may have removed or renamed it
+                        self.report.unreadable[label] = str(error)
+                    continue
+                if summary is not None and before is not None and summary.look != before.look:
+                    unchanged.append(summary)
+            if summary is not None:
+                found.setdefault(summary.id, []).append(summary)
+        if mends or self.catalog.is_in_memory:
+            self.catalog.put_looks(unchanged)
+        return found
+
+    def _look_again(
+        self, label: str, summary: RecordingSummary | None, *, mends: bool
+    ) -> RecordingSummary | None:
+        """The summary of a recording as its files are now; None if it is gone."""
+        if summary is not None:
+            listing = self.directory.listing(label)
+            row = self.catalog.recording(summary.id)
+            if row is not None and _is_current(self.directory, row[1], row[0], listing):
+                return summary._replace(look=listing.look)
+        described = (self._mended if mends else self._refresh)(label)
+        return described.summary if described is not None else None
+
+    def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
+        """The entry of a recording, compared with its files.
+
+        Args:
+            summary: Its summary at the opening of the store.
+
+        Returns:
+            The entry, None if the recording is gone; and whether the files were read again.
+
+        Raises:
+            StoreError: Its files cannot be read.
+        """
+        directory = self.directory
+        row = self.catalog.recording(summary.id)
+        if row is not None and row[1].label == summary.label:
+            listing = directory.listing(summary.label)
+            if _is_current(directory, row[1], row[0], listing):
+                return row[1], False
+        if not directory.has(summary.label):
+            return None, True
+        described = self._refresh(summary.label)
+        return (described.entry if described is not None else None), True
+
+    def _refresh(self, label: str) -> Described | None:
+        """Read what is whole of a recording, keep it in memory, and note what to mend.
+
+        None if the recording is gone.
+        """
+        if _is_empty(self.directory, label):
+            return None
+        is_open = self.directory.is_recorded(label)
+        if not (is_open or self.catalog.is_in_memory):
+            self.report.noted.add(label)
+        return self._describe(label, is_open=is_open)
+
+    def _describe(self, label: str, *, is_open: bool) -> Described:
+        described = describe_now(self.directory, self.catalog, label, is_open=is_open)
+        self.catalog.keep(described)
+        return described
+
+    def _mended(self, label: str) -> Described | None:
+        """Recover a recording after a crash, and update its catalog row; None if it is gone."""
+        directory, catalog = self.directory, self.catalog
+        if catalog.is_in_memory:
+            return self._refresh(label)
+        is_empty = _is_empty(directory, label)
+        try:
+            with directory.writing(label):
+                is_new = is_empty and directory.is_beginning(label)
+                now = "" if is_new else recover(directory, label, self.report)
+                if not now:
+                    return None
+                described = describe_now(directory, catalog, now)
+                catalog.put(described)
+                return described
+        except HeldError:
+            if not directory.id_of(label):
+                return None  # a process is about to begin it
+        except TopicError:
+            return None
+        return self._describe(label, is_open=directory.is_recorded(label))
+
+    def mend(self, until: float) -> set[str]:
+        """Recover the recordings that were noted, and update their catalog rows.
+
+        Args:
+            until: When this should end, by `time.monotonic`; what would take longer stays noted.
+
+        Returns:
+            Ids of the recordings.
+        """
+        mended, report = set(), self.report
+        for label in sorted([*report.noted]):  # other threads note more
+            if (
+                _open_bytes(self.directory, label)
+                > (until - time.monotonic()) * _RECOVERED_BYTES_PER_S
+            ):
+                continue
+            report.noted.discard(label)
+            report.unreadable.pop(label, None)
+            try:
+                described = self._mended(label)
+            except DiskFullError:
+                raise
+            except StoreError as error:
+                if self.directory.has(label):
+                    report.unreadable[label] = str(error)
+                continue
+            if described is not None:
+                mended.add(described.entry.id)
+        return mended
+
+    def _one_of(
+        self, copies: list[RecordingSummary], known: Mapping[str, RecordingSummary]
+    ) -> RecordingSummary:
+        """Choose one of several directories with the same recording, and put it in the catalog.
+
+        The most complete one; of equals the one in the catalog, then the one with the older
+        journal.
+        """
+        whole = ["complete", "open", "recovered", "unfinished", "unproven", "damaged"]
+
+        def rank(one: RecordingSummary) -> tuple[int, int, bool, int, str]:
+            place = whole.index(one.status) if one.status in whole else 0
+            was_known = one.label in known and known[one.label].id == one.id
+            try:
+                path = self.directory.recording(one.label) / journal.JOURNAL
+                written = files.status(path).st_ctime_ns
+            except OSError:
+                written = time.time_ns()
+            return -one.messages, place, not was_known, written, one.label
+
+        chosen, *others = sorted(copies, key=rank)
+        for other in others:
+            self.report.copies[other.label] = chosen.label
+        # The row may be that of the copy.
+        described = describe_now(self.directory, self.catalog, chosen.label)
+        self.catalog.keep(described)
+        return described.summary
 
 
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
@@ -185,98 +354,6 @@ def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Sn
     """
     hashes = {summary.topics for summary in summaries}
     return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
-
-
-def _find(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    looks: Mapping[str, str],
-    known: Mapping[str, RecordingSummary],
-    report: RepairReport,
-    *,
-    mends: bool = False,
-) -> dict[str, list[RecordingSummary]]:
-    """Summaries of recordings by id.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        looks: The look of each directory, by label.
-        known: Summaries in the catalog, by label.
-        report: Collects problems and repairs.
-        mends: Repair what a crash has left; otherwise it is noted.
-    """
-    found: dict[str, list[RecordingSummary]] = {}
-    unchanged: list[RecordingSummary] = []
-    for label, look in looks.items():
-        summary = known.get(label)
-        if summary is None or summary.look != look or summary.status in UNFINISHED:
-            try:
-                before = summary
-                summary = _look_again(directory, catalog, label, summary, report, mends=mends)
-            except DiskFullError:
-                raise
-            except StoreError as error:
-                if directory.has(label):  # another process may have removed or renamed it
-                    report.unreadable[label] = str(error)
-                continue
-            if summary is not None and before is not None and summary.look != before.look:
-                unchanged.append(summary)
-        if summary is not None:
-            found.setdefault(summary.id, []).append(summary)
-    if mends or catalog.is_in_memory:
-        catalog.put_looks(unchanged)
-    return found
-
-
-def _look_again(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    label: str,
-    summary: RecordingSummary | None,
-    report: RepairReport,
-    *,
-    mends: bool,
-) -> RecordingSummary | None:
-    """The summary of a recording as its files are now; None if it is gone."""
-    if summary is not None:
-        listing = directory.listing(label)
-        row = catalog.recording(summary.id)
-        if row is not None and _is_current(directory, row[1], row[0], listing):
-            return summary._replace(look=listing.look)
-    described = (_mended if mends else _refresh)(directory, catalog, label, report)
-    return described.summary if described is not None else None
-
-
-def current_entry(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    summary: RecordingSummary,
-    report: RepairReport,
-) -> tuple[RecordingEntry | None, bool]:
-    """The entry of a recording, compared with its files.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        summary: Its summary at the opening of the store.
-        report: Collects problems and repairs.
-
-    Returns:
-        The entry, None if the recording is gone; and whether the files were read again.
-
-    Raises:
-        StoreError: Its files cannot be read.
-    """
-    row = catalog.recording(summary.id)
-    if row is not None and row[1].label == summary.label:
-        listing = directory.listing(summary.label)
-        if _is_current(directory, row[1], row[0], listing):
-            return row[1], False
-    if not directory.has(summary.label):
-        return None, True
-    described = _refresh(directory, catalog, summary.label, report)
-    return (described.entry if described is not None else None), True
 
 
 def _is_current(
@@ -291,95 +368,12 @@ def _is_current(
     return True
 
 
-def _refresh(
-    directory: StoreDirectory, catalog: Catalog, label: str, report: RepairReport
-) -> Described | None:
-    """Read what is whole of a recording, keep it in memory, and note what to mend.
-
-    None if the recording is gone.
-    """
-    if _is_empty(directory, label):
-        return None
-    is_open = directory.is_recorded(label)
-    if not (is_open or catalog.is_in_memory):
-        report.noted.add(label)
-    return _describe(directory, catalog, label, is_open=is_open)
-
-
 def _is_empty(directory: StoreDirectory, label: str) -> bool:
     listing = directory.listing(label)
     is_empty = not (listing.journal or listing.sealed or listing.open)
     if is_empty and not _OURS.issuperset(listing.others):
         raise StoreError("it has neither a journal nor a segment, but other files")
     return is_empty
-
-
-def _describe(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool
-) -> Described:
-    described = describe_now(directory, catalog, label, is_open=is_open)
-    catalog.keep(described)
-    return described
-
-
-def _mended(
-    directory: StoreDirectory, catalog: Catalog, label: str, report: RepairReport
-) -> Described | None:
-    """Recover a recording after a crash, and update its catalog row; None if it is gone."""
-    if catalog.is_in_memory:
-        return _refresh(directory, catalog, label, report)
-    is_empty = _is_empty(directory, label)
-    try:
-        with directory.writing(label):
-            is_new = is_empty and directory.is_beginning(label)
-            now = "" if is_new else recover(directory, label, report)
-            if not now:
-                return None
-            described = describe_now(directory, catalog, now)
-            catalog.put(described)
-            return described
-    except HeldError:
-        if not directory.id_of(label):
-            return None  # a process is about to begin it
-    except TopicError:
-        return None
-    return _describe(directory, catalog, label, is_open=directory.is_recorded(label))
-
-
-def mend(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    report: RepairReport,
-    until: float,
-) -> set[str]:
-    """Recover the recordings that were noted, and update their catalog rows.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        report: Has what was noted; what would take too long stays.
-        until: When this should end, by `time.monotonic`.
-
-    Returns:
-        Ids of the recordings.
-    """
-    mended = set()
-    for label in sorted([*report.noted]):  # other threads note more
-        if _open_bytes(directory, label) > (until - time.monotonic()) * _RECOVERED_BYTES_PER_S:
-            continue
-        report.noted.discard(label)
-        report.unreadable.pop(label, None)
-        try:
-            described = _mended(directory, catalog, label, report)
-        except DiskFullError:
-            raise
-        except StoreError as error:
-            if directory.has(label):
-                report.unreadable[label] = str(error)
-            continue
-        if described is not None:
-            mended.add(described.entry.id)
-    return mended
 
 
 def _open_bytes(directory: StoreDirectory, label: str) -> int:
@@ -389,39 +383,6 @@ def _open_bytes(directory: StoreDirectory, label: str) -> int:
         with suppress(OSError):
             found += files.status(path / name).st_size
     return found
-
-
-def _one_of(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    copies: list[RecordingSummary],
-    known: Mapping[str, RecordingSummary],
-    report: RepairReport,
-) -> RecordingSummary:
-    """Choose one of several directories with the same recording, and put it in the catalog.
-
-    The most complete one; of equals the one in the catalog, then the one with the older
-    journal.
-    """
-    whole = ["complete", "open", "recovered", "unfinished", "unproven", "damaged"]
-
-    def rank(one: RecordingSummary) -> tuple[int, int, bool, int, str]:
-        place = whole.index(one.status) if one.status in whole else 0
-        was_known = one.label in known and known[one.label].id == one.id
-        try:
-            path = directory.recording(one.label) / journal.JOURNAL
-            written = files.status(path).st_ctime_ns
-        except OSError:
-            written = time.time_ns()
-        return -one.messages, place, not was_known, written, one.label
-
-    chosen, *others = sorted(copies, key=rank)
-    for other in others:
-        report.copies[other.label] = chosen.label
-    # The row may be that of the copy.
-    described = describe_now(directory, catalog, chosen.label)
-    catalog.keep(described)
-    return described.summary
 
 
 def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:

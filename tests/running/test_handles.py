@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog import session as session_module
 from hybridlog.live import LiveOptions
+from hybridlog.maintenance.opening import StoreFiles
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -41,7 +41,7 @@ def test_a_recording_that_comes_while_another_thread_looks_is_seen(
                     may_end.wait(30)
                 return found
 
-            calls.change(session_module, "look_at_all", slow)
+            calls.change(StoreFiles, "look_at_all", slow)
             first = threading.Thread(target=lambda: store.topic("said").count(), name="slow")
             first.start()
             assert has_looked.wait(30)
