@@ -253,10 +253,6 @@ class Session:
     def database_about(self, purpose: str, entries: Sequence[RecordingEntry]) -> Database:
         """The index of some recordings; the rest of the store need not be in it.
 
-        Args:
-            purpose: The activity, for messages.
-            entries: The recordings.
-
         Raises:
             DatabaseError: it is unavailable; has the purpose and the reason.
         """
@@ -955,10 +951,6 @@ class Session:
     def resolve_in(self, names: Sequence[str], recordings: Sequence[str]) -> list[str]:
         """The topics of some recordings that patterns match.
 
-        Args:
-            names: The patterns.
-            recordings: Ids.
-
         Raises:
             TopicError: as for `resolve`; also lists other recordings with such a topic.
         """
@@ -1297,9 +1289,6 @@ class Session:
         """See which recordings came, went, or got another name, and how some others are now.
 
         All else that was read stays, so this costs little in a store of thousands.
-
-        Args:
-            recordings: Ids of recordings that were changed.
         """
         with self._following:
             before = self._latest.snapshot

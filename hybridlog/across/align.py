@@ -53,11 +53,7 @@ class Base(Protocol):
         """No rows, with the columns of all of them."""
 
     def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
-        """Times of the rows of a recording, ns, and their columns, in order.
-
-        Args:
-            recording: Id of the recording.
-        """
+        """Times of the rows of a recording, ns, and their columns, in order."""
 
 
 class Aligned:
@@ -256,13 +252,7 @@ class Aligned:
 
 
 class TopicBase:
-    """The messages of a topic as rows.
-
-    Args:
-        session: The open store.
-        stream: The topic.
-        clock: The time of the rows.
-    """
+    """The messages of a topic as rows."""
 
     def __init__(self, session: Session, stream: Stream, clock: Clock) -> None:
         self.stream = stream

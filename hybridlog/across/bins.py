@@ -78,11 +78,7 @@ class Bins:
         self._rest: _Block | None = None
 
     def enter(self, recording: str, _end: int | None) -> None:
-        """Go on with the messages of another recording.
-
-        Args:
-            recording: Its id.
-        """
+        """Go on with the messages of another recording."""
         self._recording = recording
         self._rest = None
         self._blocks = self._times() if self._how == _COUNT else self._reader.tables(recording)
@@ -170,10 +166,6 @@ def _numbers_of(session: Session, stream: Stream, how: Aggregate) -> tuple[str, 
 class _Rows:
     """The columns of some bins.
 
-    Args:
-        how: What is asked of their messages.
-        size: Number of bins.
-
     Attributes:
         messages: int64[size], messages in each bin.
     """
@@ -223,12 +215,7 @@ class _Rows:
 
 
 class _Column:
-    """The aggregate of one column by bin.
-
-    Args:
-        how: Which one.
-        size: Number of bins.
-    """
+    """The aggregate of one column by bin."""
 
     def __init__(self, how: Aggregate, size: int) -> None:
         self._how = how

@@ -60,13 +60,7 @@ class Stream:
 
 
 class TopicReader:
-    """Reads one topic with its times on a clock.
-
-    Args:
-        session: The open store.
-        stream: The topic.
-        clock: The clock.
-    """
+    """Reads one topic with its times on a clock."""
 
     def __init__(self, session: Session, stream: Stream, clock: Clock) -> None:
         question = stream.question
@@ -248,10 +242,6 @@ class OpenedStore(Protocol):
 
 class OpensAgain:
     """A data set that can be pickled: each process opens the store for itself.
-
-    Args:
-        session: The open store.
-        open_again: Opens it in another process.
 
     Attributes:
         counters: What reading has cost in this process.

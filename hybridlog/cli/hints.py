@@ -154,13 +154,7 @@ class Command(click.Command):
     def _meant(
         self, context: click.Context, word: str, argument: click.Argument | None = None
     ) -> str:
-        """The options that a word may belong to, since the store has such a thing, as a question.
-
-        Args:
-            context: Of the command.
-            word: As typed.
-            argument: What it was taken for.
-        """
+        """The options that a word may belong to, asked about: the store has such a thing."""
         taken = (argument.metavar or "").casefold() if argument is not None else ""
         options = {one.name: one for one in self.params if isinstance(one, click.Option)}
         found = [

@@ -32,12 +32,6 @@ _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: bool) -> None:
     """Print the definition and the fields of topics, those of each type once.
 
-    Args:
-        store: The store.
-        query: A query about the topics.
-        topics: As typed.
-        as_json: Print JSON.
-
     Raises:
         TopicError: No recording of the query has any of them.
     """

@@ -32,14 +32,7 @@ _MAX_ROWS = 10  # of the ledger; `losses` prints all
 
 
 class LiveSummary:
-    """The summary of a recorder that has stopped.
-
-    Args:
-        reports: Results of its recordings.
-        recorder: It has been stopped.
-        sources: Its sources.
-        options: Its options.
-    """
+    """The summary of a recorder that has stopped."""
 
     def __init__(
         self,

@@ -41,11 +41,7 @@ def progress_bar(label: str, total: int | None, *, quiet: bool) -> Iterator[Bar]
 
 
 class Stages:
-    """One bar for several parts that each count from zero.
-
-    Args:
-        bar: The bar that shows the sum.
-    """
+    """One bar for several parts that each count from zero."""
 
     def __init__(self, bar: Bar) -> None:
         self._bar = bar
@@ -64,12 +60,7 @@ class Stages:
 
 
 class LateBar:
-    """A bar that appears at the first progress, for work that is seldom needed.
-
-    Args:
-        label: Name of the work.
-        quiet: No bar.
-    """
+    """A bar that appears at the first progress, for work that is seldom needed."""
 
     def __init__(self, label: str, *, quiet: bool) -> None:
         self._label = label

@@ -190,9 +190,6 @@ def _shown(bar: Bar, before: int, name: str, read: int, messages: int) -> None:
 class LogRecorder:
     """Records logs with the options of the command.
 
-    Args:
-        choices: The parameters of the command.
-
     Attributes:
         results: What came of the logs.
 
@@ -371,11 +368,7 @@ def _no_index(choices: RecordChoices) -> TopicMatcher | None:
 
 
 class Results:
-    """Results of logs, for the table at the end and the exit code.
-
-    Args:
-        choices: The parameters of the command.
-    """
+    """Results of logs, for the table at the end and the exit code."""
 
     def __init__(self, choices: RecordChoices) -> None:
         self._choices = choices

@@ -87,10 +87,6 @@ def run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
     """Read statements, which end with a semicolon, and print their answers.
 
     Ctrl-C stops a query, or clears what was typed; Ctrl-D ends the prompt.
-
-    Args:
-        connection: Knows views and columns.
-        run: Runs a statement and prints its answer.
     """
     say(_HINT)
     completer = Completer(connection)
@@ -136,9 +132,6 @@ def _statement(completer: Completer, keys: _Keys) -> str | None:
 
 class Completer:
     """Candidates for the word before the cursor.
-
-    Args:
-        connection: Knows views and columns.
 
     Attributes:
         before: Lines of the statement before the current one.

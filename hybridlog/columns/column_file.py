@@ -188,11 +188,7 @@ class ColumnFile(ParquetFileReader):
 
 
 class OpenFiles:
-    """The files that were read last, and their decoded columns. Thread safe.
-
-    Args:
-        cache: Keeps the columns.
-    """
+    """The files that were read last, and their decoded columns. Thread safe."""
 
     def __init__(self, cache: Cache) -> None:
         self._cache = cache
@@ -246,11 +242,6 @@ class Place(NamedTuple):
 
 class ChunkFile(ColumnFile):
     """One file that the journal lists, of a topic. Thread safe.
-
-    Args:
-        folder: Folder that its name counts from.
-        listed: The file as the journal lists it.
-        cache: Keeps what was read.
 
     Attributes:
         listed: As above.

@@ -50,11 +50,7 @@ def fields_folder(topic: str) -> str:
 
 
 class FieldColumns:
-    """Turns messages of one type into rows of what is left of them.
-
-    Args:
-        channel: A channel of the type.
-    """
+    """Turns messages of one type into rows of what is left of them."""
 
     arrays: Sequence[Any] = ()
 
@@ -195,11 +191,7 @@ def rows_of(columns: pa.StructArray) -> Rows:
 
 
 def expired_messages(parts: Sequence[pa.StructArray]) -> ExpiredMessages:
-    """The remains of the messages of a chunk, in its order.
-
-    Args:
-        parts: Its rows in each file.
-    """
+    """The remains of the messages of a chunk, in its order."""
     batches = [_batch(part) for part in parts]
     offset = np.concatenate([batch.places[0] for batch in batches])
     order = np.argsort(offset, kind="stable")

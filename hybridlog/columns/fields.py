@@ -60,9 +60,6 @@ class FieldShape:
     def columns(self, records: Array) -> Array:
         """Fields as columns.
 
-        Args:
-            records: Messages, a struct each.
-
         Returns:
             A struct array; its fields are the columns.
         """

@@ -445,12 +445,7 @@ class Listing:
 
 
 def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ParquetFileReader]:
-    """The tables in some folders; those that cannot be read are left out.
-
-    Args:
-        root: The store.
-        prefixes: Beginnings of the names of the folders.
-    """
+    """The tables in some folders; those that cannot be read are left out."""
     with suppress(OSError):
         for folder in _folders(root):
             if folder.startswith(tuple(prefixes)):

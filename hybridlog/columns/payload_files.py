@@ -247,13 +247,7 @@ class RecordingPayloads:
     def expired_fields(
         self, topic: str, chunks: Collection[tuple[int, int]], opened: OpenFiles
     ) -> TopicTable:
-        """The fields of a topic in expired chunks as a table, in no order.
-
-        Args:
-            topic: Full name.
-            chunks: Segments and numbers of the chunks.
-            opened: Reads the columns.
-        """
+        """The fields of a topic in expired chunks as a table, in no order."""
         from hybridlog.columns.column_file import FIRST, LAST, TablePart
         from hybridlog.columns.field_files import newest
         from hybridlog.columns.layout import TopicCounts
@@ -317,11 +311,6 @@ def open_file(
     folder: Path, listed: PayloadFile, cache: Cache | None = None
 ) -> PayloadReader | FieldFile:
     """The reader of a file that the journal lists.
-
-    Args:
-        folder: Folder that its name counts from.
-        listed: The file.
-        cache: Keeps what was read.
 
     Raises:
         StoreError: It is missing, damaged, or another file.

@@ -82,13 +82,7 @@ class PayloadReader(ChunkFile):
 
 
 class ArrayTable(TopicTable):
-    """The files of a topic of a recording as a table, with arrays in full.
-
-    Args:
-        channel: A channel of the topic.
-        readers: Its files.
-        opened: Reads the columns.
-    """
+    """The files of a topic of a recording as a table, with arrays in full."""
 
     def __init__(
         self, channel: RecordedChannel, readers: Sequence[PayloadReader], opened: OpenFiles

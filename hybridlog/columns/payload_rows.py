@@ -77,9 +77,6 @@ class Piece:
 class TopicColumns:
     """Turns messages of one type into rows.
 
-    Args:
-        channel: A channel of the type.
-
     Raises:
         DefinitionError: The type has no arrays of numbers, or cannot be read.
     """

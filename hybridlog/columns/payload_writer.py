@@ -189,11 +189,7 @@ class TopicWriter:
 
 
 def encodings_of(table: pa.Table) -> dict[str, str]:
-    """The smallest encoding of each column of arrays, by its path in the file.
-
-    Args:
-        table: The first rows.
-    """
+    """The smallest encoding of each column of arrays, by its path in the file."""
     chosen = {f"{RECIPE}.rest": _PLAIN, f"{RECIPE}.padding": _PLAIN}
     rows = table.to_struct_array().combine_chunks()
     kinds = {leaf.path: leaf.kind for leaf in leaves(table.schema)}

@@ -79,10 +79,6 @@ def times(first: int | None, last: int | None) -> dict[str, Any]:
 def write_recordings_file(catalog: Catalog, present: set[str]) -> None:
     """Write the file, with all ended recordings of the catalog, unless the catalog lacks some.
 
-    Args:
-        catalog: The catalog.
-        present: Labels of recordings that it should have.
-
     Raises:
         OSError: It cannot be written.
         StoreError: The catalog cannot be read or locked.

@@ -71,12 +71,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Topic:
-    """Messages of one topic and definition.
-
-    Args:
-        recording: Id of the recording.
-        channel: One of its channels.
-    """
+    """Messages of one topic and definition."""
 
     def __init__(self, recording: str, channel: Channel) -> None:
         from hybridlog.columns.fields import FieldShape
@@ -196,10 +191,6 @@ class _File:
     def write(self, pieces: list[Piece], *, is_all: bool) -> None:
         """Write rows as row groups.
 
-        Args:
-            pieces: The rows.
-            is_all: True if no more rows follow.
-
         Raises:
             OSError: the rows cannot be written.
             UnfitError: the type of their fields differs from the file's.
@@ -295,13 +286,7 @@ class TableWriter:
         )
 
     def seal(self, segment: int, digest: str, messages: int) -> None:
-        """Register a sealed segment. Thread safe.
-
-        Args:
-            segment: Its number.
-            digest: Its digest in the catalog.
-            messages: Number of its messages.
-        """
+        """Register a sealed segment. Thread safe."""
         with self._lock:
             self._sealed[segment] = digest, messages
 
@@ -320,12 +305,7 @@ class TableWriter:
             self._cut_sealed()
 
     def cut(self, segment: int, digest: str) -> None:
-        """Register that a segment gets no more messages.
-
-        Args:
-            segment: Its number.
-            digest: Its digest in the catalog.
-        """
+        """Register that a segment gets no more messages."""
         if not self._has_ended:
             with self._harmless():
                 self._decode()

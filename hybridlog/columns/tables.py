@@ -210,12 +210,7 @@ class _Folders:
 
 
 class Tables:
-    """The tables of a store. Thread safe.
-
-    Args:
-        root: The store.
-        cache: Keeps decoded columns.
-    """
+    """The tables of a store. Thread safe."""
 
     def __init__(self, root: Path, cache: Cache | None = None) -> None:
         self._root = root
@@ -240,12 +235,7 @@ class Tables:
         self.opened.clear()
 
     def of(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
-        """The table of a topic in a recording; None without one that the catalog confirms.
-
-        Args:
-            recording: The recording's entry in the catalog.
-            topic: Full name.
-        """
+        """The table of a topic in a recording; None without one that the catalog confirms."""
         key = recording.id, topic
         with self._lock:
             generation = self._generation

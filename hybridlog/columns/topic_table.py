@@ -88,12 +88,6 @@ _SIDES: Final[tuple[Any, Any]] = ("left", "right")
 class TopicTable:
     """All messages of a topic in a recording.
 
-    Args:
-        topic: Full name.
-        parts: Its rows.
-        counts: Numbers of its rows.
-        opened: Reads the columns.
-
     Attributes:
         topic: Full name.
         rows: Number of messages.

@@ -90,10 +90,6 @@ class Contract:
     def parse(cls, text: str | bytes, name: str = "contract") -> Contract:
         """Parse a contract.
 
-        Args:
-            text: YAML.
-            name: What messages call it.
-
         Raises:
             UsageError: It breaks the schema; names line and cure.
         """
@@ -274,9 +270,6 @@ def contract_of(topics: Sequence[TopicCheck]) -> str:
 
     Topics whose messages come now and then, latched ones and those of few messages get no
     times. Marks are no part of it: another recording need not have any.
-
-    Args:
-        topics: The topics of the recording.
     """
     recording = topics[0].recording if topics else "no topic"
     lines = [f"# Made by `hybridlog check --make` from {json.dumps(recording)}.", "topics:"]

@@ -55,13 +55,7 @@ class Result:
 
 
 def judge(session: Session, contract: Contract, summary: RecordingSummary) -> list[Result]:
-    """The results of all rules on a recording, in the order of the contract.
-
-    Args:
-        session: The open store.
-        contract: The rules.
-        summary: The recording.
-    """
+    """The results of all rules on a recording, in the order of the contract."""
     return [*_Judge(session, contract, summary).results()]
 
 

@@ -24,10 +24,6 @@ class RecordedChunks:
     """The chunks of a recording, read segment by segment when a span needs them.
 
     Not thread safe.
-
-    Args:
-        session: The open store.
-        recording: The recording.
     """
 
     def __init__(self, session: Session, recording: RecordingEntry) -> None:
@@ -54,9 +50,6 @@ class RecordedChunks:
 
     def follow(self, recording: RecordingEntry) -> bool:
         """See what was flushed since.
-
-        Args:
-            recording: Its entry as it is now.
 
         Returns:
             False if what was read before does not hold any more.

@@ -163,10 +163,6 @@ _SAMPLED: Final = 16  # chunks that are read for one topic
 def sampled_period(chunks: RecordedChunks, parts: Parts) -> float:
     """The usual time from one message of a topic to the next, ns, in some of its chunks.
 
-    Args:
-        chunks: The chunks of the recording.
-        parts: Those of the topic.
-
     Returns:
         0 if there is only one message, or none.
     """

@@ -60,11 +60,7 @@ class _Block(NamedTuple):
 
 
 class DensityCache:
-    """Counts messages by pixel for many clients. Thread safe.
-
-    Args:
-        session: The open store.
-    """
+    """Counts messages by pixel for many clients. Thread safe."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

@@ -30,12 +30,7 @@ def shown(text: object, most: int = _MAX_TEXT) -> str:
 
 
 def recordings_html(title: str, recordings: Sequence[RecordingSummary]) -> str:
-    """A table of recordings, the latest of them.
-
-    Args:
-        title: What they are.
-        recordings: Oldest first.
-    """
+    """A table of recordings, the latest of them."""
     columns = ("recording", "start", "duration", "topics", "messages", "tags")
     rows = (_recording_row(one) for one in recordings[-MAX_ROWS:])
     more = len(recordings) - MAX_ROWS

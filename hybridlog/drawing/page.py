@@ -25,12 +25,7 @@ _VENDOR: Final = Path(__file__).parents[1] / "view" / "static" / "vendor"
 
 
 def page(found: Sequence[Line], title: str) -> bytes:
-    """An HTML page with a chart for each topic.
-
-    Args:
-        found: The lines, by topic.
-        title: Heading of the page.
-    """
+    """An HTML page with a chart for each topic."""
     own = (_OWN / "page.js").read_text("utf-8")
     # A block has names of its own.
     script = (_VENDOR / "uPlot.esm.js").read_text("utf-8") + f"{{\n{own}}}\n"

@@ -31,11 +31,7 @@ _ROWS = 4096
 
 
 class JsonlWriter(FileWriter):
-    """Writes JSON lines.
-
-    Args:
-        target: Path or binary stream.
-    """
+    """Writes JSON lines."""
 
     end = "\n"
     """What follows a line."""
@@ -75,11 +71,7 @@ class JsonlWriter(FileWriter):
 
 
 class JsonWriter(JsonlWriter):
-    """Writes the same objects as one list, a line each.
-
-    Args:
-        target: Path or binary stream.
-    """
+    """Writes the same objects as one list, a line each."""
 
     end = ""
 

@@ -47,9 +47,6 @@ _BT601: Final = 6
 class Mp4Writer(FileWriter):
     """Writes a video.
 
-    Args:
-        target: Path of the file.
-
     Raises:
         UsageError: The target is a stream, or cannot be written.
         MissingDependencyError: PyAV is not installed.

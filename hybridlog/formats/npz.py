@@ -51,12 +51,7 @@ _OPEN_FILES = 2_000
 
 
 class NpzWriter(FileWriter):
-    """Writes one .npz file.
-
-    Args:
-        target: Path or binary stream.
-        schema: The columns, when they are known before.
-    """
+    """Writes one .npz file."""
 
     def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
         super().__init__()

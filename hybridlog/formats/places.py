@@ -23,12 +23,7 @@ _FIX = ("latitude", "longitude", "altitude")
 
 
 class _RowWriter(FileWriter):
-    """Writes a line of text for each row.
-
-    Args:
-        target: Path or binary stream.
-        schema: The columns, if they are known before.
-    """
+    """Writes a line of text for each row."""
 
     def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
         super().__init__()

@@ -39,9 +39,6 @@ _NO_WORD: Final = re.compile(r"\W", re.ASCII)
 class PlyWriter(DirectoryWriter):
     """Writes a directory with a PLY file a message.
 
-    Args:
-        target: The directory.
-
     Raises:
         UsageError: The target is a stream, not empty, or cannot be written.
     """

@@ -241,12 +241,7 @@ class CsvWriter(TableFileWriter):
 
 
 class _CsvFile:
-    """Rows as text, long ones cell by cell and in pieces.
-
-    Args:
-        sink: The output.
-        schema: The columns.
-    """
+    """Rows as text, long ones cell by cell and in pieces."""
 
     def __init__(self, sink: Sink, schema: pa.Schema) -> None:
         self._sink = sink

@@ -188,9 +188,6 @@ def _finished(builder: TableBuilder, question: Question) -> pa.Table:
 class Decoder:
     """Makes blocks from the messages of a query.
 
-    Args:
-        planner: Planner of the question.
-
     Attributes:
         channels: The channels of the messages that are read now; at first examples of all.
 

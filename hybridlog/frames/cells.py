@@ -116,10 +116,6 @@ def _cut(text: str, most: int) -> str:
 def shown(table: pa.Table, most: int) -> dict[str, Any]:
     """A table for people, as plain values.
 
-    Args:
-        table: Rows of an answer.
-        most: Greatest number of columns.
-
     Returns:
         `columns`, pairs of the name and whether it is a number; `columns_left_out`, their
         number; `rows`, texts; `times`, the log times that each row may be of, ns since 1970

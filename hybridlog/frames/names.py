@@ -106,12 +106,7 @@ def summary_of(path: str) -> tuple[str, str] | None:
 
 
 def is_summary(path: str, known: Mapping[str, str]) -> bool:
-    """True if a path is a summary of an array or of bytes, and no field.
-
-    Args:
-        path: Dotted path.
-        known: Types of all fields by path.
-    """
+    """True if a path is a summary of an array or of bytes, and no field."""
     found = summary_of(path)
     if found is None or path in known:
         return False

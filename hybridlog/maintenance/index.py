@@ -340,9 +340,6 @@ class StoreIndex:
         """Remove documents of no recording, and surplus documents of recordings.
 
         Each collection is read once.
-
-        Args:
-            entries: All recordings.
         """
         state = self._state
         known = {entry.key: entry for entry in entries}

@@ -41,13 +41,7 @@ def key_of(topic: str, path: str) -> str:
 
 
 def within_bounds(session: Session, question: Question, found: Ranges) -> Ranges:
-    """The recordings of a question that may have matching messages.
-
-    Args:
-        session: The open store.
-        question: The question, with a predicate.
-        found: The recordings.
-    """
+    """The recordings of a question that may have matching messages."""
     assert question.predicate is not None
     root = question.predicate.root
     fields = _bounded(root)
@@ -88,12 +82,7 @@ def _paths(target: Field) -> list[str]:
 
 
 class BoundsFinder:
-    """Finds bounds in columns that are read for an answer.
-
-    Args:
-        catalog: Keeps them.
-        predicate: The question's.
-    """
+    """Finds bounds in columns that are read for an answer."""
 
     def __init__(self, catalog: Catalog, predicate: Predicate) -> None:
         self._catalog = catalog
@@ -122,12 +111,7 @@ class BoundsFinder:
 
 
 class Found:
-    """Bounds of some parts.
-
-    Args:
-        finder: Takes them.
-        fields: The fields.
-    """
+    """Bounds of some parts."""
 
     def __init__(self, finder: BoundsFinder, fields: Sequence[Field]) -> None:
         self._finder = finder

@@ -55,12 +55,7 @@ Query = tuple[str, Filter]
 
 
 class IndexReader:
-    """Asks MongoDB about parts of a question.
-
-    Args:
-        session: The open store.
-        counters: Count the documents that are read.
-    """
+    """Asks MongoDB about parts of a question."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session

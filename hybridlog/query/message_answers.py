@@ -128,9 +128,6 @@ class MessageAnswers(Steps):
         They are those that a subscriber receives which joins at that time, and the frames of
         video topics from the last key frame on. Their log time is the beginning of the range.
         Take them before `batches`, and with separate counters.
-
-        Args:
-            original_times: They keep their own log time.
         """
         from hybridlog.query.answers.latched import in_force
 

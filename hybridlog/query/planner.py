@@ -62,13 +62,7 @@ _FALLBACK_ERRORS = (ResourceError, SegmentError, StoreError, UndecidedError)
 
 
 class Planner:
-    """Answers one question.
-
-    Args:
-        session: The open store.
-        question: The question.
-        counters: Count what the answer costs.
-    """
+    """Answers one question."""
 
     def __init__(self, session: Session, question: Question, counters: Counters) -> None:
         self.session = session

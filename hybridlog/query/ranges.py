@@ -99,12 +99,7 @@ class Ranges(Sequence[Resolved]):
 
 
 class RangeResolver:
-    """Turns relative and absolute times into nanoseconds, one recording at a time.
-
-    Args:
-        session: The open store.
-        question: The question.
-    """
+    """Turns relative and absolute times into nanoseconds, one recording at a time."""
 
     def __init__(self, session: Session, question: Question) -> None:
         self._session = session

@@ -118,11 +118,7 @@ def _nulls(kind: Any, rows: int) -> Any:
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:
-    """The columns for messages of one type.
-
-    Args:
-        kind: Struct type of the messages.
-    """
+    """The columns for messages of one type."""
     return list(_columns(kind, (), _RESERVED))
 
 
@@ -210,12 +206,7 @@ def whole_type(kind: Any) -> Any:
 
 
 def lacks(have: Any, want: Any) -> bool:
-    """True if a table holds a summary where a view has the array.
-
-    Args:
-        have: Type in the table.
-        want: Type of the field.
-    """
+    """True if a table holds a summary where a view has the array."""
     if is_summary(have) and not _types.is_struct(want):
         return True
     if is_list(have) and is_list(want):

@@ -59,11 +59,7 @@ _T = TypeVar("_T")
 
 
 class SqlEngine:
-    """Runs SQL on an open store. Thread safe.
-
-    Args:
-        session: The open store.
-    """
+    """Runs SQL on an open store. Thread safe."""
 
     def __init__(self, session: Session) -> None:
         begins_anew(self, session)
@@ -107,12 +103,7 @@ class SqlEngine:
             return known
 
     def tree(self, cursor: Any, text: str) -> str:
-        """The syntax tree of a query as JSON; those of the last queries are kept.
-
-        Args:
-            cursor: A connection of DuckDB.
-            text: The query.
-        """
+        """The syntax tree of a query as JSON; those of the last queries are kept."""
         with self._lock:
             found = self._trees.get(text)
             if found is None:
@@ -194,12 +185,7 @@ class SqlConnection:
         self.completeness(topics, content.having(topics)).check()
 
     def completeness(self, topics: Collection[str], recordings: Collection[str]) -> Completeness:
-        """Completeness of the answer of a query.
-
-        Args:
-            topics: Topics that it reads.
-            recordings: Ids of the recordings that it reads.
-        """
+        """Completeness of the answer of a query."""
         from hybridlog.query.answers.lost import completeness_of
 
         asked = replace(self.scope, topics=tuple(topics), recordings=tuple(recordings))

@@ -33,9 +33,6 @@ _LISTING: Final = frozenset(
 class ViewNames:
     """The names of the views of some topics. DuckDB ignores case, and so do these.
 
-    Args:
-        topics: Full names.
-
     Attributes:
         views: Name of the view of each topic, by topic.
     """

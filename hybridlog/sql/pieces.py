@@ -93,12 +93,7 @@ class Rows(NamedTuple):
 
 
 class DamagedTableError(StoreError):
-    """A table turned out to be damaged while it was read.
-
-    Args:
-        source: The topic and its recording.
-        problem: The damage.
-    """
+    """A table turned out to be damaged while it was read."""
 
     def __init__(self, source: TopicOfRecording, problem: str) -> None:
         super().__init__(f"{problem} It is made again when you ask again.")
@@ -128,13 +123,7 @@ class RowSource(Protocol):
 
 
 class TopicOfRecording:
-    """A topic of one recording.
-
-    Args:
-        session: The open store.
-        entry: The recording.
-        topic: Full name.
-    """
+    """A topic of one recording."""
 
     def __init__(self, session: Session, entry: RecordingEntry, topic: str) -> None:
         self.session = session

@@ -21,10 +21,6 @@ class TopicDataset(ds.Dataset):  # type: ignore[misc] # pyarrow has no types
     """A topic as DuckDB reads it: columns and filters reach `TopicView.rows`.
 
     DuckDB relies on the source for the filters that it hands over.
-
-    Args:
-        view: The topic.
-        reading: Returns what the current execution reads.
     """
 
     def __init__(self, view: TopicView, reading: Callable[[], Reading]) -> None:
@@ -70,12 +66,7 @@ class _Scanner:
 
 
 def source_of(view: TopicView, reading: Callable[[], Reading]) -> TopicDataset:
-    """A topic for `register`.
-
-    Args:
-        view: The topic.
-        reading: Returns what the current execution reads.
-    """
+    """A topic for `register`."""
     try:
         base = import_module("duckdb._sources.pyarrow").PyArrowDatasetSource
         translated = import_module("duckdb._sources.to_arrow").to_arrow

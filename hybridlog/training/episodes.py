@@ -157,11 +157,6 @@ def pictures(
     """The picture of each frame of an episode, and how many frames in turn show it.
 
     None stands for a picture that cannot be shown, or has no payload.
-
-    Args:
-        session: The open store.
-        episode: The episode.
-        topic: The topic of the pictures.
     """
     current: Message | None = None
     place, frames = 0, episode.times.tolist()

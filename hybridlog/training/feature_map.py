@@ -172,10 +172,6 @@ def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
     Joint states and odometry become states, commands become actions, images of all encodings
     and videos become images.
 
-    Args:
-        query: The question.
-        without: Topics that are left out.
-
     Raises:
         UsageError: There are no such topics.
     """

@@ -113,13 +113,6 @@ def write_episode(
 ) -> WrittenEpisode:
     """Write an episode; its description is written last.
 
-    Args:
-        session: The open store.
-        episode: The episode.
-        features: The features.
-        options: Rate, codec, task.
-        place: The directory, which is made anew.
-
     Raises:
         UsageError: A picture is missing, or of another size than those before.
         PayloadError: No picture can be shown.
@@ -190,10 +183,6 @@ def _task(session: Session, episode: Episode, options: LerobotOptions) -> str:
 
 class _Video:
     """Encodes the pictures of an episode.
-
-    Args:
-        path: The file.
-        options: Rate and codec.
 
     Attributes:
         counts: int64[3, 256], how often each value occurs in a colour, of some pictures.

@@ -56,9 +56,6 @@ REFRESH_SHARE: Final = 0.1
 class Context:
     """The store that is shown.
 
-    Args:
-        store: An open store. It is only read.
-
     Attributes:
         store: That store.
         turns: Held by each answer that is worked out.

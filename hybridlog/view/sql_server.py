@@ -28,11 +28,7 @@ class _GivenUp(threading.Event):
 
 
 def serve(handle: int) -> None:
-    """Answer until the other side has gone.
-
-    Args:
-        handle: The descriptor that connections come through.
-    """
+    """Answer until the other side has gone."""
     with Connection(handle) as control, suppress(EOFError):
         path, mongo, read_only = control.recv()
         context = _opened(path, mongo, read_only=read_only)

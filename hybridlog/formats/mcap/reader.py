@@ -81,9 +81,6 @@ class McapSource(Source):
     there on. Messages on a channel with an undefined schema are read without a schema, and
     `damage` notes it.
 
-    Args:
-        path: The file.
-
     Raises:
         SourceError: It cannot be opened, or is not an MCAP file.
     """

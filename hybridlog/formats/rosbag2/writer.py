@@ -249,12 +249,7 @@ class Rosbag2Writer(FileWriter):
 
 
 class _SqliteFile:
-    """A file of a bag in SQLite; times of publication and attachments have no place in it.
-
-    Args:
-        path: The file.
-        bag: The bag, which knows the topics.
-    """
+    """A file of a bag in SQLite; times of publication and attachments have no place in it."""
 
     def __init__(self, path: Path, bag: Rosbag2Writer) -> None:
         self._path = path

@@ -154,13 +154,7 @@ def not_indexed(messages: int) -> str:
 
 
 def left_out(question: Question, counters: Counters, expired: str) -> Iterator[str]:
-    """Messages that an answer could not read or has no payload of.
-
-    Args:
-        question: The question.
-        counters: Of the answer.
-        expired: Why payloads have expired.
-    """
+    """Messages that an answer could not read or has no payload of."""
     from hybridlog.schema.states import State, without_fields, without_payload
 
     if counters.unreadable > counters.without_arrays:
@@ -246,12 +240,7 @@ def line_of(loss: Mapping[str, Any]) -> str:
 
 
 def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
-    """The completeness of a recording in words: `complete`, or the number of missing messages.
-
-    Args:
-        entry: The recording.
-        losses: Rows of its ledger.
-    """
+    """The completeness of a recording in words: `complete`, or the number of missing messages."""
     from hybridlog.schema.states import expired_messages, expired_state, without_payload
 
     found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])

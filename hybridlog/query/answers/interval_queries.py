@@ -40,13 +40,7 @@ Rows: TypeAlias = "pa.StructArray | Sequence[Mapping[str, object]]"
 
 
 class IntervalQueries:
-    """Answers one question with intervals.
-
-    Args:
-        session: The open store.
-        question: The question.
-        counters: Count what the answer costs.
-    """
+    """Answers one question with intervals."""
 
     def __init__(self, session: Session, question: Question, counters: Counters) -> None:
         self._session = session

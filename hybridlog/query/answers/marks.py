@@ -70,13 +70,7 @@ def marks(session: Session, question: Question, counters: Counters) -> Iterator[
 
 
 def marks_in(session: Session, recordings: Collection[str], counters: Counters) -> Iterator[Mark]:
-    """All marks of some recordings, in order of log time.
-
-    Args:
-        session: The open store.
-        recordings: Ids.
-        counters: Count what the answer costs.
-    """
+    """All marks of some recordings, in order of log time."""
     topics = mark_topics(session, recordings)
     places = session.snapshot().having(topics)
     having = {session.snapshot().summaries[place].id for place in places.tolist()}

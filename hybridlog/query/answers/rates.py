@@ -53,11 +53,6 @@ class Stretch(NamedTuple):
 class Rates:
     """Answers about the times of messages.
 
-    Args:
-        session: The open store.
-        question: The question.
-        counters: Count what the answer costs.
-
     Raises:
         UsageError: the question has limit, every or reverse.
     """
@@ -185,11 +180,7 @@ class Rates:
 
 
 class _Times:
-    """Times that are iterated over more than once; few are kept, many are read again.
-
-    Args:
-        read: Reads them.
-    """
+    """Times that are iterated over more than once; few are kept, many are read again."""
 
     def __init__(self, read: Callable[[], Iterator[NDArray[np.int64]]]) -> None:
         self._read = read

@@ -153,11 +153,7 @@ class _Playing:
 
 
 class VideoPictures:
-    """Decodes frames of video topics. Those in a row are decoded once each.
-
-    Args:
-        session: The open store.
-    """
+    """Decodes frames of video topics. Those in a row are decoded once each."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

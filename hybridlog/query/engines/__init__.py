@@ -115,12 +115,7 @@ class Checking(Protocol):
 
 
 class Counting:
-    """An engine that only counts. The planner has a table of them.
-
-    Args:
-        session: The open store.
-        counters: What it reads is counted here.
-    """
+    """An engine that only counts. The planner has a table of them."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session

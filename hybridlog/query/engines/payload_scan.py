@@ -29,12 +29,7 @@ _BY_COLUMNS = {"ros1", "cdr"}
 
 
 class PayloadScan:
-    """Reads the chunks of the parts; needs only the segments.
-
-    Args:
-        session: The open store.
-        counters: Count what is read.
-    """
+    """Reads the chunks of the parts; needs only the segments."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session
@@ -119,12 +114,7 @@ class PayloadScan:
         return RowSelection({})
 
     def plan(self, parts: Sequence[Part], *, filtered: bool = True) -> ScanPlan:
-        """The plan for reading some parts.
-
-        Args:
-            parts: Parts of one question.
-            filtered: True for only the matching messages.
-        """
+        """The plan for reading some parts."""
         channels: list[RecordedChannel] = []
         filters: dict[int, MessageFilter] = {}
         of_recording: dict[str, tuple[Part, dict[int, int]]] = {}

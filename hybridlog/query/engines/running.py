@@ -43,12 +43,7 @@ class _Halves(NamedTuple):
 
 
 class RunningTables:
-    """Reads tables where segments are sealed, and messages where they are not.
-
-    Args:
-        session: The open store.
-        counters: Count what is read.
-    """
+    """Reads tables where segments are sealed, and messages where they are not."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session

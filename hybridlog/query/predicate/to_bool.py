@@ -90,12 +90,7 @@ def to_truth(
 
 
 def numbers_at(message: Message, path: str) -> list[float]:
-    """The numbers at a path such as `pose.position.x` or `ranges.min`.
-
-    Args:
-        message: A message or an index document.
-        path: Names and indexes separated by dots.
-    """
+    """The numbers at a path such as `pose.position.x` or `ranges.min`."""
     parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
     found = _Reader(FieldTypes.of(None), summarised=False).leaves(message, Field(parts))
     values = (v for leaf in found for v in (_flat(leaf) if isinstance(leaf, list) else [leaf]))

@@ -35,12 +35,7 @@ _OPERATORS = {"==": "$eq", "!=": "$ne", "<": "$lt", "<=": "$lte", ">": "$gt", ">
 
 
 def replaced(node: Node, answer: Callable[[Node], Node]) -> Node:
-    """The tree with another node for each of its largest parts that only documents answer.
-
-    Args:
-        node: The tree.
-        answer: Returns the node for such a part.
-    """
+    """The tree with another node for each of its largest parts that only documents answer."""
     if not needs_index(node):
         return node
     if _is_of_documents(node):

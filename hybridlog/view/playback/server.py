@@ -102,12 +102,7 @@ class _Client:
 
 
 class _Reading:
-    """Reads blocks of messages in a thread of their own, one ahead.
-
-    Args:
-        blocks: The blocks.
-        executor: Its only thread reads.
-    """
+    """Reads blocks of messages in a thread of their own, one ahead."""
 
     def __init__(self, blocks: Iterator[Block], executor: ThreadPoolExecutor) -> None:
         self._blocks = blocks
