@@ -275,7 +275,7 @@ def _recording(results: Results) -> list[str]:
         "does not compress.",
         "At 64 Hz a topic: seconds of processor time for a GB that was kept, servers included; "
         "peak memory in MB, servers included; bytes on the disk over bytes kept of 640 kB, half "
-        "of which cannot be compressed.",
+        "of which cannot be compressed. hybridlog compresses only what it has time for.",
         _by_backend(
             [
                 *("system", *(f"s/GB, {text}" for text in sizes)),

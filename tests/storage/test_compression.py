@@ -7,6 +7,7 @@ import threading
 import tracemalloc
 
 import lz4.frame
+import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
@@ -64,6 +65,15 @@ def test_noise_is_never_given_to_the_codec_as_a_whole(calls: Calls) -> None:
     sizes.clear()
     compressor.compress(TEXT)
     assert max(sizes) == len(TEXT)
+
+
+def test_a_noisy_picture_is_compressed_at_the_level_that_shrinks_it() -> None:
+    noise = np.random.default_rng(1).integers(0, 4, (4, 480, 640))
+    picture = (2 * np.arange(640) + np.arange(480)[:, None] + noise).astype(np.uint8).tobytes()
+    assert Compressor(level=1).compress(picture) == ("", picture)
+    compression, out = Compressor(level=3).compress(picture)
+    assert (compression, len(out) < 0.7 * len(picture)) == ("zstd", True)
+    assert Compressor(level=3).compress(picture, hurried=True) == ("", picture)
 
 
 def test_what_gains_less_than_the_minimum_is_kept() -> None:
