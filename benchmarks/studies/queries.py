@@ -44,7 +44,7 @@ class Settings(NamedTuple):
 
 SETTINGS: dict[Scale, Settings] = {
     "full": Settings(4, 10.0, 5),
-    "quick": Settings(2, 5.0, 2),
+    "quick": Settings(2, 5.0, 3),
     "tiny": Settings(1, 1.0, 1),
 }
 
