@@ -558,6 +558,8 @@ class Store:
         Raises:
             TopicError: A name matches no topic, or several; the message lists candidates.
         """
+        if not all(isinstance(name, str) for name in names):
+            raise UsageError("Topics are names: topic('scan', 'odom').")
         return Query(self.session, Question(*self.session.resolve(names)))
 
     def all_topics(self) -> Query:
@@ -701,13 +703,15 @@ class Store:
 
         Raises:
             TopicError: no such topic or field, or a topic does not have the clock.
-            UsageError: an unknown way or clock, a base of several topics, or a query with
-                limit, every or reverse.
+            UsageError: an unknown way or clock, a base of several topics, a query of another
+                store, or one with limit, every or reverse.
             TimeError: the tolerance is no duration.
         """
         from hybridlog.across.align import side_by_side
 
         beside = [others] if isinstance(others, str | Query) else others
+        if not isinstance(fields or {}, Mapping):
+            raise UsageError("Fields are given by topic: fields={'scan': ['ranges.min']}.")
         chosen = dict(fields or {})
         queries = [self._query_of(one, chosen) for one in (base, *beside)]
         if chosen:
@@ -891,6 +895,8 @@ class Store:
     def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
         """A query about a topic, with its share of the fields, which is taken out of them."""
         query = self.topic(name) if isinstance(name, str) else name
+        if query.session is not self.session:
+            raise UsageError(f"A query of {query.directory} cannot be joined with another store's.")
         for key in [*fields]:
             if key == name or self.topic(key).topics == query.topics:
                 query = query.fields(*fields.pop(key))

@@ -267,5 +267,14 @@ def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:
         paths = channel.codec.paths()
         if not paths:
             return None
-        types.update({path.path: path.type for path in paths})
+        for path in paths:
+            types[path.path] = _either(types.get(path.path), path.type)
     return types or None
+
+
+def _either(one: str | None, other: str) -> str:
+    """The type of a field in two definitions: arrays of two lengths are of any; else the later."""
+    base, _, length = other.partition("[")
+    if length and one is not None and one != other and one.startswith(f"{base}["):
+        return f"{base}[]"
+    return other

@@ -12,6 +12,7 @@ from hybridlog.query.times import (
     is_relative,
     parse_range,
     parse_time,
+    units_of,
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError, UsageError
@@ -265,6 +266,7 @@ class RangeResolver:
             parse_range(begin, stop, start=start, end=end)
         raise TimeError(
             f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.{self._others()}"
+            f"{units_of(begin, stop)}"
         )
 
     def _others(self) -> str:

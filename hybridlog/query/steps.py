@@ -148,11 +148,14 @@ class Steps:
             checked = self.session.predicate(predicate, self.topics, self.question.recordings)
         else:
             from hybridlog.query.predicate.from_mongo import from_mongo
+            from hybridlog.query.predicate.types import check_names
 
             checked = from_mongo(predicate)
+            check_names(checked, self.session.field_types(self.topics, self.question.recordings))
         if within is not None:
             raise UsageError(
-                "A time within which is for other topics: '/odom: twist.twist.linear.x > 0.5'."
+                "`within` is for conditions on other topics: where('/odom: twist.twist.linear.x > "
+                "0.5', within='0.1s'). A second predicate is a second where()."
             )
         if self.question.predicate is not None:
             checked = self.question.predicate & checked
@@ -251,7 +254,7 @@ class Steps:
 
     def __getitem__(self, fields: str | tuple[str, ...]) -> Self:
         """`query["header.stamp", "ranges.min"]` is `query.fields("header.stamp", "ranges.min")`."""
-        return self.fields(*((fields,) if isinstance(fields, str) else fields))
+        return self.fields(*(fields if isinstance(fields, tuple) else (fields,)))
 
     @of_one_moment
     def tags(self, *keys: str) -> Self:

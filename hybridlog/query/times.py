@@ -63,6 +63,8 @@ ACCEPTED = (
 )
 """The forms `parse_time` accepts, for messages and help texts."""
 
+_LONGEST_BARE = 10**7 * 10**9  # 115 days, ns
+
 DURATIONS = "write a duration as 5s, 1m30s, 2h, 500ms, 250us, 100ns, or a number of seconds"
 """The forms `parse_duration` accepts."""
 
@@ -129,6 +131,14 @@ def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     return _checked(_from_datetime64(text), text)
 
 
+def units_of(*times: TimeLike | None) -> str:
+    """A sentence about the unit, if one of some times may have been meant in another; or none."""
+    for one in times:
+        if isinstance(one, Integral) and 0 < int(one) < _NANOSECONDS_FROM:
+            return f" A whole number is nanoseconds; {float(one)!r} is seconds."
+    return ""
+
+
 def is_relative(time: TimeLike | None) -> bool:
     """True if a time depends on the recording: `+5s`, `-10s`, `500ms`, `start`, `end`."""
     if not isinstance(time, str):
@@ -170,7 +180,8 @@ def parse_duration(text: DurationLike) -> int:
 
     Args:
         text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`, `2y` (730 days). Units are in
-            descending order, each number may have a fraction; one without unit is seconds.
+            descending order, each number may have a fraction; one without unit is seconds,
+            less than ten million.
 
     Raises:
         TimeError: not a duration, negative, finer than a nanosecond, or 2**63 or more.
@@ -189,6 +200,12 @@ def parse_duration(text: DurationLike) -> int:
         ns = _rounded(Decimal(repr(float(text))) * _SECOND)
     if not 0 <= ns < TIME_LIMIT:
         raise TimeError(f"{_shown(text)} is out of range for a duration: {DURATIONS}")
+    is_bare = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else isinstance(text, Real)
+    if is_bare and ns >= _LONGEST_BARE:
+        raise TimeError(
+            f"{_shown(text)} without a unit is that many seconds; write {text}s if they are meant, "
+            f"else {text}ns"
+        )
     return ns
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
@@ -213,6 +213,8 @@ class SqlConnection:
         Raises:
             UsageError: DuckDB refuses it.
         """
+        if isinstance(params, str) or not isinstance(() if params is None else params, Iterable):
+            raise UsageError("Parameters are a list, or a dictionary by name: sql(query, [0.5]).")
         with explained(self.memory):
             statements = list(self.cursor.extract_statements(text))
         if not statements:

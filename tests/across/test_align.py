@@ -358,6 +358,12 @@ def test_what_is_refused(logs: Logs) -> None:
         store.align("base", "left/pose", fields={"base": ["z"]})
     with pytest.raises(TimeError, match="not a duration"):
         store.align("base", "left/pose", tolerance="soon")
+    with pytest.raises(UsageError, match="given by topic"):
+        store.align("base", "left/pose", fields=["x"])  # type: ignore[arg-type]
+    with hl.open(store.directory.path) as other:
+        for call in (store.align, lambda *queries: store.sync(queries)):
+            with pytest.raises(UsageError, match="another store"):
+                call(store.topic("base"), other.topic("left/pose"))
     with pytest.raises(UsageError, match="step of 0"):
         store.topic("base").resample(0)
     with pytest.raises(UsageError, match="longer step"):

@@ -216,12 +216,18 @@ def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
 
 def test_what_is_refused(logs: Logs) -> None:
     base = logs.store.topic("base")
+    with pytest.raises(UsageError, match="Topics are names"):
+        logs.store.topic(["base"])  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="Fields are names"):
+        base[0]  # type: ignore[index]
     with pytest.raises(UsageError, match="time within which"):
         base.where("left/pose: x > 1")
-    with pytest.raises(UsageError, match="for other topics"):
+    with pytest.raises(UsageError, match="on other topics"):
         base.where("x > 1", within="1s")
-    with pytest.raises(UsageError, match="for other topics"):
+    with pytest.raises(UsageError, match="on other topics"):
         base.where({"x": 1}, within="1s")
+    with pytest.raises(WhereError, match="no field xx"):
+        base.where({"$or": [{"x": 1}, {"xx": {"$gt": 1}}]})
     with pytest.raises(WhereError, match="joined by `and`"):
         base.where("x > 1 or left/pose: x > 1", within="1s")
     with pytest.raises(WhereError, match="joined by `and`"):

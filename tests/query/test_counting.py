@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.query.intervals import Intervals
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_documents import key_bound
@@ -195,3 +195,14 @@ def test_statistics_of_arrays_of_which_some_have_only_a_summary(tmp_path: Path) 
             assert [(one.begin_ns - BASE) // 10**6 for one in found] == expected
         late = store.topic("/a").between(BASE + 3000 * 10**6, None).changes("r.n", pause=0)
         assert len(late) == 1  # compared with the message before the range
+
+
+def test_elements_of_an_array_that_has_two_lengths(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        for size in (9, 3):
+            kind = Schema("t/A", "ros1msg", f"float32[{size}] box\n".encode())
+            with store.start(f"of {size}") as recording:
+                recording.write(Channel("/a", "ros1", kind), np.ones(size, np.float32).tobytes())
+        assert store.topic("/a").where("box[7] > 0").count() == 1
+        with pytest.raises(WhereError, match="3 elements"):
+            store.topic("/a").in_recording("of 3").where("box[7] > 0")

@@ -234,6 +234,9 @@ def test_durations(text: object, ns: int) -> None:
         "s",
         "1s1s",
         "1000000d",
+        50_000_000,  # nanoseconds?
+        "50000000",
+        1e9,
         -1,
         True,
         float("nan"),

@@ -12,6 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.sql.engine import SqlAnswer
 from hybridlog.sql.pieces import TopicOfRecording
+from hybridlog_storage.errors import UsageError
 from tests.sql.conftest import LARGE, SCANS
 from tests.tables.logs import BASE, SECOND, Decoded, decoded
 
@@ -316,6 +317,9 @@ def test_parameters_and_several_statements(store: hl.Store) -> None:
     assert store.sql("select count(*) from large where i8 = ?", [5]).rows() == [(40,)]
     counted = store.sql("select count(*) from large where i8 = $n", {"n": 5})
     assert counted.rows() == [(40,)]
+    for params in (5, "5"):
+        with pytest.raises(UsageError, match="a list"):
+            store.sql("select count(*) from large where i8 = ?", params)  # type: ignore[arg-type]
     made = store.sql("create table few as select * from scan limit 7; select count(*) from few")
     assert made.rows() == [(7,)]
     # What a view of the user reads is not in the text of the next query.

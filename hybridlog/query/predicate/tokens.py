@@ -32,6 +32,11 @@ _HEX = re.compile(r"0[xX][0-9a-fA-F]+")
 _INTEGER = re.compile(r"[0-9]+")
 _FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _OPERATOR = re.compile(r"==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-]")
+_HINTS = {
+    "&": "; write and",
+    "|": "; write or",
+    ":": "; behind the name of another topic a space follows: /odom: x > 1",
+}
 _STRING = re.compile(
     r"""(?P<quote>["'])(?P<body>(?:\\.|(?!(?P=quote))[^\\])*)(?P=quote)""", re.DOTALL
 )
@@ -152,7 +157,8 @@ def _next(text: str, at: int) -> tuple[Token, int]:
         return _path(text, first)
     if operator := _OPERATOR.match(text, at):
         return Token("operator", operator[0], at), operator.end()
-    raise error_at(text, at, f"{char!r} has no meaning here")
+    hint = _HINTS.get(char, "")
+    raise error_at(text, at, f"{char!r} has no meaning here{hint}")
 
 
 def _string(text: str, at: int) -> tuple[Token, int]:

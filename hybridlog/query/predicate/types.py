@@ -32,6 +32,10 @@ STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 """Names of the statistics in the summary of an array."""
 _MAX_NAMES = 10
 _ANY_ELEMENT = re.compile(r"\[\*?\]")
+_FIXED = re.compile(r"\[([0-9]+)\]$")
+_BARE = re.compile(r"[0-9][0-9.]*(?![\w.])")
+_SECONDS, _NANOSECONDS = 10**8, 10**14
+"""Numbers between are taken for seconds since 1970, or for milliseconds."""
 _KINDS: dict[str, Kind] = {
     "bool": "bool",
     "boolean": "bool",
@@ -40,6 +44,14 @@ _KINDS: dict[str, Kind] = {
     **dict.fromkeys(TIMES, "time"),
     **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
+_COLUMNS = {
+    "log_time": "_meta.t",
+    "t": "_meta.t",
+    "publish_time": "_meta.pub",
+    "seq": "_meta.seq",
+    "topic": "_meta.topic",
+}
+"""Columns of tables that are no fields, and what predicates call them."""
 _META = {
     "_meta.inserted_at": "date",
     "_meta.t": "time",
@@ -152,25 +164,41 @@ def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) ->
         checker.check(condition)
 
 
+def check_names(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) -> None:
+    """Refuse a predicate with unknown fields, whatever they are compared with.
+
+    Raises:
+        WhereError: there is no such field.
+    """
+    checker = _Checker(predicate.text, FieldTypes.of(types))
+    for condition in predicate.conditions():
+        checker.check_name(condition.field)
+
+
 class _Checker:
     def __init__(self, text: str, types: FieldTypes) -> None:
         self._text = text
         self._types = types
 
     def check(self, node: Condition) -> None:
-        kind = self._kind(node.field)
+        kind = self.check_name(node.field)
         if not isinstance(node, Exists):
             self._check_leaf(node.field)
         match node:
             case Compare(value=value, position=position):
-                self._check_value(kind, value, position)
+                self._check_value(kind, node.field.names, value, position)
             case Member(values=values, position=position):
                 for value in values:
-                    self._check_value(kind, value, position)
+                    self._check_value(kind, node.field.names, value, position)
             case Match(position=position) if kind not in {"string", "other"}:
                 raise error_at(self._text, position, f"the field is a {kind}, not a string")
             case _:
                 pass
+
+    def check_name(self, target: Field) -> Kind:
+        """Refuse a field that does not exist; the kind of one that does."""
+        self._check_elements(target)
+        return self._kind(target)
 
     def _kind(self, target: Field) -> Kind:
         types = self._types
@@ -187,6 +215,14 @@ class _Checker:
             return "other"
         raise self._unknown(target, path)
 
+    def _check_elements(self, target: Field) -> None:
+        """Refuse an element that an array of fixed length does not have."""
+        for place, part in enumerate(target.parts):
+            before = ".".join(name for name in target.parts[:place] if isinstance(name, str))
+            size = _FIXED.search(self._types.types.get(before, ""))
+            if isinstance(part, int) and size and part >= int(size[1]):
+                raise self._fail(target, f"{before} has {size[1]} elements, numbered from 0")
+
     def _check_leaf(self, target: Field) -> None:
         """Refuse a comparison with a message, which has fields and no value of its own."""
         path = target.names
@@ -199,7 +235,7 @@ class _Checker:
             target, f"{path} is a message, not a value; ask for one of its fields: {names}"
         )
 
-    def _check_value(self, kind: Kind, value: Value, position: int) -> None:
+    def _check_value(self, kind: Kind, path: str, value: Value, position: int) -> None:
         if kind == "date":
             raise error_at(
                 self._text, position, "_meta.inserted_at has milliseconds only; ask for _meta.t"
@@ -212,7 +248,10 @@ class _Checker:
             given = "string"
         else:
             given = "number"
-        if given == kind or (given == "number" and kind == "time"):
+        if given == "number" and kind == "time":
+            self._check_time(value, self._types.base(path), position)
+            return
+        if given == kind:
             return
         hints = {
             "bool": "; write true or false",
@@ -225,10 +264,23 @@ class _Checker:
             f"the field is a {kind}, the value is a {given}{hints.get(kind, '')}",
         )
 
+    def _check_time(self, value: Value, kind: str, position: int) -> None:
+        """Refuse a number without a unit that is seconds since 1970 rather than nanoseconds."""
+        is_odd = kind != "duration" and _SECONDS <= value < _NANOSECONDS  # type: ignore[operator]
+        bare = _BARE.match(self._text, position)
+        if is_odd and bare:
+            raise error_at(
+                self._text,
+                position,
+                f'a number is nanoseconds here; write t"{bare[0]}" for seconds since 1970, or '
+                f't"{bare[0]}ns"',
+            )
+
     def _unknown(self, target: Field, path: str) -> WhereError:
         known = sorted(set(self._types.types) - ({} if path.startswith("_meta") else _META).keys())
         lowered = {name.lower(): name for name in known}
-        near = [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
+        near = [_COLUMNS[path]] if path in _COLUMNS else []
+        near += [name for name in known if name.rsplit(".", 1)[-1] == path.rsplit(".", 1)[-1]]
         near += [
             lowered[key]
             for key in difflib.get_close_matches(path.lower(), lowered, n=_MAX_NAMES, cutoff=0.5)

@@ -29,6 +29,7 @@ TYPES = {
     "b": "bool",
     "t": "time",
     "a": "float64[]",
+    "nine": "float32[9]",
     "flags": "bool[]",
     "names": "string[]",
     "o.y": "int32",
@@ -211,11 +212,26 @@ def test_limits() -> None:
         ("o in [1]", "o is a message"),
         ("_meta > 1", "_meta is a message.*_meta.t,"),
         ("m[0] ~ 'a'", "m is a message"),
+        ("log_time > 5", "did you mean _meta.t"),
+        ("nine[9] > 1", "nine has 9 elements"),
+        ("t > 1760000000", 't"1760000000" for seconds'),
+        ("1760000000.5 < t", 't"1760000000.5" for seconds'),
+        ("_meta.t between 1760000000000 and 1770000000000", "nanoseconds here"),
+        ("x > 1 & x < 2", "write and"),
+        ("o:x > 1", "a space follows"),
     ],
 )
 def test_types(where: str, message: str) -> None:
     with pytest.raises(WhereError, match=message):
         checked(where, TYPES)
+
+
+@pytest.mark.parametrize(
+    "where",
+    ["t > 0", "t < 50", 't > t"1760000000"', 't > t"1760000000ns"', "t > 1760000000000000000"],
+)
+def test_times_that_are_what_they_say(where: str) -> None:
+    checked(where, TYPES)
 
 
 @given(st.text(alphabet="xyt.[]()<>=!~&|'\"`0159emsinorad -+,_\\\n", max_size=40))
