@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, overload
 
-import numpy as np
-
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
+from hybridlog.query.topics import namesakes
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
@@ -103,10 +102,7 @@ class Recordings(Sequence["RecordingEntry"]):
 
     def topics(self) -> list[str]:
         """Names of their topics, sorted; includes those whose messages are all lost."""
-        ids = [summary.id for summary in self.summaries]
-        snapshot = self._session.look(ids)
-        places = (snapshot.by_id.get(recording) for recording in ids)
-        return snapshot.topics_at(np.array([p for p in places if p is not None], np.intp))
+        return self._session.topics_of(self.ids)
 
     def topic(self, *names: str) -> Query:
         """Make a query about topics of these recordings.
@@ -121,7 +117,8 @@ class Recordings(Sequence["RecordingEntry"]):
         self.check()
         if not names:
             raise TopicError(f"Name a topic. There are: {listed(self.topics())}.")
-        return self._query(self._session.resolve_in(names, self.ids))
+        found = self._session.resolve_in(names, self.ids)
+        return self._query(found, namesakes(names, self.topics()))
 
     def all_topics(self) -> Query:
         """Make a query about all topics of these recordings.
@@ -131,5 +128,6 @@ class Recordings(Sequence["RecordingEntry"]):
         """
         return self._query(self.check().topics())
 
-    def _query(self, topics: Sequence[str]) -> Query:
-        return Query(self._session, Question(*self._session.having(topics, self.ids)))
+    def _query(self, topics: Sequence[str], others: tuple[str, ...] = ()) -> Query:
+        found = self._session.having(topics, self.ids)
+        return Query(self._session, Question(*found, namesakes=others))

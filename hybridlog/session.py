@@ -948,15 +948,24 @@ class Session:
             raise TopicError(f"Name a topic. {there}")
         return self.having(resolve(names, known))
 
+    def topics_of(self, recordings: Sequence[str]) -> list[str]:
+        """Names of all topics of some recordings, sorted.
+
+        Args:
+            recordings: Ids; those that are not there are passed over.
+        """
+        snapshot = self.look(recordings)
+        places = [snapshot.by_id[one] for one in recordings if one in snapshot.by_id]
+        return snapshot.topics_at(np.array(places, np.intp))
+
     def resolve_in(self, names: Sequence[str], recordings: Sequence[str]) -> list[str]:
         """The topics of some recordings that patterns match.
 
         Raises:
             TopicError: as for `resolve`; also lists other recordings with such a topic.
         """
+        known = self.topics_of(recordings)
         snapshot = self.look(recordings)
-        places = [snapshot.by_id[one] for one in recordings if one in snapshot.by_id]
-        known = snapshot.topics_at(np.array(places, np.intp))
         try:
             return resolve(names, known)
         except TopicError as error:
@@ -1256,6 +1265,7 @@ class Session:
         from hybridlog.maintenance.tables import make_noted
 
         repairs = self.repairs
+        self.snapshot()  # notes what this process has changed
         self.catalog.write_pending()
         self.catalog.drop_damaged()
         mended = self._files.mend(until)

@@ -26,6 +26,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import parse_range, parse_time
+from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Session, of_one_moment
 from hybridlog.wording import listed
@@ -560,7 +561,9 @@ class Store:
         """
         if not all(isinstance(name, str) for name in names):
             raise UsageError("Topics are names: topic('scan', 'odom').")
-        return Query(self.session, Question(*self.session.resolve(names)))
+        found = self.session.resolve(names)
+        others = namesakes(names, self.topics())
+        return Query(self.session, Question(*found, namesakes=others))
 
     def all_topics(self) -> Query:
         """Make a query about all topics."""

@@ -151,6 +151,13 @@ def test_a_question_that_misses_tables_writes_none(
     assert not died.repairs.noted_tables
 
 
+def test_what_no_question_has_met_yet_is_repaired_too(died: hl.Store) -> None:
+    died.refresh()
+    died.mend()
+    assert not died.repairs.noted
+    assert died.repairs.recovered.keys() == {LABEL}
+
+
 def test_closing_repairs_and_an_interruption_does_not(died: hl.Store, known: Known) -> None:
     died.refresh()
     died.entry(LABEL)

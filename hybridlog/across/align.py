@@ -15,7 +15,7 @@ from hybridlog.across.match import HOWS, UNKNOWN, How, interpolated, match
 from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, concatenated
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
-from hybridlog.query.answers.remarks import about_names, remarks
+from hybridlog.query.answers.remarks import remarks
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, format_duration, parse_duration
@@ -142,29 +142,25 @@ class Aligned:
             found.setdefault(name, {})[reason] = rows
         return found
 
-    def remarks(self, *names: str) -> list[str]:
-        """Sentences about the last answer, those of `Query.remarks` about each topic.
-
-        Args:
-            names: The topics as they were written; further topics may end with a short name.
-        """
+    def remarks(self) -> list[str]:
+        """Sentences about the last answer, those of `Query.remarks` about each topic."""
         streams = self._streams
         topics = tuple(topic for stream in streams for topic in stream.question.topics)
-        named = replace(streams[0].question, topics=topics)
-        found = [*about_names(self._session, named, names)]
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
             for name, reasons in self.empty.items()
             for reason, number in reasons.items()
         ]
-        found += lines[:_MAX_NAMES]
+        found = lines[:_MAX_NAMES]
         if len(lines) > _MAX_NAMES:
             found.append(
                 f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
             )
         for stream in streams:
-            found += remarks(self._session, stream.question, (), is_empty=False)
+            question = stream.question
+            others = tuple(topic for topic in question.namesakes if topic not in topics)
+            found += remarks(self._session, replace(question, namesakes=others), is_empty=False)
         return [*dict.fromkeys([*found, *self.completeness().sentences])]
 
     def completeness(self) -> Completeness:

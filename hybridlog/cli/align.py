@@ -117,7 +117,7 @@ def _resample(
         query = query.fields(*parse_fields(",".join(given.fields)))
     rows = query.resample(given.step or 0, given.how, given.tolerance)
     answer_tables(rows.to_tables(to.shown), rows.schema, to)
-    return rows.counters, rows.remarks(*topics)
+    return rows.counters, rows.remarks()
 
 
 def _align(
@@ -155,7 +155,7 @@ def _align(
     # That there is a transform shows only at the end.
     completeness = aligned.completeness if given.strict else None
     answer_tables(aligned.to_tables(to.shown), aligned.schema, to, completeness)
-    return aligned.counters, aligned.remarks(base, *topics)
+    return aligned.counters, aligned.remarks()
 
 
 def _queries(

@@ -282,7 +282,6 @@ class Answering:
 def answering(given: Topics) -> Iterator[Answering]:
     """The open store and the query; its cost and remarks are printed at the end."""
     started = time.monotonic()
-    topics = given.topics
     with given.opened() as store:
         asked = Answering(store, given.query(store))
         yield asked
@@ -290,7 +289,7 @@ def answering(given: Topics) -> Iterator[Answering]:
         if not given.quiet:
             query = asked.query
             print_cost(query.counters, time.monotonic() - started, count=True)
-            print_remarks(query, topics, is_empty=asked.is_empty)
+            print_remarks(query, is_empty=asked.is_empty)
 
 
 def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
@@ -729,15 +728,14 @@ def print_lost(query: Query, count: int) -> None:
         output.note(found.describe(count, query.question.limit))
 
 
-def print_remarks(query: Query, topics: Sequence[str], *, is_empty: bool | None = None) -> None:
+def print_remarks(query: Query, *, is_empty: bool | None = None) -> None:
     """Print what is to be known about an answer, a line each.
 
     Args:
         query: The query that was answered.
-        topics: Its topics as typed.
         is_empty: The answer was empty; None to tell by its counters.
     """
-    output.notes(query.remarks(*topics, is_empty=is_empty))
+    output.notes(query.remarks(is_empty=is_empty))
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:

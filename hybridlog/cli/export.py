@@ -69,6 +69,8 @@ def export_command(given: _Given, **training: Any) -> None:
     `lerobot` makes a training set for robot learning.
     """
     target, force, quiet, split = given.target, given.force, given.quiet, given.split
+    if str(target) == "-":
+        raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or _form(target)
     check_options(training, form)
     options.check_latched(
@@ -104,7 +106,7 @@ def export_command(given: _Given, **training: Any) -> None:
             else:
                 _write_directory(one, to, path, front)
             if not quiet:
-                print_remarks(one, given.topics, is_empty=None if form in _LOGS else False)
+                print_remarks(one, is_empty=None if form in _LOGS else False)
 
 
 def _form(target: Path) -> str:

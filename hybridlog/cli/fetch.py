@@ -104,7 +104,7 @@ def fetch_command(choices: _Choices) -> None:
                 query = query.at_time(choices.at)
             except TopicError:
                 if not choices.quiet:
-                    print_remarks(query.between("start", choices.at), (), is_empty=False)
+                    print_remarks(query.between("start", choices.at), is_empty=False)
                 raise
         count = None
         if choices.strict:
@@ -133,7 +133,7 @@ def fetch_command(choices: _Choices) -> None:
             if count is None and to.path is not None and not given:
                 what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
                 output.note(f"Nothing matched {what}, so {to.path} is empty.")
-            print_remarks(query, choices.topics)
+            print_remarks(query)
             if count is not None:
                 print_lost(query, count)
 
@@ -172,7 +172,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
 
         asked = Query(query.session, following.question)
         asked.counters = query.counters
-        print_remarks(asked, choices.topics)
+        print_remarks(asked)
         for one in asked.summaries():
             if one.status != "open":
                 output.note(f"{one.label} has ended: {status_text(one)}.")

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -559,6 +560,6 @@ def _refuse_log(path: Path) -> None:
             f"{path} is no segment of a hybridlog store, and no log: {error}"
         ) from None
     raise StoreError(
-        f"{path} is a log, and `info` is about recordings: `hybridlog record {path}`, then "
-        f"`hybridlog info {name_of(path)}`."
+        f"{path} is a log, and `info` is about recordings: "
+        f"`hybridlog record {quote(str(path))}`, then `hybridlog info {quote(name_of(path))}`."
     )

@@ -16,7 +16,7 @@ from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
-from hybridlog.cli.signals import SIGNALS, if_stopped
+from hybridlog.cli.signals import ended_by_signal, if_stopped
 from hybridlog.formats.slices import SliceCache
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
@@ -94,7 +94,6 @@ def open_command(given: _Given) -> None:
             play(
                 given.query(store),
                 given.choice.name,
-                given.topics,
                 quiet=given.quiet,
                 port=_PORT if given.port is None else given.port,
                 speed=given.speed or 1.0,
@@ -108,7 +107,7 @@ def open_command(given: _Given) -> None:
         query = given.query(store)
         path = _written(store, query, given)
         if not given.quiet:
-            print_remarks(query, given.topics, is_empty=False)
+            print_remarks(query, is_empty=False)
             output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[given.viewer].options, path.absolute()], check=False
@@ -184,15 +183,12 @@ def check_installed() -> None:
         ) from error
 
 
-def play(
-    query: Query, names: Sequence[str], topics: Sequence[str], *, quiet: bool, **how: Any
-) -> None:
+def play(query: Query, names: Sequence[str], *, quiet: bool, **how: Any) -> None:
     """Play a query to viewers, until a signal ends it.
 
     Args:
         query: The messages.
         names: Of the recordings, as typed.
-        topics: As typed.
         quiet: Only print the address.
         how: Of `PlaybackOptions`.
     """
@@ -205,30 +201,19 @@ def play(
     name = " ".join(["hybridlog", *names])
     server = PlaybackServer(log, name, PlaybackOptions(**how), output.note)
     if not quiet:
-        print_remarks(query, topics, is_empty=False)
+        print_remarks(query, is_empty=False)
         _print_undefined(log)
     asyncio.run(_until_signal(server, quiet=quiet))
 
 
 async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
-    """Serve until a signal comes; a second one ends the process at once."""
+    """Serve until a signal comes."""
     import asyncio
-    import signal
 
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-
-    def end() -> None:
-        stop.set()
-        for number, handler in before.items():
-            loop.remove_signal_handler(number)
-            signal.signal(number, handler)
-
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            loop.add_signal_handler(number, end)
-    await server.run(stop, lambda port: _print_address(port, quiet=quiet))
+    with ended_by_signal(lambda: loop.call_soon_threadsafe(stop.set)):
+        await server.run(stop, lambda port: _print_address(port, quiet=quiet))
 
 
 def _print_address(port: int, *, quiet: bool) -> None:
@@ -305,7 +290,8 @@ def view_command(given: _View) -> None:
         sys.stdout.flush()
         if given.opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
-        server.run()
+        with ended_by_signal(server.stop):
+            server.run()
 
 
 def _print_mcap(url: str, label: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import chain, islice
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.segments.recovery import Recovered
 
-_MAX_LISTED = 3  # recordings that are reported one by one
+_MAX_LISTED = 3  # recordings that are reported one by one, stores that are named
 _MAX_FOLDERS = 1000
 _READING: Final = ("Look", "Ask", "Export")
 """Groups of commands that take the only store that is near; others name it."""
@@ -59,10 +60,10 @@ def opened_store(
     import_numpy_late()
     from hybridlog.store import open_store
 
-    near = None if path or create else _only_store_near()
-    if near is not None and _reads():
-        note(f"Store: {near}, the only one below this folder.")
-        path = near
+    near = [] if path or create else _stores_near()
+    if len(near) == 1 and _reads():
+        path = near[0]
+        note(f"Store: {path}, the only one below this folder.")
     bar = LateBar("indexing", quiet=quiet)
     try:
         store = open_store(
@@ -76,8 +77,9 @@ def opened_store(
             recover=recover,
         )
     except StoreError as error:
-        if near is not None and path is None:
-            error.add_note(f"There is one below this folder: --store {near}.")
+        if near and path is None:
+            named = " or ".join(f"--store {quote(str(one))}" for one in near[:_MAX_LISTED])
+            error.add_note(f"Below this folder: {named}.")
         raise
     finally:
         bar.close()
@@ -101,18 +103,17 @@ def opened_store(
             _print_rebuilt(store, "" if records else doing)
 
 
-def _only_store_near() -> Path | None:
-    """The only store up to two levels below this folder; None if one is named, or two are there."""
+def _stores_near() -> list[Path]:
+    """The stores up to two levels below this folder; none if one is named."""
     from hybridlog.store import store_path
     from hybridlog_storage.settings import NAME
 
     if os.environ.get("HYBRIDLOG_STORE") or store_path().exists():
-        return None
+        return []
     folders = chain.from_iterable(
         islice(Path().glob(depth), _MAX_FOLDERS) for depth in ("*", "*/*")
     )
-    found = [folder for folder in folders if (folder / NAME).is_file()]
-    return found[0] if len(found) == 1 else None
+    return sorted(folder for folder in folders if (folder / NAME).is_file())
 
 
 def _reads() -> bool:

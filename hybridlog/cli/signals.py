@@ -92,6 +92,32 @@ def install() -> None:
             signal.signal(number, stop)
 
 
+@contextlib.contextmanager
+def ended_by_signal(end: Callable[[], object]) -> Iterator[None]:
+    """Let the first signal end a server, with exit code 0; a second one ends the process.
+
+    Args:
+        end: Ends the server soon.
+    """
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        restore()
+        end()
+
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        restore()
+
+
 def undo_unfinished() -> None:
     """Take back what a command has not completed when it is stopped, such as files."""
     restore_echo()

@@ -122,8 +122,8 @@ def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEF
             sys.stderr.write(f"error: `{step.command}` {fault}\n")
             return code
     _print(
-        f"\nAll files remain in {directory}; continue with --store {directory / STORE}, or look "
-        f"at it: {_program()} view\n"
+        f"\nAll files remain in {directory}; look at them: {_program()} view --store "
+        f"{shlex.quote(str(directory / STORE))}\n"
     )
     return 0
 

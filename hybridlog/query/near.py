@@ -14,7 +14,7 @@ from hybridlog.query.predicate.across import All, AnyOf, Condition, Near, NoneOf
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.query.topics import resolve
+from hybridlog.query.topics import namesakes, resolve
 from hybridlog_storage.errors import WhereError
 
 if TYPE_CHECKING:
@@ -50,10 +50,13 @@ def question_about(
     """
     recordings = question.recordings
     if recordings is None:
-        topics = resolve([topic], session.look(None).topics)
+        known = session.look(None).topics
+        topics = resolve([topic], known)
     else:
+        known = session.topics_of(recordings)
         topics = session.resolve_in([topic], recordings)
-    found = Question(*session.having(topics, recordings))
+    others = namesakes([topic], known)
+    found = Question(*session.having(topics, recordings), namesakes=others)
     if question.is_unbounded or not question.is_by_log_time:
         return found
     if {*found.topics} <= {*mark_topics(session)}:

@@ -101,15 +101,15 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
         return completeness_of(self.session, self.question, self.counters, *others)
 
     @of_one_moment
-    def remarks(self, *names: str, is_empty: bool | None = None) -> list[str]:
+    def remarks(self, *, is_empty: bool | None = None) -> list[str]:
         """Sentences about the last answer.
 
         They tell what it lacks: messages that could not be read or asked, those without their
         payload, losses in its range, and recordings that go on. And topics that lack fields of
-        the predicate, header stamps of another epoch, likely causes of an empty answer.
+        the predicate, topics whose end is a short name that was given, header stamps of another
+        epoch, likely causes of an empty answer.
 
         Args:
-            names: The topics as they were written; further topics may end with a short name.
             is_empty: Whether the answer was empty; without, if `counters` has no messages.
         """
         from hybridlog.query.answers.remarks import remarks
@@ -119,6 +119,6 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
         found = [*self.completeness().sentences]
         for one in self.conditions:
             nothing = self.question.during is not None and not self.question.during
-            found += remarks(self.session, one.question, (), is_empty=nothing)
-        found += remarks(self.session, self.question, names, is_empty=is_empty)
+            found += remarks(self.session, one.question, is_empty=nothing)
+        found += remarks(self.session, self.question, is_empty=is_empty)
         return [*dict.fromkeys(found)]

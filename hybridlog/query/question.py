@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -45,6 +45,7 @@ class Question:
         names_recording: Tables have the column `recording` even if there is only one.
         during: Intervals of log time that messages must lie in; None for all times.
         frame: Frame of points and poses in the answer; None for that of each message.
+        namesakes: Further topics that end with a short name that chose one of `topics`.
     """
 
     topics: tuple[str, ...]
@@ -60,6 +61,7 @@ class Question:
     names_recording: bool = False
     during: Intervals | None = None
     frame: str | None = None
+    namesakes: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def returns_all(self) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from hybridlog.query.times import (
     format_time,
+    is_early,
     is_relative,
     parse_range,
     parse_time,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_NAMES = 5  # recordings in a message
+_FAR_NS = 10 * 365 * 86_400 * 10**9
 
 
 class Resolved(NamedTuple):
@@ -126,8 +128,25 @@ class RangeResolver:
                 each, inside = self._bounds_of(places)
             if len(places) and not len(inside) and question.during is None:
                 self._refuse(places)
+            self._check_begin(snapshot.begin[inside])
             places = inside
         return Ranges(snapshot, places, shared, each, question.during)
+
+    def _check_begin(self, first: NDArray[np.int64]) -> None:
+        """Refuse a range that begins at an early time, far before any message.
+
+        Args:
+            first: Log times of the first messages of the recordings, ns.
+
+        Raises:
+            TimeError: `10` was written, and `+10` is meant.
+        """
+        assert self._question.bounds is not None
+        begin, _ = self._question.bounds
+        if self._question.clock == "log" and is_early(begin) and len(first):
+            low = parse_time(begin, start=None, end=None)
+            if int(first.min()) - low > _FAR_NS:
+                raise TimeError(f"The range begins long before any message.{units_of(begin)}")
 
     def _in_intervals(self, places: NDArray[np.intp], during: Intervals) -> NDArray[np.intp]:
         """The recordings that have any of some intervals."""

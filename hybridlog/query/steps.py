@@ -403,7 +403,11 @@ class Steps:
     def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Self:
         """The same conditions on other topics and recordings."""
         topics, chosen = self.session.having(topics, recordings)
-        return self._with(topics=topics, recordings=chosen)
+        others = self.question.namesakes
+        if others and recordings is not None:
+            there = {*self.session.topics_of(recordings)}
+            others = tuple(topic for topic in others if topic in there)
+        return self._with(topics=topics, recordings=chosen, namesakes=others)
 
     def _planner(self) -> Planner:
         """A planner for an answer, of a moment that begins now."""

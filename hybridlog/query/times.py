@@ -34,7 +34,7 @@ import time
 from datetime import UTC, date, datetime, timedelta
 from decimal import ROUND_HALF_EVEN, Decimal
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.times import BEGIN, END
@@ -70,6 +70,7 @@ DURATIONS = "write a duration as 5s, 1m30s, 2h, 500ms, 250us, 100ns, or a number
 
 _NANOSECONDS_FROM = 10**14
 _SECOND = 10**9
+_EARLY_NS = 10**17
 _LONGEST_TEXT = 200
 
 _NUMBER = re.compile(r"([0-9]+)(?:\.([0-9]*))?")
@@ -136,6 +137,9 @@ def units_of(*times: TimeLike | None) -> str:
     for one in times:
         if isinstance(one, Integral) and 0 < int(one) < _NANOSECONDS_FROM:
             return f" A whole number is nanoseconds; {float(one)!r} is seconds."
+        if is_early(one):
+            at = format_time(parse_time(one, start=None, end=None))
+            return f" {one} is {at}; +{one} is that long after the beginning of a recording."
     return ""
 
 
@@ -145,6 +149,13 @@ def is_relative(time: TimeLike | None) -> bool:
         return False
     word = time.strip()
     return word.lower() != "now" and _absolute(word) is None
+
+
+def is_early(time: TimeLike | None) -> TypeGuard[str]:
+    """True for a number without sign and unit that is a time before 1973: `10`."""
+    if not isinstance(time, str) or _NUMBER.fullmatch(time.strip()) is None:
+        return False
+    return 0 < parse_time(time, start=None, end=None) < _EARLY_NS
 
 
 def parse_range(

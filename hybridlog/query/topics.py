@@ -57,20 +57,24 @@ def split_topic(text: str) -> tuple[str, str]:
     return topic.strip().removesuffix(":"), rest.strip()
 
 
-def namesakes(pattern: str, topics: Collection[str]) -> list[str]:
+def namesakes(patterns: Iterable[str], topics: Collection[str]) -> tuple[str, ...]:
     """Further topics that end with a short name which is the whole name of one topic.
 
     Args:
-        pattern: A pattern of the user.
+        patterns: Patterns of the user.
         topics: All existing topics.
     """
+    found = {topic for pattern in patterns for topic in _namesakes(pattern, topics)}
+    return tuple(sorted(found))
+
+
+def _namesakes(pattern: str, topics: Collection[str]) -> list[str]:
     if pattern.startswith("/") or pattern in topics or not _is_plain(pattern):
         return []
     for fold in (str, str.casefold):
         wanted = "/" + fold(pattern)
         if any(fold(topic) == wanted for topic in topics):
-            others = [t for t in topics if fold(t).endswith(wanted) and fold(t) != wanted]
-            return sorted(others)
+            return [t for t in topics if fold(t).endswith(wanted) and fold(t) != wanted]
     return []
 
 

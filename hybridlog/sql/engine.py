@@ -12,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.query.question import Question
+from hybridlog.query.topics import namesakes
 from hybridlog.schema.states import without_fields
 from hybridlog.sql.content import StoreContent
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
@@ -21,6 +22,7 @@ from hybridlog.sql.source import source_of
 from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
+from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     HybridlogError,
     TopicError,
@@ -328,6 +330,12 @@ class SqlAnswer:
             lines.append(f"{topic} has no columns of fields: {reason}.")
         for (topic, state), count in found.absent.items():
             lines.append(f"{topic}: {without_fields(count, state)}.")
+        views = self._connection.content.names.views
+        for topic in sorted(found.topics):
+            others = namesakes([topic.strip("/")], views)
+            unread = [views[other] for other in others if other not in found.topics]
+            if unread:
+                lines.append(f"{topic} was asked, not the view {listed(unread, 5)}.")
         lacks = self._connection.completeness(found.topics, found.recordings)
         return [*lines, *lacks.sentences]
 

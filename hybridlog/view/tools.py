@@ -127,7 +127,7 @@ def schema(context: Context, topic: str | None, recording: str | None) -> Answer
     if known is None:
         known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
     fields = [{"field": path, "type": kind} for path, kind in known.items()]
-    values = {"topics": query.topics, "lacks": query.remarks(topic, is_empty=False)}
+    values = {"topics": query.topics, "lacks": query.remarks(is_empty=False)}
     return _answer({**values, "fields": fields[:MAX_ROWS]}, "fields", is_cut=len(fields) > MAX_ROWS)
 
 
@@ -135,7 +135,7 @@ def ask(context: Context, question: ToolQuestion, at_least: str | None) -> Answe
     """The number of messages that satisfy a predicate, when it holds, and the first of them."""
     query = question.query(context)
     count = query.count()
-    values: dict[str, Any] = {"count": count, **_lacks(query, question.topic, count)}
+    values: dict[str, Any] = {"count": count, **_lacks(query, count)}
     with suppress(TimeError):  # the range is outside all recordings
         times = match_times(query.session, query.question, Counters())
         values["first_times"] = [format_time(one) for one in islice(_each(times), 10)]
@@ -219,8 +219,8 @@ def fetch(
             except PayloadError as error:
                 problems.append(f"{format_time(message.log_time_ns)}: {error}")
     count = query.count()
-    values = {"count": count, **_lacks(query, question.topic, count), "not_shown": problems}
-    values["lacks"] = [*dict.fromkeys([*limited.remarks(question.topic), *values["lacks"]])]
+    values = {"count": count, **_lacks(query, count), "not_shown": problems}
+    values["lacks"] = [*dict.fromkeys([*limited.remarks(), *values["lacks"]])]
     return _answer({**values, "messages": rows}, "messages", tuple(shown), is_cut=count > len(rows))
 
 
@@ -243,7 +243,7 @@ def plot(context: Context, question: ToolQuestion, fields: list[str]) -> Answer:
     if not found:
         raise TopicError("There is no message to draw.")
     drawn = figure(found, size=_PLOT, form="png")
-    lacks = _lacks(query, question.topic, query.counters.messages)
+    lacks = _lacks(query, query.counters.messages)
     return _answer(
         {**lacks, "lines": [f"{one.topic} {one.series.field} in {one.recording}" for one in found]},
         "lines",
@@ -251,12 +251,12 @@ def plot(context: Context, question: ToolQuestion, fields: list[str]) -> Answer:
     )
 
 
-def _lacks(query: Query, name: str, count: int) -> dict[str, Any]:
+def _lacks(query: Query, count: int) -> dict[str, Any]:
     """The gaps of a query's last answer, in words."""
     found = query.completeness()
     return {
         "lost": found.describe(count) if found.has_losses else None,
-        "lacks": query.remarks(name, is_empty=not count),
+        "lacks": query.remarks(is_empty=not count),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import pyarrow.parquet
@@ -80,6 +81,8 @@ def test_wrong_targets(store: Path, tmp_path: Path) -> None:
     nameless = run("export", tmp_path / "x", store=store, code=2)
     assert "end it in .mcap or .bag, or name a directory" in nameless.err
     run("export", tmp_path / "x.csv", store=store, code=2)
+    with contextlib.chdir(tmp_path):
+        assert "for a pipe" in run("export", "-", "-F", "mcap", store=store, code=2).err
     run("export", tmp_path / "file", "-F", "csv", "--force", store=store, code=2)
     run("export", tmp_path, "-F", "mcap", "--force", store=store, code=2)
     assert (tmp_path / "file").read_text() == "mine"

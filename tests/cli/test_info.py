@@ -7,6 +7,7 @@ import json
 import re
 import struct
 from pathlib import Path
+from shlex import quote
 
 from mcap.writer import Writer
 from rosbags.rosbag1 import Reader
@@ -99,19 +100,21 @@ def test_info_of_a_segment(logs: Path, store: Path) -> None:
 
 
 def test_a_log_is_told_from_a_recording(logs: Path, store: Path, tmp_path: Path) -> None:
-    with Rosbag2Writer(tmp_path / "bag2", version=9):
-        pass
+    for folder in ("bag2", "a bag"):
+        with Rosbag2Writer(tmp_path / folder, version=9):
+            pass
     for log, name in (
         (logs / "odd.mcap", "odd"),
         (logs / "robot.bag", "robot"),
         (tmp_path / "bag2", "bag2"),
         (Path("bag2"), "bag2"),
+        (Path("a bag"), "a bag"),
     ):
         with contextlib.chdir(tmp_path):
             refused = run("info", log, store=store, code=5)
         assert refused.err == (
-            f"hybridlog: {log} is a log, and `info` is about recordings: `hybridlog record {log}`, "
-            f"then `hybridlog info {name}`.\n"
+            f"hybridlog: {log} is a log, and `info` is about recordings: `hybridlog record "
+            f"{quote(str(log))}`, then `hybridlog info {quote(name)}`.\n"
         )
     (tmp_path / "text.mcap").write_text("text")
     assert "no log: " in run("info", tmp_path / "text.mcap", code=5).err

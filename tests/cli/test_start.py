@@ -358,7 +358,7 @@ def test_a_reader_that_ends_early_is_no_error(store: Path) -> None:
     ("words", "code", "said"),
     [
         ("ls", 0, "Store: demo/robot-logs, the only one below this folder."),
-        ("rm x -y", 5, "There is one below this folder: --store demo/robot-logs."),
+        ("rm x -y", 5, "Below this folder: --store demo/robot-logs."),
     ],
 )
 def test_the_only_store_below_the_folder(words: str, code: int, said: str, tmp_path: Path) -> None:

@@ -45,8 +45,7 @@ def test_it_serves_until_it_is_stopped(store: Path, number: signal.Signals) -> N
         assert json.load(answer)["all"] == 0
     running.send_signal(number)
     _, errors = running.communicate(timeout=20)
-    assert running.returncode == 128 + number
-    assert "Traceback" not in errors
+    assert (running.returncode, errors) == (0, "")
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(said["url"])
 
@@ -82,7 +81,7 @@ def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
     running = start(folder=tmp_path)
     _, errors = running.communicate(timeout=20)
     assert running.returncode == 5
-    assert "hybridlog-store" in errors
+    assert errors.endswith("Below this folder: --store one or --store two.\n")
 
 
 def test_mcap_for_other_viewers(store: Path) -> None:

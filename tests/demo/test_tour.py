@@ -108,7 +108,8 @@ def test_the_last_line_can_be_typed(
     monkeypatch.setattr("sys.argv", [started])
     monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}" if on_path else None)
     assert tour.run(tmp_path) == 0
-    assert capfd.readouterr().out.endswith(f"look at it: {typed} view\n")
+    place = shlex.quote(str(tmp_path / tour.STORE))
+    assert capfd.readouterr().out.endswith(f"look at them: {typed} view --store {place}\n")
 
 
 def test_a_failing_command_ends_the_tour_with_its_code(

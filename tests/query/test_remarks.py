@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,6 +140,12 @@ def test_why_an_answer_is_empty(store: hl.Store) -> None:
     day = BEGIN + 86_400 * SECOND
     with pytest.raises(TimeError, match=r"monday spans .* Other recordings span .*: tuesday\."):
         store.topic("/n").in_recording("monday").between(day, day + 1).count()
+    for begin, stop in (("10", "12s"), ("10", "12"), ("10.5", None)):  # "+10" is meant
+        with pytest.raises(TimeError, match=r" 10\S* is 1970-\S+; \+10\S* is that long after"):
+            store.topic("/n").between(begin, stop).count()
+    assert (
+        store.topic("/n").between("0", "3s").count() == store.topic("/n").between(10, "3s").count()
+    )
     with pytest.raises(TimeError, match=r"Z\.$"):
         store.topic("/n").between(day + SECOND, day + 2 * SECOND).count()
 
@@ -160,17 +167,34 @@ def test_a_short_name_that_several_topics_end_with(store: hl.Store) -> None:
     query = store.topic("scan")
     assert query.topics == ("/scan",)
     assert query.count() == 1
-    assert query.remarks("scan") == [
-        "'scan' is the whole name of a topic; not asked: /front/base/scan, /rear/scan."
-    ]
-    assert query.remarks("/scan") == query.remarks("*scan") == []
+    told = ["/scan was asked, not /front/base/scan, /rear/scan; '**/scan' takes all."]
+    assert query.remarks() == store.recordings().topic("scan").remarks() == told
+    for name in ("/scan", "*scan"):
+        assert store.topic(name).remarks(is_empty=False) == []
     every = store.topic("**/scan")
     assert every.count() == 3
-    assert every.remarks("scan") == []
-    tuesday = store.topic("/n").in_recording("tuesday")
-    assert tuesday.remarks("scan", is_empty=False) == []
-    assert namesakes("SCAN", ["/Scan", "/a/scan", "/a/scanner"]) == ["/a/scan"]
-    assert namesakes("scan", ["/a/scan", "/b/scan"]) == []
+    assert every.remarks() == []
+    near = store.topic("/n").where("scan: n >= 0", within="1s")
+    assert told[0] in near.remarks(is_empty=False)
+    assert namesakes(["SCAN"], ["/Scan", "/a/scan", "/a/scanner"]) == ("/a/scan",)
+    assert namesakes(["scan"], ["/a/scan", "/b/scan"]) == ()
+
+
+def test_a_short_name_that_topics_of_other_recordings_end_with(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", mongo="none", create=True) as store:
+        for label, topic in (("one", "/scan"), ("two", "/base/scan")):
+            with store.start(label) as recording:
+                recording.write(Channel(topic, "ros1", NUMBER), number(0), log_time=BEGIN)
+        query = store.topic("scan")
+        assert query.count() == 1
+        assert query.remarks() == ["/scan was asked, not /base/scan; '**/scan' takes all."]
+        assert (
+            store.recordings(["o*", "t*"]).topic("scan").remarks(is_empty=False) == query.remarks()
+        )
+        assert query.in_recording("one").remarks(is_empty=False) == []
+        answer = store.sql("select count(*) from scan")
+        assert answer.to_arrow().to_pylist() == [{"count_star()": 1}]
+        assert answer.sentences() == ["/scan was asked, not the view base__scan."]
 
 
 def test_messages_that_changes_and_statistics_leave_out(store: hl.Store) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ from hybridlog.query.predicate.tree import Exists, is_meta
 from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_time, is_relative
-from hybridlog.query.topics import namesakes
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TimeError
 
@@ -28,18 +27,15 @@ _MAX_NAMES = 5  # names in a remark
 _APART_NS = 86_400 * 10**9  # header stamps and log times this far apart have other epochs
 
 
-def remarks(
-    session: Session, question: Question, names: Sequence[str], *, is_empty: bool
-) -> Iterator[str]:
+def remarks(session: Session, question: Question, *, is_empty: bool) -> Iterator[str]:
     """Sentences about an answer, for people; its `Completeness` has those about what it lacks.
 
     Args:
         session: The open store.
         question: The question.
-        names: The topics as they were written.
         is_empty: The answer has no messages or intervals.
     """
-    yield from about_names(session, question, names)
+    yield from about_names(question)
     if question.clock == "header" and question.bounds is not None:
         yield from _about_stamps(session, question)
     yield from _missing_fields(session, question, is_empty=is_empty)
@@ -47,17 +43,14 @@ def remarks(
         yield from _causes(session, question)
 
 
-def about_names(session: Session, question: Question, names: Sequence[str]) -> Iterator[str]:
-    """Further topics that end with a short name, in the recordings of the question."""
-    for name in names:
-        others = namesakes(name, session.topics())
-        if others:
-            snapshot = session.look(question.recordings)
-            places = set(session.chosen(question).tolist())
-            others = [t for t in others if not places.isdisjoint(snapshot.having([t]).tolist())]
-        others = [topic for topic in others if topic not in question.topics]
-        if others:
-            yield f"{name!r} is the whole name of a topic; not asked: {listed(others, _MAX_NAMES)}."
+def about_names(question: Question) -> Iterator[str]:
+    """Further topics that end with a short name, in the recordings that were chosen."""
+    others = [topic for topic in question.namesakes if topic not in question.topics]
+    for topic in question.topics:
+        tail = "/" + topic.strip("/")
+        found = [other for other in others if other.casefold().endswith(tail.casefold())]
+        if found:
+            yield f"{topic} was asked, not {listed(found, _MAX_NAMES)}; '**{tail}' takes all."
 
 
 def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:

@@ -60,7 +60,7 @@ def ask(context: Context, params: RequestParams) -> dict[str, Any]:
     return {
         "count": count,
         "lost": found.describe(count) if found.has_losses else None,
-        "remarks": query.remarks(*query.topics),
+        "remarks": query.remarks(),
         "python": question.python(),
         "command": question.command(),
     }
