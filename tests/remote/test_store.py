@@ -130,6 +130,20 @@ def test_edits(here: Path, address: str, proxy: Proxy) -> None:
     assert "why=test" in answer("ls", store=Path(address)).out
 
 
+def test_changes_keep_their_order(here: Path, address: str, proxy: Proxy) -> None:
+    """Also where the name of one that did not come to its end is free again."""
+    publish_all(here, address, ("run",))
+    with hl.open(address) as store:
+        bucket, name = Bucket(address), f"recordings/{store.entry('run').id}/journal.1"
+        bucket.create(name, b"?")
+        store.tag("run", x="1")
+        bucket.delete([name])
+        store.tag("run", x="2")
+    files.mounted.clear()
+    with hl.open(address) as store:
+        assert store.entry("run").tags["x"] == "2"
+
+
 def test_the_command_copies(here: Path, address: str, proxy: Proxy) -> None:
     said = answer("copy", "-r", "short-*", address, "--json", store=here).json
     assert (said["copied"], said["known"]) == (["short-0", "short-1", "short-2"], [])

@@ -19,6 +19,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -537,14 +538,11 @@ class RemoteDirectory(StoreDirectory):
 
     def _append(self, label: str, content: bytes) -> None:
         listed = self._now.recordings[label]
-        number = 1
-        while True:
+        # Behind all others: one in a gap would be read before those behind it.
+        for number in count(max(map(_part, listed.files), default=0) + 1):
             path = f"{JOURNAL}.{number}"
             name = f"{RECORDINGS}/{listed.id}/{path}"
-            number += 1
-            if path in listed.files:
-                continue
-            # One that no list names is of a change that did not come to its end.
+            # One that is there is of a change that did not come to its end.
             with suppress(ObjectExistsError):
                 version = self.source.bucket.create(name, content)
                 break
@@ -718,9 +716,8 @@ def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     more: dict[int, Object] = {}
     for path, about in objects.items():
-        stem, _, number = path.partition(".")
-        if stem == JOURNAL and number.isascii() and number.isdigit() and len(number) < 10:
-            more[int(number)] = about
+        if number := _part(path):
+            more[number] = about
             continue
         *folders, name = path.split("/")
         place = found
@@ -732,6 +729,13 @@ def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
     if more and JOURNAL in found:
         found[JOURNAL] = [found[JOURNAL], *(one for _, one in sorted(more.items()))]
     return found
+
+
+def _part(path: str) -> int:
+    """Number of an object with later lines of a journal; 0 for all others."""
+    stem, _, number = path.partition(".")
+    is_part = stem == JOURNAL and number.isascii() and number.isdigit() and len(number) < 10
+    return int(number) if is_part else 0
 
 
 def _look(objects: Mapping[str, Object]) -> str:
