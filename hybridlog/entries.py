@@ -20,7 +20,7 @@ import numpy as np
 
 from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
-from hybridlog.schema.states import expired_messages
+from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import (
     ChannelStats,
@@ -34,7 +34,7 @@ from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, 
 from hybridlog_storage.journal import Journal, PayloadFile
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
-from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE
+from hybridlog_storage.segments.segment_format import MOVED_SIZE
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
@@ -372,7 +372,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         entry: Its entry.
         look: State of its directory; empty if that does not matter.
     """
-    losses = entry.end.get("losses", ())
+    losses, gone = entry.end.get("losses", ()), expired_messages(entry)
     return RecordingSummary(
         id=entry.id,
         label=entry.label,
@@ -390,9 +390,9 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         segments=entry.segments,
         has_losses=bool(losses),
         has_lost_segments=any(row["cause"] == Cause.SEGMENT for row in losses),
-        expired=expired_messages(entry),
+        expired=gone.get(State.EXPIRED, 0),
+        not_copied=gone.get(State.NOT_COPIED, 0),
         notes=entry.notes,
-        lacks_payloads=entry.lacks_payloads,
         look=look,
     )
 
@@ -429,7 +429,6 @@ def _base(inventory: Inventory) -> RecordingEntry:
         entry.notes = list(state.notes)
         entry.marks = list(state.marks)
         entry.pins = list(state.pins.values())
-        entry.lacks_payloads = state.lacks_payloads and bool(state.expired)
     entry.payloads = [asdict(file) for file in inventory.payloads.values()]
     return entry
 
@@ -496,8 +495,8 @@ def _losses_of_columns(inventory: Inventory) -> list[dict[str, Any]]:
 def _span_of(summary: SegmentSummary, file: PayloadFile) -> tuple[int, int] | None:
     """First and last log time of messages that need a file: moved or expired ones of its topic."""
     table = summary.table
-    size = EXPIRED_SIZE if file.has_fields else MOVED_SIZE
-    needs_file = np.repeat(table.chunks["length"] == size, table.chunks["parts"])
+    needs = table.is_expired if file.has_fields else table.chunks["length"] == MOVED_SIZE
+    needs_file = np.repeat(needs, table.chunks["parts"])
     channels = [n for n, channel in summary.channels.items() if channel.topic == file.topic]
     parts = table.parts[needs_file & np.isin(table.parts["channel"], channels)]
     return (int(parts["first"].min()), int(parts["last"].max())) if len(parts) else None

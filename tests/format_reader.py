@@ -335,7 +335,7 @@ class Segment:
         return self._opcode(number) == 0x93
 
     def is_expired(self, number: int) -> bool:
-        return self._opcode(number) == 0x94
+        return self._opcode(number) in {0x94, 0x95}
 
     def parts_of(self, number: int) -> list[Part]:
         before = sum(chunk.parts for chunk in self.chunks[:number])
@@ -375,10 +375,10 @@ class Segment:
         demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
         is_indexed = zlib.crc32(trailer) == place.trailer_crc
         ((_, opcode, body),) = records(record)
-        demand(opcode in {0x06, 0x93, 0x94}, "no chunk")
+        demand(opcode in {0x06, 0x93, 0x94, 0x95}, "no chunk")
         left: list[tuple[int, bytes]] = []
-        if opcode == 0x94:
-            left = self._expired(number, Content(body), place)
+        if opcode in {0x94, 0x95}:
+            left = self._expired(number, Content(body[: 36 if opcode == 0x94 else -1]), place)
             content = b"".join(record for _, record in left)
         elif opcode == 0x93:
             content = self._moved(number, Content(body), place)
@@ -420,7 +420,7 @@ class Segment:
 
     @staticmethod
     def _head(record: bytes) -> int:
-        if record[0] in {0x93, 0x94}:
+        if record[0] in {0x93, 0x94, 0x95}:
             return len(record)
         body = Content(record[37:])
         return 37 + 4 + len(body.text()) + 8

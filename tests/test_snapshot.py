@@ -54,7 +54,7 @@ def summary(number: int, span: tuple[int, int] | None, topics: list[str], **othe
         "has_lost_segments": False,
         "expired": 0,
         "notes": [],
-        "lacks_payloads": False,
+        "not_copied": 0,
         "look": "",
         **other,
     }

@@ -187,6 +187,7 @@ def _write_files(query: Query, to: Destination, directory: Path, front: Front) -
         _print_written(path, one, missing, quiet=to.quiet)
         query.counters.reduced += one.counters.reduced
         query.counters.expired += one.counters.expired
+        query.counters.not_copied += one.counters.not_copied
     if len(left_out) == len(paths):
         raise left_out[0]
 

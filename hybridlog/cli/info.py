@@ -326,14 +326,12 @@ def _print_recording(
     channels = sorted(shown_channels(entry.channels), key=lambda c: c.topic)
 
     def rows_with(*, short: bool) -> list[list[str]]:
-        known, gone = entry.is_decoded, "not copied yet" if entry.lacks_payloads else "expired"
         return [
             _channel_row(
                 c,
-                is_decoded=known,
+                is_decoded=entry.is_decoded,
                 narrow=narrow,
                 short=short,
-                gone=gone,
                 video=videos.get(c.topic),
             )
             for c in channels
@@ -412,7 +410,6 @@ def _channel_row(
     is_decoded: bool,
     narrow: bool,
     short: bool,
-    gone: str = "expired",
     video: VideoSummary | None = None,
 ) -> list[str]:
     from hybridlog.query.latching import depth_of
@@ -432,7 +429,8 @@ def _channel_row(
         notes.append(f"{stats.surplus} with bytes left over")
     state = state_of(channel.message_encoding)
     if state is not State.WHOLE:
-        notes.append("fields only" if state is State.REDUCED else f"fields only, {gone}")
+        why = {State.EXPIRED: ", expired", State.NOT_COPIED: ", not copied yet"}
+        notes.append(f"fields only{why.get(state, '')}")
     if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
         notes.append("latched")
     if video is not None and video.frames:

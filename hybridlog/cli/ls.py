@@ -63,11 +63,11 @@ def _with_short_notes(
 def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     span = entry.span
     notes = [] if entry.status == "complete" else [status_text(entry)]
-    if entry.expired:
-        from hybridlog.schema.states import CAUSES, expired_state
+    for state, number in {"expired": entry.expired, "not_copied": entry.not_copied}.items():
+        if number:
+            from hybridlog.schema.states import CAUSES, State
 
-        why = CAUSES[expired_state(entry)]
-        notes.append(f"{output.counted(entry.expired, 'payload')} {why}")
+            notes.append(f"{output.counted(number, 'payload')} {CAUSES[State(state)]}")
     if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
@@ -116,8 +116,8 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
         "topics": recording.topic_count,
         "messages": recording.messages,
         "expired": recording.expired,
+        "not_copied": recording.not_copied,
         "notes": recording.notes,
-        "lacks_payloads": recording.lacks_payloads,
         "stored_bytes": recording.stored_bytes,
         "segments": recording.segments,
         "source": recording.source,

@@ -27,7 +27,7 @@ from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import expired_payloads
 from hybridlog.schema.states import State, state_of
 from hybridlog_storage.journal import FIELDS
-from hybridlog_storage.messages import EXPIRED_IDS, Batch
+from hybridlog_storage.messages import Batch
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.chunk import ExpiredMessages
 
@@ -222,12 +222,11 @@ def _batch(part: pa.StructArray) -> Batch:
     ref = part.field("ref")
     data, bounds = bytes_of(ref.field("left"))
     place = [numbers(ref.field(name), np.int64) for name in ("off", "len")]
-    channel = numbers(part.field("channel"), np.int32) + EXPIRED_IDS
     return Batch(
         data.tobytes(),
         bounds[:-1],
         np.diff(bounds),
-        channel.astype(np.int32),
+        numbers(part.field("channel"), np.int32),
         numbers(part.field("t"), np.int64),
         numbers(part.field("pub"), np.int64),
         numbers(ref.field("sequence"), np.uint32),

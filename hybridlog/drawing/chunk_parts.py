@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.chunk_table import ChunkTable
 
-_CHANNELS = 2 * EXPIRED_IDS  # ids of channels
+_CHANNELS = 3 * EXPIRED_IDS  # ids of channels
 
 
 class RecordedChunks:

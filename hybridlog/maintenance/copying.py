@@ -32,6 +32,7 @@ from hybridlog_storage.disk.directory import REMOVED, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.remote.bucket import digest_like
+from hybridlog_storage.segments.segment_format import not_copied_record
 from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
@@ -476,7 +477,7 @@ class _Sent:
 
 @contextmanager
 def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory]:
-    """A store, in a hidden folder, with a recording all of whose payloads have expired.
+    """A store, in a hidden folder, with a recording whose payloads are to be copied later.
 
     Its files are second names of the files of the recording: expiry replaces them by new
     ones, and the recording keeps its own.
@@ -497,7 +498,7 @@ def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory
             files.make_folders(target.parent, depth=file.depth - 1)
             files.link(file.below(sent.path), target, depth=file.depth, new_depth=file.depth)
         files.write_file(path / JOURNAL, sent.lines)
-        expire(scratch, sent.label, sent.segments)
+        expire(scratch, sent.label, sent.segments, record=not_copied_record)
         yield scratch
     except OSError as error:
         raise durability.explain(error, folder, "preparing fields in") from error

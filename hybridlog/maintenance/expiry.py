@@ -38,7 +38,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE, expired_record
+from hybridlog_storage.segments.segment_format import MOVED_SIZE, expired_record
 from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.journal import JournalState, PayloadFile
-    from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
@@ -90,6 +90,7 @@ def expire(
     topics: Collection[str] | None = None,
     *,
     log: Journal | None = None,
+    record: Callable[[Buffer], bytes] = expired_record,
     progress: Progress | None = None,
     min_bytes: int = MIN_BYTES,
     max_files: int = MAX_FILES,
@@ -105,6 +106,7 @@ def expire(
         topics: Full names of the topics whose payloads go; None for all. Messages of other
             topics in the same chunk keep theirs, and so the chunk stays.
         log: The journal of a running recording, which its recorder appends to; None to open it.
+        record: Makes the record in place of that of a chunk.
         progress: Called after each chunk.
         min_bytes: Chunks with fewer stored bytes a message stay.
         max_files: Small files of fields that a topic may have.
@@ -114,7 +116,9 @@ def expire(
         DiskFullError: There is no room for the fields; nothing is deleted.
     """
     path = directory.recording(label)
-    work = _Expiry(path, sorted(segments), topics, log or Journal(path), min_bytes)
+    work = _Expiry(
+        path, sorted(segments), topics, log or Journal(path), record=record, min_bytes=min_bytes
+    )
     done = work.run(directory, label, progress)
     # Files that cannot be joined stay as they are, and the next expiry tries again.
     with suppress(HybridlogError, OSError):
@@ -131,12 +135,15 @@ class _Expiry:
         segments: list[int],
         topics: Collection[str] | None,
         log: Journal,
+        *,
+        record: Callable[[Buffer], bytes],
         min_bytes: int,
     ) -> None:
         self._path = path
         self._min_bytes = min_bytes
         self._topics = topics
         self._log = log
+        self._record = record
         self._state = self._journal()
         self._chosen: dict[int, set[int]] = {}  # numbers of chunks by segment
         self._summaries: dict[int, SegmentSummary] = {}
@@ -167,7 +174,7 @@ class _Expiry:
             self._chosen[number], self._summaries[number] = chosen, summary
 
     def _goes(self, place: ChunkPlace, summary: SegmentSummary) -> bool:
-        if place.length == EXPIRED_SIZE:
+        if place.is_expired:
             return False
         parts = _parts_of(summary, place)
         size = place.length if place.length != MOVED_SIZE else int(parts["payload_bytes"].sum())
@@ -304,7 +311,7 @@ class _Expiry:
             self._state,
             segment.reader,
             segment.summary,
-            dict.fromkeys(chosen, expired_record),
+            dict.fromkeys(chosen, self._record),
             files=self._state.payloads.values(),
             event=journal.EXPIRED,
             log=self._log,
@@ -323,7 +330,7 @@ class _Expiry:
             (segment.number, place.number)
             for segment in walk(self._path, sorted(self._state.sealed))
             for place in segment.summary.chunks
-            if place.length == EXPIRED_SIZE
+            if place.is_expired
         }
         payloads = RecordingPayloads(self._path, columns)
         expired = [file for file in columns if payloads.reader(file).places.keys() <= gone]

@@ -27,7 +27,7 @@ from hybridlog_storage.journal import Journal
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_file import sealed_name
-from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, MOVED_SIZE, moved_record
+from hybridlog_storage.segments.segment_format import MOVED_SIZE, moved_record
 from hybridlog_storage.segments.segment_thinning import thin
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ def _prove(
             == [len(part) for part in reader.indexes()[1:]]
             and all(
                 there.crc == here.crc
-                if here.length == EXPIRED_SIZE
+                if here.is_expired
                 else _is_same(new.read_chunk(there), reader.read_chunk(here))
                 for there, here in zip(found.chunks, summary.chunks, strict=True)
             )
@@ -262,8 +262,9 @@ def _prove(
 
 def _without_content(summary: SegmentSummary) -> set[int]:
     """Numbers of moved and expired chunks."""
-    sizes = {MOVED_SIZE, EXPIRED_SIZE}
-    return {chunk.number for chunk in summary.chunks if chunk.length in sizes}
+    return {
+        chunk.number for chunk in summary.chunks if chunk.is_expired or chunk.length == MOVED_SIZE
+    }
 
 
 def _channels(summary: SegmentSummary) -> dict[int, dict[str, Any]]:

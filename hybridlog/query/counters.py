@@ -26,12 +26,12 @@ class Counters:
         chunks_read: Chunks read and decompressed.
         documents_read: Index documents received from MongoDB.
         reduced: Messages left out because only their fields are there.
-        expired: Those of them whose payloads were deleted to make room, or not copied yet.
+        expired: Those of them whose payloads were deleted to make room.
+        not_copied: Those of them whose payloads were not copied yet.
         lacking: Messages in the answer whose arrays are null, since only summaries are left.
         unreadable: Messages of the predicate's topics that do not fit their definition, or lack
             arrays that it asks for.
-        without_arrays: Those of them that lack arrays, since their payloads were deleted to make
-            room.
+        without_arrays: Those of them that lack arrays, since their payloads are gone.
         unindexed: Messages of running recordings that the index lacks, if it has answered.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
             the number of messages; several.
@@ -47,6 +47,7 @@ class Counters:
     documents_read: int = 0
     reduced: int = 0
     expired: int = 0
+    not_copied: int = 0
     lacking: int = 0
     unreadable: int = 0
     without_arrays: int = 0
@@ -78,8 +79,8 @@ class Counters:
     def leave_out(self, messages: int, state: State) -> None:
         """Count messages that are left out since their payloads are gone."""
         self.reduced += messages
-        if state != "reduced":
-            self.expired += messages
+        self.expired += messages * (state == "expired")
+        self.not_copied += messages * (state == "not_copied")
 
     @contextmanager
     def timed(self) -> Iterator[None]:

@@ -7,7 +7,7 @@ of its answer; the cheapest one answers, and if it fails, the next one.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from operator import itemgetter
@@ -23,6 +23,7 @@ from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.column import STAMP
+from hybridlog.schema.states import GONE
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import (
     ResourceError,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.query.ranges import Ranges
+    from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -428,20 +430,22 @@ class Planner:
         """Number of messages of a part without a predicate."""
         return self._count_part(self._choose(part, Need.COUNT), part)
 
-    def count_expired(self) -> int:
-        """Number of messages, in the range, whose payloads were deleted to make room.
+    def count_expired(self) -> Counter[State]:
+        """Number of messages, in the range, whose payloads are gone, by state.
 
         Raises:
             TimeError: as for `parts`.
             TopicError: as for `parts`.
         """
-        total = 0
+        found: Counter[State] = Counter()
         for part in self.parts():
-            gone = tuple(one for one in (*part.channels, *part.undecodable) if one.is_expired)
-            if gone:
-                own = replace(part, channels=gone, undecodable=(), predicate=None)
-                total += self._count_stored(own)
-        return total
+            for state in GONE:
+                channels = (*part.channels, *part.undecodable)
+                gone = tuple(one for one in channels if one.state is state)
+                if gone:
+                    own = replace(part, channels=gone, undecodable=(), predicate=None)
+                    found[state] += self._count_stored(own)
+        return found
 
     def count_unindexed(self, parts: Iterable[Part]) -> int:
         """Number of messages of running recordings, in the range, that the index lacks.

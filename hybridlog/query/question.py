@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hybridlog.query.times import TimeLike
-from hybridlog.schema.states import State, encoding_of, expired_state, state_of
+from hybridlog.schema.states import GONE, State, encoding_of, state_of
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.times import END, span_of
 
@@ -102,7 +102,7 @@ class RecordedChannel:
         """Decodes its payloads; made when first used."""
         from hybridlog.schema.codecs import codec_for
 
-        return codec_for(self.channel, expired_state(self.recording))
+        return codec_for(self.channel)
 
     def arrow_type(self, fields: Collection[str] | None = None) -> Any:
         """Arrow type of its messages, as far as a definition fixes it.
@@ -126,7 +126,7 @@ class RecordedChannel:
     @property
     def is_expired(self) -> bool:
         """True if the payloads of its messages were deleted to make room, or not copied yet."""
-        return self.state in {State.EXPIRED, State.NOT_COPIED}
+        return self.state in GONE
 
     @property
     def encoding(self) -> str:
@@ -136,8 +136,7 @@ class RecordedChannel:
     @property
     def state(self) -> State:
         """The state of its messages; some may be unreadable."""
-        state = state_of(self.channel.message_encoding)
-        return expired_state(self.recording) if state is State.EXPIRED else state
+        return state_of(self.channel.message_encoding)
 
 
 @dataclass(frozen=True, eq=False)

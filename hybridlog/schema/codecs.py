@@ -11,7 +11,7 @@ from hybridlog.schema.codec import Codec, OpaqueCodec, decode_each
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.definition_text import canonical
 from hybridlog.schema.objects import Objects
-from hybridlog.schema.states import State, encoding_of, state_of
+from hybridlog.schema.states import GONE, State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -30,19 +30,19 @@ _MAX_NAME = 1000  # bytes
 _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "omgidl")}
 
 
-def codec_for(channel: Channel, expired: State = State.EXPIRED) -> Codec:
+def codec_for(channel: Channel) -> Codec:
     """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
 
     Args:
         channel: The channel; its message encoding and schema determine the codec.
-        expired: State of its messages if their payloads have expired.
     """
     schema = channel.schema
-    if state_of(channel.message_encoding) is State.EXPIRED:
+    state = state_of(channel.message_encoding)
+    if state in GONE:
         from hybridlog.schema.reduced_codec import ExpiredCodec
 
         encoding = encoding_of(channel.message_encoding, channel.metadata)
-        return ExpiredCodec(codec_for(replace(channel, message_encoding=encoding)), expired)
+        return ExpiredCodec(codec_for(replace(channel, message_encoding=encoding)), state)
     if schema is not None and has_hidden_fields(channel):
         return OpaqueCodec(
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "

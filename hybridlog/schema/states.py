@@ -6,16 +6,16 @@ answers count messages that are not whole, and name the cause.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.wording import counted, unfit
-from hybridlog_storage.messages import EXPIRED, EXPIRED_IDS, ORIGINAL_ENCODING, REDUCED
+from hybridlog_storage.messages import EXPIRED, EXPIRED_IDS, NOT_COPIED, ORIGINAL_ENCODING, REDUCED
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
-    from hybridlog_storage.summary import RecordingSummary
 
 
 class State(StrEnum):
@@ -43,17 +43,14 @@ CAUSES: Final = {
     State.NOT_COPIED: "not copied yet (`hybridlog copy` without --only-fields brings what is left)",
 }
 """Reasons why messages have no payload."""
-_STATES: Final = {REDUCED: State.REDUCED, EXPIRED: State.EXPIRED}
+GONE: Final = (State.EXPIRED, State.NOT_COPIED)
+"""States of expired messages, in the order in which answers name them."""
+_STATES: Final = {REDUCED: State.REDUCED, EXPIRED: State.EXPIRED, NOT_COPIED: State.NOT_COPIED}
 
 
 def state_of(encoding: str) -> State:
     """The state of the messages of a channel, by its encoding; some may still be unreadable."""
     return _STATES.get(encoding, State.WHOLE)
-
-
-def expired_state(recording: RecordingEntry | RecordingSummary) -> State:
-    """The state of the expired messages of a recording: a copy may have been made without them."""
-    return State.NOT_COPIED if recording.lacks_payloads else State.EXPIRED
 
 
 def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:
@@ -72,14 +69,17 @@ def shown_channels(channels: Iterable[ChannelEntry]) -> list[ChannelEntry]:
     return [
         channel
         for number, channel in known.items()
-        if channel.stats.messages or number + EXPIRED_IDS not in known
+        if channel.stats.messages
+        or not {number + EXPIRED_IDS, number + 2 * EXPIRED_IDS} & known.keys()
     ]
 
 
-def expired_messages(entry: RecordingEntry) -> int:
-    """Number of messages of a recording whose payloads were deleted."""
-    gone = (c for c in entry.channels if state_of(c.message_encoding) is State.EXPIRED)
-    return sum(channel.stats.messages for channel in gone)
+def expired_messages(entry: RecordingEntry) -> dict[State, int]:
+    """Number of messages of a recording whose payloads are gone, by state; none is 0."""
+    found: Counter[State] = Counter()
+    for channel in entry.channels:
+        found[state_of(channel.message_encoding)] += channel.stats.messages
+    return {state: found[state] for state in GONE if found[state]}
 
 
 def without_payload(messages: int, state: State = State.REDUCED, cause: str = "") -> str:

@@ -21,11 +21,11 @@ from hybridlog.query.engines import places_of
 from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
-from hybridlog.schema.states import State
+from hybridlog.schema.states import GONE, State
 from hybridlog.sql.columns import whole_message
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.segments.segment_format import EXPIRED_SIZE
+from hybridlog_storage.messages import EXPIRED_IDS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -193,9 +193,9 @@ class TopicOfRecording:
         found += [
             _ChunkRows(self, chunk.segment, chunk.place, (chunk.first, chunk.last))
             for chunk in left
-            if chunk.place.length != EXPIRED_SIZE
+            if not chunk.place.is_expired
         ]
-        gone = {(c.segment, c.number) for c in left if c.place.length == EXPIRED_SIZE}
+        gone = {(c.segment, c.number) for c in left if c.place.is_expired}
         if gone:
             fields = self.session.expired_fields(self.entry, self.topic, gone)
             found += [_FieldRows(self, fields, part) for part in fields.parts]
@@ -208,11 +208,15 @@ class TopicOfRecording:
         return {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
 
     @lazy
-    def expired(self) -> NDArray[np.int64]:
-        """Keys of its expired chunks, see `_keys`."""
-        chunks = self.session.chunks(self.entry, list(self.channels), None, "log")
-        gone = [(c.segment, c.number) for c in chunks if c.place.length == EXPIRED_SIZE]
-        return _keys(*np.array(gone, np.int64).reshape(-1, 2).T)
+    def expired(self) -> dict[State, NDArray[np.int64]]:
+        """Keys of its expired chunks by state, see `_keys`."""
+        found = {}
+        for kind, state in enumerate(GONE, 1):
+            places = self.places.items()
+            gone = [key for key, place in places if place.channels[0] // EXPIRED_IDS == kind]
+            if gone:
+                found[state] = _keys(*np.array(gone, np.int64).T)
+        return found
 
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
         """A chunk; see `Session.chunk`."""
@@ -226,12 +230,16 @@ def _keys(segment: NDArray[np.int64], chunk: NDArray[np.int64]) -> NDArray[np.in
     return (segment << 32) | chunk
 
 
-def _with_expired(states: Any, ref: Any, expired: NDArray[np.int64]) -> Any:
-    """States of rows: tables that were made before payloads expired do not say so."""
-    places = places_of(ref)
-    is_gone = pa.array(np.isin(_keys(places[:, 0], places[:, 1]), expired))
-    is_gone = pc.and_(is_gone, pc.equal(states, State.WHOLE.value))
-    return pc.if_else(is_gone, State.EXPIRED.value, states)
+def _with_expired(states: Any, ref: Any, expired: Mapping[State, NDArray[np.int64]]) -> Any:
+    """States of rows, by their chunks: payloads may have gone, or come, since they were made."""
+    keys = _keys(*places_of(ref)[:, :2].T)
+    was_gone = pc.is_in(states, pa.array([*map(str, GONE)]))
+    states = pc.if_else(was_gone, State.WHOLE.value, states)
+    for state, gone in expired.items():
+        is_gone = pa.array(np.isin(keys, gone))
+        is_gone = pc.and_(is_gone, pc.equal(states, State.WHOLE.value))
+        states = pc.if_else(is_gone, state.value, states)
+    return states
 
 
 def _is_fixed(channel: RecordedChannel) -> bool:
@@ -266,19 +274,16 @@ class _TableRows:
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.add_group(self._part.file.path, self._part.group)
         expired = self._source.expired
-        is_whole = not (self._table.unreadable or self._table.reduced or len(expired))
-        wanted = own if is_whole else {*own, "state"}
+        is_whole = not (self._table.unreadable or self._table.reduced or expired)
+        wanted = {*own} if is_whole else {*own, "state"}
+        if "state" in wanted:
+            wanted.add("ref")
         try:
-            ours, records = self._table.read(
-                self._part, paths, {*wanted, "ref"} if len(expired) else wanted
-            )
+            ours, records = self._table.read(self._part, paths, wanted)
         except StoreError as error:
             raise self._damaged(error) from error
-        if len(expired):
+        if "state" in wanted:
             ours["state"] = _with_expired(ours["state"], ours["ref"], expired)
-        if self._source.entry.lacks_payloads and "state" in ours:
-            is_gone = pc.equal(ours["state"], State.EXPIRED.value)
-            ours["state"] = pc.if_else(is_gone, State.NOT_COPIED.value, ours["state"])
         yield Rows(ours, records, self._part.rows)
 
 

@@ -198,7 +198,6 @@ class RecordingEntry:
         spans: Number, first and last log time (ns) of each segment that has messages.
         digests: Digest of each valid segment, by its number as text.
         stored: Digest of the files of those with moved or expired chunks.
-        lacks_payloads: Whether it is a copy whose expired payloads have not been copied yet.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
         payloads: Files with columns of payloads: `file`, `bytes`, `digest`, `topic`, `messages`.
@@ -226,7 +225,6 @@ class RecordingEntry:
     spans: list[tuple[int, int, int]] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     stored: dict[str, str] = field(default_factory=dict)
-    lacks_payloads: bool = False
     is_decoded: bool = False
     payloads: list[dict[str, Any]] = field(default_factory=list)
     flushed: dict[int, Flushed] = field(default_factory=dict)

@@ -32,8 +32,12 @@ REDUCED = "hybridlog.reduced"
 """Message encoding of a channel with reduced messages, whose payload was dropped."""
 EXPIRED = "hybridlog.expired"
 """Message encoding of a channel with expired messages, whose payload was deleted."""
+NOT_COPIED = "hybridlog.not_copied"
+"""The same of messages whose payload is to be copied later."""
 EXPIRED_IDS = 1 << 16
-"""Added to the id of a channel: the channel of its expired messages. No file has such ids."""
+"""Added to the id of a channel: the channel of its expired messages; twice this: of those that
+were not copied. No file has such ids."""
+_ENCODINGS = {1: EXPIRED, 2: NOT_COPIED}
 
 
 SUPPLIED = "hybridlog.definition"
@@ -87,20 +91,21 @@ class Channel:
     is_indexed: bool = True
 
 
-def expired_channel(channel: Channel) -> Channel:
+def expired_channel(channel: Channel, encoding: str = EXPIRED) -> Channel:
     """The channel of a channel's expired messages; a reduced one has no payload to expire."""
     if channel.message_encoding == REDUCED:
         return channel
     metadata = {**channel.metadata, ORIGINAL_ENCODING: channel.message_encoding}
-    return replace(channel, message_encoding=EXPIRED, metadata=metadata)
+    return replace(channel, message_encoding=encoding, metadata=metadata)
 
 
 def with_expired(channels: Mapping[int, Channel], ids: Iterable[int]) -> dict[int, Channel]:
     """Channels by id, with those of expired messages among some ids."""
     found = dict(channels)
     for number in ids:
-        if number >= EXPIRED_IDS and number - EXPIRED_IDS in found:
-            found.setdefault(number, expired_channel(found[number - EXPIRED_IDS]))
+        kind, own = divmod(number, EXPIRED_IDS)
+        if kind and own in found:
+            found.setdefault(number, expired_channel(found[own], _ENCODINGS[kind]))
     return found
 
 

@@ -47,8 +47,8 @@ class RecordingSummary(NamedTuple):
         has_losses: Whether its loss ledger has a row.
         has_lost_segments: Whether stored messages of it are missing.
         expired: Number of messages whose payloads were deleted to make room.
+        not_copied: Number of messages whose payloads were not copied yet.
         notes: See there.
-        lacks_payloads: See there.
         look: State of its directory and its journal when its files were read.
         indexed_by: The id of the index that is known to be complete for it; empty if none is.
     """
@@ -70,8 +70,8 @@ class RecordingSummary(NamedTuple):
     has_losses: bool
     has_lost_segments: bool
     expired: int
+    not_copied: int
     notes: list[dict[str, Any]]
-    lacks_payloads: bool
     look: str
     indexed_by: str = ""
 
@@ -111,7 +111,7 @@ MAX_INT: Final = 2**63 - 1
 _SPAN: Final = RecordingSummary._fields.index("span")  # the extent follows
 _TYPES: Final[list[type]] = [
     *(str, str, str, dict, dict, int, str, list, list, str),
-    *(int, int, int, int, bool, bool, int, list, bool, str),
+    *(int, int, int, int, bool, bool, int, int, list, str),
 ]
 _TYPES_WITHOUT_SPAN: Final = [*_TYPES[:_SPAN], type(None), *_TYPES[_SPAN + 1 :]]
 

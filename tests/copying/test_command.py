@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -12,13 +13,13 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli import watching
 from hybridlog.cli.signals import Stopped
-from hybridlog.schema.states import State
+from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
 from hybridlog_storage.errors import PayloadError
 from tests.cli.running import run, started
 from tests.cli.within import answer
-from tests.copying.conftest import answers
+from tests.copying.conftest import answers, expire
 from tests.json_schemas import misfit, schema_of
 from tests.waiting import wait_for
 
@@ -109,7 +110,7 @@ def test_payloads_that_were_not_copied_yet_were_not_deleted(
     assert told in answer("info", label, "--json", store=lab).json["coverage"]
     assert f"payloads {why}" in " ".join(answer("ls", store=lab).out.split())
     (listed,) = answer("ls", "--json", store=lab).json
-    assert listed["lacks_payloads"] == (state is State.NOT_COPIED)
+    assert bool(listed["not_copied"]) == (state is State.NOT_COPIED)
     verified = answer("verify", store=lab)
     assert "to make room" not in verified.out + verified.err
     with hl.open(lab, mongo="none") as store:
@@ -124,6 +125,54 @@ def test_payloads_that_were_not_copied_yet_were_not_deleted(
         assert found.to_arrow()["state"].to_pylist() == [state]
     arrays = answer("sql", "select sum(len(data)) from cloud", store=lab)
     assert why in " ".join(arrays.err.split())
+
+
+def test_some_were_deleted_before_and_others_not_copied_yet(robots: Path, tmp_path: Path) -> None:
+    """Each message knows its own state, in a copy of a copy, too, and when payloads follow."""
+    here, lab, there = tmp_path / "here", tmp_path / "lab", tmp_path / "there"
+    with hl.open(robots, mongo="none") as robot:
+        robot.copy(here, ["noted"])
+    with hl.open(here, mongo="none") as store:
+        expire(store, "noted", [0])
+        was = Counter(one.state for one in store.topic("/cloud"))
+    gone = was[State.EXPIRED]
+    assert gone
+    assert was[State.WHOLE]
+    run("copy", lab, "--store", here, "--only-fields")
+    run("copy", there, "--store", lab)
+    for place in (lab, there):
+        assert not answer("verify", "--json", store=place).json["findings"]
+        counted = _told(place)
+        assert counted == {State.EXPIRED: gone, State.NOT_COPIED: was[State.WHOLE]}
+    run("copy", there, "--store", here)
+    assert _told(there) == was
+
+
+def _told(path: Path) -> Counter[State]:
+    """States of a topic's messages, that all places agree on."""
+    with hl.open(path, mongo="none") as store:
+        query = store.topic("/cloud")
+        found = Counter(one.state for one in query)
+        told = query.completeness()
+        assert (told.expired, told.not_copied) == (found[State.EXPIRED], found[State.NOT_COPIED])
+        sql = store.sql("select state, count(*) from cloud group by 1").to_arrow().to_pydict()
+        assert dict(zip(*sql.values(), strict=True)) == found
+        (one,) = store.summaries()
+        (listed,) = answer("ls", "--json", store=path).json
+        assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)
+    raw = answer("fetch", "cloud", "-o", path / "cut.mcap", "--force", store=path).err
+    words = {State.EXPIRED: one.expired, State.NOT_COPIED: one.not_copied}
+    for state, number in words.items():
+        told_by = (
+            " ".join(answer("ls", store=path).out.split()),
+            answer("info", "--json", store=path).json[0]["coverage"],
+        )
+        for text in told_by:
+            assert (CAUSES[state] in text) == bool(number)
+            assert not number or f"{number} " in text
+        sentence = f"{without_payload(found[state], state)}: not in this answer"
+        assert (sentence in " ".join(raw.split())) == bool(number)
+    return found
 
 
 def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:

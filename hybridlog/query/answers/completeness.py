@@ -18,6 +18,7 @@ from hybridlog_storage.errors import IncompleteError
 if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question
+    from hybridlog.schema.states import State
     from hybridlog_storage.catalog import RecordingEntry
 
 JOURNAL_LOST = "journal lost"
@@ -36,8 +37,8 @@ class Completeness:
             the range, all of it.
         is_exact: False if an unknown number is lost besides.
         reduced: Messages of which only the fields are stored.
-        expired: Those of them whose payloads were deleted to make room, or not copied yet.
-        why_expired: Which of the two, in words.
+        expired: Those of them whose payloads were deleted to make room.
+        not_copied: Those of them whose payloads were not copied yet.
         rows: Rows of the loss ledger, with the label of their `recording`.
         unwritten: Messages that a running recorder has taken and not written yet, which are not
             lost; None for an unknown number.
@@ -53,7 +54,7 @@ class Completeness:
     is_exact: bool
     reduced: int = 0
     expired: int = 0
-    why_expired: str = ""
+    not_copied: int = 0
     rows: tuple[Mapping[str, Any], ...] = ()
     unwritten: int | None = 0
     unindexed: int = 0
@@ -69,14 +70,10 @@ class Completeness:
 
     def __str__(self) -> str:
         """The missing messages in words: `4 messages are lost`, and payloads by cause."""
-        from hybridlog.schema.states import State, without_payload
+        from hybridlog.schema.states import without_payload
 
-        found, reduced = [self._losses()], self.reduced - self.expired
-        if reduced:
-            found.append(without_payload(reduced))
-        if self.expired:
-            found.append(without_payload(self.expired, State.EXPIRED, self.why_expired))
-        return "; ".join(found)
+        gone = (without_payload(number, state) for state, number in _gone(self).items())
+        return "; ".join([self._losses(), *gone])
 
     def _losses(self) -> str:
         if not self.has_losses:
@@ -153,6 +150,19 @@ def not_indexed(messages: int) -> str:
     return f"{counted(messages, 'message')} {are} not indexed yet, nor in this answer of MongoDB."
 
 
+def _gone(counted: Completeness | Counters) -> dict[State, int]:
+    """Number of messages without their payloads, by state; none is 0."""
+    from hybridlog.schema.states import State
+
+    reduced = counted.reduced - counted.expired - counted.not_copied
+    found = {
+        State.REDUCED: reduced,
+        State.EXPIRED: counted.expired,
+        State.NOT_COPIED: counted.not_copied,
+    }
+    return {state: number for state, number in found.items() if number}
+
+
 def left_out(question: Question, counters: Counters, expired: str) -> Iterator[str]:
     """Messages that an answer could not read or has no payload of."""
     from hybridlog.schema.states import State, without_fields, without_payload
@@ -165,16 +175,11 @@ def left_out(question: Question, counters: Counters, expired: str) -> Iterator[s
             f"{counted(counters.without_arrays, 'message')} could not be tested: {its} {expired}; "
             "of long arrays only summaries are left."
         )
-    gone = {
-        State.REDUCED: counters.reduced - counters.expired,
-        State.EXPIRED: counters.expired,
-    }
-    for state, number in gone.items():
-        if number:
-            yield (
-                f"{without_payload(number, state, expired if state is State.EXPIRED else '')}: "
-                "not in this answer; --where and --fields find the fields."
-            )
+    for state, number in _gone(counters).items():
+        yield (
+            f"{without_payload(number, state)}: not in this answer; --where and --fields find "
+            "the fields."
+        )
     if counters.lacking:
         yield f"{without_fields(counters.lacking, State.EXPIRED, expired)}; these are null."
     reasons: Counter[str] = Counter()
@@ -241,14 +246,14 @@ def line_of(loss: Mapping[str, Any]) -> str:
 
 def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:
     """The completeness of a recording in words: `complete`, or the number of missing messages."""
-    from hybridlog.schema.states import expired_messages, expired_state, without_payload
+    from hybridlog.schema.states import expired_messages, without_payload
 
     found = _coverage(entry, [loss for loss in losses if loss["cause"] not in NOT_LOST])
     for cause, what in NOT_LOST.items():
         messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
         found += f"; {counted(messages, 'message')} {what}" if messages else ""
-    messages = expired_messages(entry)
-    return found + (f"; {without_payload(messages, expired_state(entry))}" if messages else "")
+    gone = (without_payload(number, state) for state, number in expired_messages(entry).items())
+    return "; ".join([found, *gone])
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
-from hybridlog.schema.states import CAUSES, State, expired_state
+from hybridlog.schema.states import CAUSES, GONE, State
 from hybridlog_storage.errors import HybridlogError, TimeError
 from hybridlog_storage.settings import EXPIRED
 from hybridlog_storage.times import BEGIN, END, span_of
@@ -68,7 +68,7 @@ def completeness_of(
         unindexed += lacks
         late += [not_indexed(lacks)] if lacks else []
         if cost is not None:
-            is_short = cost.expired or cost.lacking or cost.without_arrays
+            is_short = cost.lacking or cost.without_arrays
             sentences += left_out(one, cost, _why_expired(session, one) if is_short else "")
     by_recording: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     known: set[tuple[Any, ...]] = set()
@@ -87,9 +87,9 @@ def completeness_of(
         is_exact=not any(row["count"] is None for row in lost)
         and all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows),
         reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
-        + expired,
-        expired=expired,
-        why_expired=_why_expired(session, question) if expired else "",
+        + expired.total(),
+        expired=expired[State.EXPIRED],
+        not_copied=expired[State.NOT_COPIED],
         rows=tuple(lost),
         unwritten=unwritten,
         unindexed=unindexed,
@@ -101,20 +101,18 @@ def completeness_of(
 
 
 def _why_expired(session: Session, question: Question) -> str:
-    """Why payloads that an answer lacks have expired: a copy may be waiting for them."""
-    summaries = session.snapshot().summaries
-    chosen = [summaries[place] for place in session.chosen(question).tolist()]
-    states = {expired_state(one) for one in chosen if one.expired} or {State.EXPIRED}
-    return ", or ".join(CAUSES[state] for state in sorted(states))
+    """Why payloads that an answer lacks are gone: a copy may be waiting for them."""
+    found = _expired(session, question)
+    return ", or ".join(CAUSES[state] for state in GONE if found[state]) or CAUSES[State.EXPIRED]
 
 
-def _expired(session: Session, question: Question) -> int:
-    """Number of messages in the range of a question whose payloads were deleted."""
+def _expired(session: Session, question: Question) -> Counter[State]:
+    """Number of messages in the range of a question whose payloads are gone, by state."""
     if EXPIRED not in session.directory.settings.requires:
-        return 0
+        return Counter()
     with suppress(TimeError):  # nothing is in the range
         return Planner(session, question, Counters()).count_expired()
-    return 0
+    return Counter()
 
 
 def _rows_of(session: Session, question: Question) -> list[Mapping[str, Any]]:

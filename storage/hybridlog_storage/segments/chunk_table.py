@@ -20,7 +20,7 @@ from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.compression import decompress
-from hybridlog_storage.segments.segment_format import EXPIRED_SIZE, checked_frame
+from hybridlog_storage.segments.segment_format import ADDED_IDS, checked_frame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -109,15 +109,15 @@ class ChunkTable:
     @property
     def is_expired(self) -> NDArray[np.bool_]:
         """bool[n], True for chunks whose payloads were deleted."""
-        return np.asarray(self.chunks["length"] == EXPIRED_SIZE)
+        return np.isin(self.chunks["length"], [*ADDED_IDS])
 
     def with_expired(self) -> ChunkTable:
         """The table with the messages of expired chunks on channels of their own."""
-        rows = np.repeat(self.is_expired, self.chunks["parts"])
-        if not rows.any():
+        if not self.is_expired.any():
             return self
-        parts = self.parts.copy()
-        parts["channel"][rows] += EXPIRED_IDS
+        parts, length = self.parts.copy(), np.repeat(self.chunks["length"], self.chunks["parts"])
+        for size, added in ADDED_IDS.items():
+            parts["channel"][length == size] += added
         return replace(self, parts=parts)
 
     def as_stored(self) -> ChunkTable:

@@ -33,12 +33,11 @@ from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
     CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
-    EXPIRED_OPCODE,
+    CONTENT_ELSEWHERE,
     FORMAT_VERSION,
     INDEX_HEAD,
     LIBRARY,
     MAGIC,
-    MOVED_OPCODE,
     PROFILE,
     PROOF,
     RECORDING_METADATA,
@@ -392,7 +391,7 @@ class SegmentFile:
         _, _, first, last, size, _ = CHUNK_HEAD.unpack_from(record)
         self._append([record, own])
         checksums = {"crc": proof.record, "trailer_crc": crc32(own)}
-        if record[0] in {MOVED_OPCODE, EXPIRED_OPCODE}:
+        if record[0] in CONTENT_ELSEWHERE:
             self.table.chunk(
                 offset=offset,
                 length=len(record),

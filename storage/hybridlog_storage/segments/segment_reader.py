@@ -33,7 +33,7 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_content,
     read_record,
 )
-from hybridlog_storage.messages import EXPIRED_IDS, Buffer, Channel, with_expired
+from hybridlog_storage.messages import Buffer, Channel, with_expired
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import (
     MAX_HEAD,
@@ -46,12 +46,12 @@ from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_file import digest_of
 from hybridlog_storage.segments.segment_format import (
+    ADDED_IDS,
     CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
     COMPACTED_METADATA,
+    CONTENT_ELSEWHERE,
     END_METADATA,
-    EXPIRED_OPCODE,
-    EXPIRED_SIZE,
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
@@ -109,6 +109,11 @@ class ChunkPlace:
     channels: tuple[int, ...]
     crc: int
     trailer_crc: int
+
+    @property
+    def is_expired(self) -> bool:
+        """True if its payloads were deleted, or are to be copied later."""
+        return self.length in ADDED_IDS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -453,7 +458,7 @@ class SegmentReader:
             if crc32(record) != place.crc:
                 raise SegmentError("its checksum differs")
             compressed, fields = 0, None
-            if len(record) == EXPIRED_SIZE:
+            if len(record) in ADDED_IDS:
                 left = self._expired(place, record)
                 batch, fields = left.batch, left.fields
             else:
@@ -491,12 +496,14 @@ class SegmentReader:
     def _expired(self, place: ChunkPlace, record: memoryview) -> ExpiredMessages:
         """The remains of an expired chunk: as many messages as it has, of its channels."""
         opcode, length, *_ = CHUNK_HEAD.unpack_from(record)
-        if opcode != EXPIRED_OPCODE or length + RECORD_HEAD.size != len(record):
+        is_one = CONTENT_ELSEWHERE.get(opcode) == len(record) == length + RECORD_HEAD.size
+        if not is_one:
             raise SegmentError("no chunk record is there")
         if self._contents is None:
             raise SegmentError("its fields lie in files of fields")
         left = self._contents.expired(self.number, place.number)
         batch = left.batch
+        batch.channel = batch.channel + np.int32(ADDED_IDS[len(record)])
         times = (place.first, place.last)
         is_all = (
             len(batch)
@@ -558,7 +565,7 @@ class SegmentReader:
     def _read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         trailer = self.read(place.offset + place.length, place.trailer)
         if crc32(trailer) == place.trailer_crc:
-            added = EXPIRED_IDS if place.length == EXPIRED_SIZE else 0
+            added = ADDED_IDS.get(place.length, 0)
             return {number + added: times for number, times in message_times(trailer).items()}
         batch = self.read_chunk(place).batch
         channels = distinct(batch.channel).tolist()
@@ -688,7 +695,7 @@ _WANTED = frozenset(
 
 def _listed_counts(table: ChunkTable) -> dict[int, int]:
     """Messages of each channel in chunks with their content."""
-    is_here = ~np.isin(table.chunks["length"], [MOVED_SIZE, EXPIRED_SIZE])
+    is_here = ~np.isin(table.chunks["length"], [*CONTENT_ELSEWHERE.values()])
     rows = np.repeat(is_here, table.chunks["parts"])
     totals = replace(table, parts=table.parts[rows]).by_channel()
     return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
