@@ -788,7 +788,8 @@ class Session:
         for place in places:
             summary = summaries[place]
             entry = self._moment.entries.get(summary.id) or self._entries.get(summary.id)
-            if entry is None and not summary.has_losses and summary.status == "complete":
+            is_complete = not summary.has_losses and summary.status == "complete"
+            if entry is None and is_complete and not self.directory.lost_of(summary.label):
                 continue
             entry = entry or self.entry_of(summary)
             if entry.status != "complete" or entry.end.get("losses"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import chain, islice
 from pathlib import Path
@@ -95,11 +95,13 @@ def opened_store(
             _print_repairs(store, doing)
         else:
             _print_rebuilt(store, doing)
+        told = {*store.repairs.unreadable}
         try:
             yield store
             store.mend()
             _print_left(store)
         finally:
+            _print_unreadable(store, told)
             _print_rebuilt(store, "" if records else doing)
 
 
@@ -141,8 +143,7 @@ def _print_repairs(store: Store, doing: str) -> None:
             f"{copy} is a copy of recording {original}, which is used. Remove one of them: "
             f"`hybridlog rm {copy}`."
         )
-    for recording, problem in repairs.unreadable.items():
-        note(f"Recording {recording} cannot be read: {problem}")
+    _print_unreadable(store, ())
     if repairs.disk_full is not None:
         note(
             "The disk of the store is full, so nothing in it is repaired or noted. Remove "
@@ -151,6 +152,11 @@ def _print_repairs(store: Store, doing: str) -> None:
     elif not (store.directory.is_writable or store.directory.is_remote):
         note(f"The store {store.directory.path} is read-only; its segments answer.")
     _print_rebuilt(store, doing)
+
+
+def _print_unreadable(store: Store, told: Collection[str]) -> None:
+    for recording in store.repairs.unreadable.keys() - told:
+        note(f"Recording {recording} cannot be read: {store.repairs.unreadable[recording]}")
 
 
 def _print_rebuilt(store: Store, doing: str) -> None:

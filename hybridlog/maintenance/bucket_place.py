@@ -97,7 +97,7 @@ class BucketPlace:
             found = copied_of(self._target, label)
         else:
             found = Copied(label, content=content_of(_digests(row[1])))
-        return replace(found, is_damaged=self._target.is_damaged(label))
+        return replace(found, is_damaged=bool(self._target.lost_of(label)))
 
     def segments(self, recording: str) -> dict[int, str]:
         """As of `Place`."""
@@ -208,6 +208,7 @@ class BucketPlace:
             RefusedError: More is lost than was sent.
         """
         target, recording, proven = self._target, self._recording, {*self._proven.values()}
+        row, fields = self._catalog.recording(recording), None
         for _ in range(TRIES):
             with suppress(ObjectExistsError), target.changing():
                 known = self.have([recording]).get(recording)
@@ -218,8 +219,11 @@ class BucketPlace:
                     for path, file in self._lost(known.label).items()
                     if file in proven
                 }
-                if found:
-                    target.mend(known.label, found)
+                target.look_closely()
+                if any(path.startswith(f"{TABLES}/") for path in target.lost_of(known.label)):
+                    fields = fields or ({} if row is None else self._bring_fields(row[1]))
+                if found or fields is not None:
+                    target.mend(known.label, found, fields)
                     self._own.put(describe(self._own, take_inventory(target, known.label)))
                 left = target.lost_of(known.label)
                 break
@@ -320,6 +324,7 @@ class BucketPlace:
     def problems(self, recording: str) -> list[str]:
         """As of `Place`; damaged objects count as lost from here on."""
         label = self._target.labels_by_id().get(recording)
+        self._target.look_closely()
         objects = {} if label is None else self._target.files_of(label)
 
         def is_whole(file: CopiedFile) -> bool:

@@ -370,7 +370,8 @@ def _is_current(
 
 def _is_empty(directory: StoreDirectory, label: str) -> bool:
     listing = directory.listing(label)
-    is_empty = not (listing.journal or listing.sealed or listing.open)
+    # What a list names was not begun a moment ago: its objects are lost.
+    is_empty = not (listing.journal or listing.sealed or listing.open or directory.is_remote)
     if is_empty and not _OURS.issuperset(listing.others):
         raise StoreError("it has neither a journal nor a segment, but other files")
     return is_empty

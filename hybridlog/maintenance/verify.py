@@ -19,6 +19,7 @@ from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_file import sealed_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -196,6 +197,7 @@ class _Check:
         self._contents = RecordingPayloads(self._path)
         self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
+        self._lost: set[str] = set()  # files that were found to be lost
         self._is_damaged = False
         self._has_index = False
 
@@ -203,7 +205,8 @@ class _Check:
         """Add a problem."""
         if self._directory.is_remote:
             cure = _COPY_AGAIN
-        self._result.findings.append(Finding(self._label, place, problem, cure))
+        if place not in self._lost:
+            self._result.findings.append(Finding(self._label, place, problem, cure))
 
     def run(self, repairs: RepairReport, progress: Progress | None) -> None:
         """Check the whole recording.
@@ -222,6 +225,10 @@ class _Check:
         is_held = holder is not None
         self._has_index = not is_held and self._label not in repairs.copies
         inventory = take_inventory(self._directory, self._label)
+        lost = self._directory.lost_of(self._label)
+        for path in sorted(lost):
+            self.found(path, "its object is missing or was changed", _COPY_AGAIN)
+        self._lost = {*lost}
         self._indexer = ChunkIndexer(inventory.id)
         self._journal(inventory)
         self._files(inventory, is_held=is_held)
@@ -276,6 +283,8 @@ class _Check:
     def _files(self, inventory: Inventory, *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
+            if sealed_name(misfit.segment) in self._lost:
+                continue
             can_mend = misfit.is_unlisted or misfit.belongs is not None
             self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE_LOST)
         for name in inventory.listing.open.values():

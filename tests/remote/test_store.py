@@ -33,7 +33,8 @@ from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.lists import StoreList, list_name
 from hybridlog_storage.remote.store import RemoteDirectory
-from tests.cli.within import answer
+from tests.cli import running as commands
+from tests.cli.within import Answer, answer
 from tests.limits import Limit
 from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy
@@ -365,7 +366,7 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, changes: bool) -
         assert question.count() == left + 20
         assert question.completeness().has_losses
         found = store.verify()
-        assert [(one.recording, one.place) for one in found.findings] == [("run", "segment 1")]
+        assert [(one.recording, one.place) for one in found.findings] == [("run", "000001.mcap")]
         assert "hybridlog copy" in found.findings[0].cure
         assert found.recordings == 2
     with hl.open(tmp_path / "back", mongo="none", create=True) as store:
@@ -387,13 +388,13 @@ def test_lost_fields_and_journals(here: Path, address: str, proxy: Proxy) -> Non
     files.mounted.clear()
     with hl.open(address) as store:
         assert store.topic("/arm").where("n < 10").count() == 20
-        assert not store.verify().findings
+        assert [one.place for one in store.verify().findings] == [table]
     lose(address, "/journal", table.split("/")[-1][:32])
     files.mounted.clear()
     with hl.open(address) as store:
-        (finding,) = store.verify().findings
-        assert finding.place == "journal"
-        label = finding.recording
+        findings = store.verify().findings
+        assert [one.place for one in findings] == ["journal", table]
+        label = findings[0].recording
         assert store.topic("/arm").where("n < 10").count() == 20
     with hl.open(here, mongo="none") as source:
         proxy.requests.clear()
@@ -527,3 +528,43 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
         hl.open(published, mongo="embedded")
     assert address_of(Path(published)) == published
     assert address_of("./s3") is None
+
+
+def test_all_commands_tell_of_lost_objects(here: Path, address: str) -> None:
+    """In words and in JSON; of a recording that is left out by its bounds, too."""
+    publish_all(here, address, ("run", "short-0"))
+    with hl.open(here, mongo="none") as source:
+        run = source.entry("run").id
+
+    def told(*words: str) -> Answer:
+        files.mounted.clear()
+        return answer(*words, store=Path(address))
+
+    for lost, (listed, missing) in {
+        "000001.mcap": ("stored data lost", "20 lost"),
+        "/journal": ("journal lost", "an unknown number lost"),
+    }.items():
+        lose(address, lost, run)
+        assert listed in told("ls").out
+        assert told("ls", "--json").json[0]["status"] != "complete"
+        for count in ("n < 10", "n > 10000"):
+            assert missing in told("fetch", "arm", "--where", count, "--count").err
+        places = [one["place"] for one in told("verify", "--json").json["findings"]]
+        assert lost.strip("/") in places
+        assert "000001.mcap" in places
+        assert (
+            f"run: {lost.strip('/')}: " in commands.run("verify", store=Path(address), code=1).out
+        )
+    for name in ("000000.mcap", "000002.mcap"):
+        lose(address, name, run)
+    assert "neither a journal nor a segment" in told("ls").err
+    assert {"000000.mcap", "journal"} < {
+        f["place"] for f in told("verify", "--json").json["findings"]
+    }
+    files.mounted.clear()
+    with pytest.raises(StoreError, match="neither a journal nor a segment"):
+        hl.open(address).topic("arm").where("n < 10").count()
+    with hl.open(here, mongo="none") as source:
+        assert source.copy(address, ["run", "short-0"]).copied == ["run"]
+    assert not told("verify", "--json").json["findings"]
+    assert told("ls", "--json").json[0]["status"] == "complete"

@@ -344,6 +344,10 @@ class StoreDirectory:
     def look_closely(self) -> None:
         """Find out which files are there that a list only says to be there; here none is."""
 
+    def lost_of(self, label: str) -> Collection[str]:
+        """Files that a list says to be there, and are not; here nothing says so."""
+        return ()
+
     def listing(self, label: str) -> Listing:
         """Read the content of a recording's directory.
 

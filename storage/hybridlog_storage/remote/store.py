@@ -615,14 +615,16 @@ class RemoteDirectory(StoreDirectory):
         """The object of each file of a recording, without those that are lost."""
         return self.source.files_of(label)
 
-    def is_damaged(self, label: str) -> bool:
-        """True if objects of a recording were lost, as far as it was compared with them."""
-        return bool(self.lost_of(label))
-
     def lost_of(self, label: str) -> dict[str, Object]:
-        """The files of a recording whose objects were lost, as far as it was compared with them."""
-        there = self.files_of(label)
-        return {p: o for p, o in self._now.recordings[label].files.items() if p not in there}
+        """The files of a recording, which is compared with its objects, that were lost.
+
+        After `look_closely` its fields are among them, with `tables/` before their paths.
+        """
+        recording, lost = self._now.recordings[label], self.source.bucket.lost
+        self.source.compare(recording.id)
+        mine = _tables_of(recording.id)
+        tables = {f"{TABLES}/{p}": o for p, o in self._now.tables.items() if mine.fullmatch(p)}
+        return {p: o for p, o in {**recording.files, **tables}.items() if o in lost}
 
     def add_recording(
         self, label: str, recording: ListedRecording, tables: Mapping[str, Object]
@@ -632,11 +634,21 @@ class RemoteDirectory(StoreDirectory):
         self._relist(label, recording)
         self._replace_tables(recording.id, tables)
 
-    def mend(self, label: str, found: Mapping[str, Object]) -> None:
-        """List objects of a recording in the place of lost ones, within `changing`."""
-        self.source.bucket.lost.difference_update(found.values())
+    def mend(
+        self, label: str, found: Mapping[str, Object], tables: Mapping[str, Object] | None
+    ) -> None:
+        """List objects of a recording in the place of lost ones, within `changing`.
+
+        Args:
+            label: The recording.
+            found: Its files that were lost.
+            tables: All files of its fields; None to leave them as they are.
+        """
+        self.source.bucket.lost.difference_update(found.values(), (tables or {}).values())
         listed = self._now.recordings[label]
         self._relist(label, replace(listed, files={**listed.files, **found}))
+        if tables is not None:
+            self._replace_tables(listed.id, tables)
 
     def move(self, old: str, new: str) -> None:
         """Give a recording another label, within `writing`."""
@@ -693,12 +705,17 @@ class RemoteDirectory(StoreDirectory):
         return list_name(self._now.number)
 
     def _replace_tables(self, recording: str, tables: Mapping[str, Object]) -> None:
-        mine = re.compile(rf"[^/]+/{recording}-\d+\.parquet")
+        mine = _tables_of(recording)
         others = {path: o for path, o in self._now.tables.items() if not mine.fullmatch(path)}
         self.source.list = replace(self._now, tables={**others, **tables})
 
     def _relist(self, label: str, recording: ListedRecording) -> None:
         self.source.list = replace(self._now, recordings={**self._now.recordings, label: recording})
+
+
+def _tables_of(recording: str) -> re.Pattern[str]:
+    """The paths of the fields of a recording, below `tables`."""
+    return re.compile(rf"[^/]+/{recording}-\d+\.parquet")
 
 
 def _files_below(folder: Path) -> dict[str, tuple[int, int]]:
