@@ -190,7 +190,7 @@ def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place
         if source.place == address:
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
         target = RemoteDirectory.create_in(address)
-        yield BucketPlace(target, store.catalog, store.session.tables)
+        yield BucketPlace(target, source, store.catalog, store.session.tables)
         return
     if is_ssh(str(to)):
         with ssh_place(str(to), options.ssh, options.program) as server:

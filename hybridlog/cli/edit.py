@@ -201,7 +201,7 @@ def rm_command(given: _Remove) -> None:
             chosen = recordings_of(store, rest).summaries
         targets = {copy: copy for copy in copies} | {one.id: one.label for one in chosen}
         if not given.yes:
-            _confirm(copies, chosen)
+            _confirm(store, copies, chosen)
         for recording, label in targets.items():
             with if_stopped(
                 "A recording whose removal began is gone; the next command that opens the "
@@ -212,13 +212,16 @@ def rm_command(given: _Remove) -> None:
                 output.say(f"deleted {label}")
 
 
-def _confirm(copies: Sequence[str], chosen: Sequence[RecordingSummary]) -> None:
+def _confirm(store: Store, copies: Sequence[str], chosen: Sequence[RecordingSummary]) -> None:
     """Ask for consent; several recordings are shown with what would be lost."""
     labels = [*copies, *(one.label for one in chosen)]
+    pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
+    why = f" ({listed([one for one in dict.fromkeys(pins) if one])})" if any(pins) else ""
+    pinned = f" {output.counted(len(pins), 'pin')} would go, too{why}." if pins else ""
     several = len(labels) > 1
     names = f"{len(labels)} recordings ({listed(labels)})" if several else labels[0]
     if not sys.stdin.isatty():
-        raise UsageError(f"Deleting {names} for good needs --yes.")
+        raise UsageError(f"Deleting {names} for good needs --yes.{pinned}")
     if several:
         for copy in copies:
             output.note(f"  {copy}: a copy")
@@ -231,6 +234,8 @@ def _confirm(copies: Sequence[str], chosen: Sequence[RecordingSummary]) -> None:
         if len(chosen) > _MAX_ROWS:
             output.note(f"  and {len(chosen) - _MAX_ROWS} more")
         names = f"these {len(labels)} recordings"
+    if pinned:
+        output.note(pinned.strip())
     if not click.confirm(f"Delete {names} for good?", err=True):
         output.note("Nothing is deleted.")
         raise click.exceptions.Exit(1)

@@ -7,17 +7,19 @@ and not sent again. The next list names all of a recording: only from then on is
 
 from __future__ import annotations
 
-import secrets
+import platform
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import IN_TYPE, SHARED, SUFFIX
 from hybridlog.entries import describe, put_entry, take_inventory
+from hybridlog.maintenance.copying import SENDING, at_work, is_at_work
 from hybridlog.maintenance.keep import pin_of
 from hybridlog.maintenance.opening import open_catalog
 from hybridlog.maintenance.places import (
@@ -32,6 +34,7 @@ from hybridlog.maintenance.places import (
     edits_of,
     pieces_of,
     problems_of,
+    segments_of,
 )
 from hybridlog.schema.states import expired_messages
 from hybridlog_storage import journal
@@ -47,6 +50,7 @@ from hybridlog_storage.segments.segment_file import sealed_name
 if TYPE_CHECKING:
     from hybridlog.columns.tables import Tables
     from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
     from hybridlog_storage.remote.bucket import Object
     from hybridlog_storage.remote.store import RemoteDirectory
@@ -59,21 +63,28 @@ class BucketPlace:
 
     Args:
         target: The store.
-        catalog: The catalog of the store that is copied from, with what decoding found out.
-        tables: The fields in that store.
+        source: The store that is copied from.
+        catalog: Its catalog, with what decoding found out.
+        tables: Its fields.
     """
 
     proves = False
 
-    def __init__(self, target: RemoteDirectory, catalog: Catalog, tables: Tables) -> None:
+    def __init__(
+        self, target: RemoteDirectory, source: StoreDirectory, catalog: Catalog, tables: Tables
+    ) -> None:
         self.name = target.place
         self._target = target
+        self._source = source
+        store = sha256(f"{source.settings.store_id} {platform.node()}".encode()).hexdigest()
+        self._mine = f"copy-{store[:8]}-"  # begins the ids of pins that copies of this store set
         self._catalog = catalog
         self._tables = tables
         self._own = open_catalog(target)
         self._recording = ""
         self._is_mending = False
-        self._pins: dict[str, str] = {}  # by id of the recording
+        self._pins: set[tuple[str, str]] = set()  # ids of recordings, and of their pins
+        self._held = ExitStack()
         self._damaged: set[Object] = set()
         self._there: dict[str, Object] = {}  # by path below the recording
         self._proven: dict[str, CopiedFile] = {}
@@ -93,16 +104,19 @@ class BucketPlace:
         self._target.source.compare(recording)
         self._target.source.bucket.lost.update(self._damaged)
         row = self._own.recording(recording)
+        for pin in [] if row is None else row[1].pins:  # a copy that was stopped has left some
+            own, _, name = pin["id"].partition(self._mine)
+            if not own and name and not is_at_work(self._source, SENDING + name):
+                self._pins.add((recording, pin["id"]))
         if row is None or expired_messages(row[1]):
             found = copied_of(self._target, label)
         else:
             found = Copied(label, content=content_of(_digests(row[1])))
         return replace(found, is_damaged=bool(self._target.lost_of(label)))
 
-    def segments(self, recording: str) -> dict[int, str]:
+    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
         """As of `Place`."""
-        row = self._own.recording(recording)
-        return {} if row is None else _digests(row[1])
+        return segments_of(self._target, self._target.labels_by_id().get(recording))
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """As of `Place`."""
@@ -174,8 +188,7 @@ class BucketPlace:
         check_proven(state, recording, self._proven)
         found = {_path(file): self._there[_path(file)] for file in self._proven.values()}
         lines += journal.encode(adopted_line(target, state, lacks_payloads=lacks_payloads))
-        row = self._catalog.recording(recording)
-        entry = None if row is None else row[1]
+        entry = self._entry(recording)
         fields = {} if entry is None else self._bring_fields(entry)
         for _ in range(TRIES):
             with suppress(ObjectExistsError), target.changing():
@@ -197,9 +210,16 @@ class BucketPlace:
                 if listed != there:
                     target.add_recording(label, ListedRecording(recording, listed), fields)
                     self._describe(label, entry)
-                self.leave()
                 return label
         raise StoreError(f"{self.name} changes all the time. Copy again.")
+
+    def _entry(self, recording: str) -> RecordingEntry | None:
+        """The entry of a recording in the store that is copied, as its files are now."""
+        row = self._catalog.recording(recording)
+        if row is None:
+            return None
+        label = self._source.label_now(row[1].label, recording)
+        return describe(self._catalog, take_inventory(self._source, label)).entry
 
     def _mend(self) -> str:
         """List what was sent in the place of what was lost; the rest stays as it is.
@@ -208,7 +228,7 @@ class BucketPlace:
             RefusedError: More is lost than was sent.
         """
         target, recording, proven = self._target, self._recording, {*self._proven.values()}
-        row, fields = self._catalog.recording(recording), None
+        entry, fields = self._entry(recording), None
         for _ in range(TRIES):
             with suppress(ObjectExistsError), target.changing():
                 known = self.have([recording]).get(recording)
@@ -221,7 +241,7 @@ class BucketPlace:
                 }
                 target.look_closely()
                 if any(path.startswith(f"{TABLES}/") for path in target.lost_of(known.label)):
-                    fields = fields or ({} if row is None else self._bring_fields(row[1]))
+                    fields = fields or ({} if entry is None else self._bring_fields(entry))
                 if found or fields is not None:
                     target.mend(known.label, found, fields)
                     self._own.put(describe(self._own, take_inventory(target, known.label)))
@@ -229,7 +249,6 @@ class BucketPlace:
                 break
         else:
             raise StoreError(f"{self.name} changes all the time. Copy again.")
-        self.leave()
         if left:
             raise RefusedError(
                 f"{known.label} in {self.name} has lost {', '.join(sorted(left))}, which this "
@@ -287,23 +306,29 @@ class BucketPlace:
         self._own.put(describe(self._own, inventory))
 
     def hold(self, recordings: Sequence[str]) -> bool:
-        """Pin the recordings there: a bucket has no locks. Always true; a crash leaves the pins."""
+        """Pin the recordings there: a bucket has no locks. Always true.
+
+        Pins that a crash leaves go with the next copy of this store.
+        """
         self.leave()
+        folder = self._held.enter_context(at_work(self._source))
+        name = self._mine + folder.name.removeprefix(SENDING)
         reason = "held for a copy that deletes payloads at its source; unpin it if none runs"
-        pins = {one: pin_of(secrets.token_hex(4), (None, None), None, reason) for one in recordings}
-        self._note(pins)
-        self._pins = {recording: pin["id"] for recording, pin in pins.items()}
+        pin = pin_of(name, (None, None), None, reason)
+        self._pins = {(recording, name) for recording in recordings}
+        self._note([(recording, pin) for recording in recordings])
         return True
 
-    def _note(self, lines: Mapping[str, journal.Event]) -> None:
-        """Append a line to each journal of recordings, in one change."""
+    def _note(self, lines: Sequence[tuple[str, journal.Event]]) -> None:
+        """Append lines to journals of recordings, in one change."""
         target = self._target
         for _ in range(TRIES):
             with suppress(ObjectExistsError), target.changing():
                 labels = target.labels_by_id()
-                for recording in lines.keys() & labels.keys():
-                    target.append(labels[recording], lines[recording])
-                    put_entry(target, self._own, labels[recording])
+                for recording, line in lines:
+                    if recording in labels:
+                        target.append(labels[recording], line)
+                        put_entry(target, self._own, labels[recording])
                 return
         raise StoreError(f"{self.name} changes all the time. Copy again.")
 
@@ -313,10 +338,10 @@ class BucketPlace:
 
     def leave(self) -> None:
         """As of `Place`."""
-        pins, self._pins = self._pins, {}
-        if pins:
-            line = journal.UNPINNED
-            self._note({recording: journal.event(line, id=pin) for recording, pin in pins.items()})
+        pins, self._pins = self._pins, set()
+        with self._held:
+            if pins:
+                self._note([(one, journal.event(journal.UNPINNED, id=pin)) for one, pin in pins])
         self._recording, self._upload, self._is_mending = "", None, False
         self._there.clear()
         self._proven.clear()

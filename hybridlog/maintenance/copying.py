@@ -37,6 +37,7 @@ from hybridlog_storage.stopping import pause
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from hybridlog.maintenance.places import Place
     from hybridlog.maintenance.report import Progress
@@ -46,7 +47,8 @@ if TYPE_CHECKING:
 _READ: Final = 1 << 20  # bytes read at once
 _ASKED_AT_ONCE: Final = 1000  # recordings in a question
 _TRIES: Final = 3  # of a recording that is compacted or expires meanwhile
-_SENDING: Final = ".copying-"  # prefix of the folder of a recording whose fields are copied
+SENDING: Final = ".copying-"
+"""Prefix of hidden folders of copies under way in the store that is copied."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,11 +185,11 @@ class _Copying:
                 self._total -= one.stored_bytes
             finally:
                 self._place.leave()
-        if self._proven:
-            try:
+        try:
+            if self._proven:
                 self._let_go(proved)
-            finally:
-                self._place.leave()
+        finally:
+            self._place.leave()
         return self._report
 
     def _let_go(self, proved: Callable[[str, Mapping[int, str]], None]) -> None:
@@ -202,14 +204,15 @@ class _Copying:
         for begin in range(0, len(ids), _ASKED_AT_ONCE):
             there |= self._place.have(ids[begin : begin + _ASKED_AT_ONCE])
         for recording, sent in self._proven.items():
-            now = there.get(recording)
+            now, found = there.get(recording), self._place.segments(recording)
             is_whole = now is not None and not (now.lacks_payloads or now.is_damaged)
-            if now is None or not is_whole or now.expired > expired_in(sent):
+            gone = (topics - sent.expired.get(n, set()) for n, (_, topics) in found.items())
+            if not is_whole or any(gone):
                 problems.append(f"Payloads of {sent.name} stay: its copy in {name} has lost some.")
                 continue
-            digests = self._place.segments(recording)
-            found = {number: one.digest for number, one in sent.sealed.items()}
-            proved(recording, {n: one for n, one in found.items() if digests.get(n) == one})
+            digests = {number: one.digest for number, one in sent.sealed.items()}
+            there_too = {n for n, (digest, _) in found.items() if digests.get(n) == digest}
+            proved(recording, {number: digests[number] for number in there_too})
 
     def _is_same(self) -> bool:
         """True if the place is the source: it sees a file that was made here this moment.
@@ -276,6 +279,11 @@ class _Copying:
             )
             return
         self._report.known.append(known.label)
+        if known.is_damaged:
+            self._report.problems.append(
+                f"{known.label} in {self._place.name} is damaged: `hybridlog copy` without "
+                "--only-fields mends it."
+            )
         may_lack = known.expired and not known.lacks_payloads
         if may_lack and known.expired > expired_in(state):
             self._report.lacking.append(known.label)
@@ -303,9 +311,8 @@ class _Copying:
         if self._source.is_remote or content_of(listed) == known.content:
             return 0
         there, marks = self._place.segments(recording), {mark["segment"] for mark in state.marks}
-        return sum(
-            there.get(number) != digest for number, digest in listed.items() if number not in marks
-        )
+        same = {number for number, (digest, _) in there.items() if listed.get(number) == digest}
+        return len(listed.keys() - marks - same)
 
     def _copy(self, one: RecordingEntry | RecordingSummary) -> None:
         """Copy a recording, whatever label it has now.
@@ -484,13 +491,8 @@ def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory
     """
     from hybridlog.maintenance.expiry import expire
 
-    source.check_writable()
-    _remove_stale(source)
-    folder = source.path / f"{_SENDING}{secrets.token_hex(4)}"
-    held = ExitStack()
-    try:
-        scratch = StoreDirectory.create(folder)
-        held.enter_context(scratch.retaining())
+    with at_work(source) as folder:
+        scratch = StoreDirectory.create(folder / "store")
         path = scratch.recording(sent.label)
         files.make_folder(path, depth=files.IN_FOLDER)
         for file in sent.files:
@@ -500,20 +502,34 @@ def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory
         files.write_file(path / JOURNAL, sent.lines)
         expire(scratch, sent.label, sent.segments, record=not_copied_record)
         yield scratch
+
+
+@contextmanager
+def at_work(source: StoreDirectory) -> Iterator[Path]:
+    """A hidden folder in the store that is copied, locked until the end of the block.
+
+    Those of copies that were stopped are removed.
+    """
+    source.check_writable()
+    folder, held = source.path / f"{SENDING}{secrets.token_hex(4)}", ExitStack()
+    try:
+        for name in files.names(source.path, depth=0):
+            if name.startswith(SENDING) and not is_at_work(source, name):
+                files.remove_tree(source.path / name, depth=files.IN_STORE)
+        files.make_folder(folder, depth=files.IN_STORE)
+        held.enter_context(files.locked_folder(folder, files.IN_STORE))
+        yield folder
     except OSError as error:
-        raise durability.explain(error, folder, "preparing fields in") from error
+        raise durability.explain(error, folder, "copying from") from error
     finally:
         with held, suppress(OSError):
             files.remove_tree(folder, depth=files.IN_STORE)
 
 
-def _remove_stale(source: StoreDirectory) -> None:
-    """Remove hidden folders of copies that were stopped; those in use are locked."""
-    for name in files.names(source.path, depth=0):
-        if name.startswith(_SENDING):
-            with (
-                suppress(StoreError, OSError),
-                StoreDirectory(source.path / name).retaining() as is_unused,
-            ):
-                if is_unused:
-                    files.remove_tree(source.path / name, depth=files.IN_STORE)
+def is_at_work(source: StoreDirectory, name: str) -> bool:
+    """True if a hidden folder of a copy is locked: the copy goes on."""
+    try:
+        with files.locked_folder(source.path / name, files.IN_STORE, 0):
+            return False
+    except OSError as error:
+        return isinstance(error, BlockingIOError)

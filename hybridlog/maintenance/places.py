@@ -179,8 +179,8 @@ class Place(Protocol):
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """Those of some recordings that it has, by id."""
 
-    def segments(self, recording: str) -> dict[int, str]:
-        """Digests of the segments of a recording as they were sealed, by number."""
+    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
+        """Segments of a recording: digests as sealed, and topics that expired, by number."""
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """Begin or go on with a recording; nobody else copies it here until `leave`.
@@ -284,11 +284,9 @@ class DirectoryPlace:
                 found[ids.get(label) or self._directory.id_of(label)] = label
         return found
 
-    def segments(self, recording: str) -> dict[int, str]:
+    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
         """As of `Place`."""
-        label = self._labels().get(recording)
-        state = None if label is None else journal.read(self._directory.recording(label))
-        return {} if state is None else {n: one.digest for n, one in state.sealed.items()}
+        return segments_of(self._directory, self._labels().get(recording))
 
     def begin(self, recording: str, *, wants_payloads: bool, wait_s: float = LOCK_WAIT_S) -> Begun:
         """As of `Place`.
@@ -513,6 +511,12 @@ def problems_of(
     path = directory.recording(label)
     is_whole = is_whole or (lambda file: file.is_whole(path))
     return found + [f"{f.file} is damaged" for f in files_of(inventory) if not is_whole(f)]
+
+
+def segments_of(directory: StoreDirectory, label: str | None) -> dict[int, tuple[str, set[str]]]:
+    """As of `Place`, by the journal of a recording."""
+    state = (label and journal.read(directory.recording(label))) or JournalState()
+    return {n: (one.digest, state.expired.get(n, set())) for n, one in state.sealed.items()}
 
 
 def copied_of(directory: StoreDirectory, label: str) -> Copied:

@@ -154,10 +154,14 @@ class Server:
         found = _mapping(self._ask("have", recordings=[*recordings]))
         return {one: _copied(value) for one, value in found.items() if one in recordings}
 
-    def segments(self, recording: str) -> dict[int, str]:
+    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
         """As of `Place`."""
         found = _mapping(self._ask("segments", recording=recording))
-        return {int(number): str(digest) for number, digest in found.items() if number.isdigit()}
+        return {
+            int(number): (str(one[0]), {*map(str, one[1:])})
+            for number, one in found.items()
+            if number.isdigit() and isinstance(one, list) and one
+        }
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """As of `Place`."""
@@ -334,7 +338,10 @@ def _have(place: DirectoryPlace, request: Mapping[str, Any], _: bytes) -> Any:
 _ANSWERS: Final[Mapping[str, Callable[[DirectoryPlace, Mapping[str, Any], bytes], Any]]] = {
     "sees": lambda place, request, _: place.sees(str(request["mark"])),
     "have": _have,
-    "segments": lambda place, request, _: place.segments(str(request["recording"])),
+    "segments": lambda place, request, _: {
+        number: [digest, *topics]
+        for number, (digest, topics) in place.segments(str(request["recording"])).items()
+    },
     "hold": lambda place, request, _: place.hold([str(one) for one in request["recordings"]]),
     "drop": lambda place, *_: place.drop(),
     "begin": _begin,

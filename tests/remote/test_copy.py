@@ -36,7 +36,7 @@ CUTS = 10
 @contextmanager
 def bucket_at(path: Path, store: hl.Store) -> Iterator[Place]:
     target = RemoteDirectory.create_in(f"s3://{path.as_posix().removeprefix('s3:/')}")
-    yield BucketPlace(target, store.catalog, store.session.tables)
+    yield BucketPlace(target, store.directory, store.catalog, store.session.tables)
 
 
 def place_at(path: Path, store: hl.Store) -> AbstractContextManager[Place]:

@@ -18,6 +18,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.cli import running as commands
 from tests.cli.within import answer
 from tests.copying.conftest import expire
 from tests.remote.conftest import BEGIN, SCAN
@@ -139,7 +140,9 @@ def test_nothing_is_deleted_there_while_it_is_deleted_here(robot: hl.Store, addr
         with hl.open(address) as there:
             assert there.keep({"quota": "1kB", "fields-age": "1d"}).freed_bytes == 0
 
-    place = BucketPlace(RemoteDirectory.create_in(address), robot.catalog, robot.session.tables)
+    place = BucketPlace(
+        RemoteDirectory.create_in(address), robot.directory, robot.catalog, robot.session.tables
+    )
     report = run(robot.directory, place, robot.summaries(), THEN, proved=proved)
     assert (told, report.problems) == ([robot.entry("run").id], [])
     assert states(address) == {"whole": COUNT}
@@ -185,3 +188,80 @@ def test_damaged_objects_are_replaced(
     sent = [path for method, path, _ in proxy.requests if method == "PUT" and ".mcap" in path]
     assert len(sent) == 1
     assert states(address) == {"whole": COUNT}
+
+
+def test_pins_that_a_crash_left_go_with_the_next_copy(robot: hl.Store, address: str) -> None:
+    """Those of a copy under way stay, and those of users."""
+    held: list[list[str]] = []
+
+    def pins() -> list[str]:
+        files.mounted.clear()
+        with hl.open(address) as there:
+            return [pin["id"] for pin in there.entry("run").pins]
+
+    def proved(*_: object) -> None:
+        assert robot.copy(address).known == ["run"]
+        held.append(pins())
+        raise KeyboardInterrupt
+
+    class Cut(BucketPlace):
+        def leave(self) -> None:
+            if not held:
+                super().leave()
+
+    robot.copy(address)
+    with hl.open(address) as there:
+        there.pin("run", reason="mine")
+    mine = pins()
+    target = RemoteDirectory.create_in(address)
+    place = Cut(target, robot.directory, robot.catalog, robot.session.tables)
+    with pytest.raises(KeyboardInterrupt):
+        run(robot.directory, place, robot.summaries(), THEN, proved=proved)
+    assert len(pins()) == len(held[0]) == 2
+    place._held.close()  # as a power cut does
+    files.mounted.clear()
+    assert robot.copy(address).known == ["run"]
+    assert pins() == mine
+    asked = commands.run("rm", "run", store=Path(address), code=2).err
+    assert "1 pin would go, too (mine)" in " ".join(asked.split())
+
+
+def test_only_fields_name_a_damaged_copy(robot: hl.Store, address: str) -> None:
+    """A whole copy mends it, with its fields, which the next answer reads."""
+    robot.copy(address)
+    lose(address, "000001.mcap")
+    report = robot.copy(address, options=CopyOptions(only_fields=True))
+    assert report.known == ["run"]
+    assert "is damaged: `hybridlog copy` without --only-fields mends it" in report.problems[0]
+    tables = [o.name for o in Bucket(address).objects("tables")]
+    lose(address, "000002.mcap")
+    Bucket(address).delete(tables)
+    files.mounted.clear()
+    assert robot.copy(address).copied == ["run"]
+    files.mounted.clear()
+    with hl.open(address) as there:
+        assert not there.verify().findings
+        assert there.topic("scan").where("n < 10").count() == 10
+    Bucket(address).delete([o.name for o in Bucket(address).objects("tables")])
+    files.mounted.clear()
+    assert robot.copy(address).known == ["run"]  # messages answer, too
+    assert robot.copy(address, options=CopyOptions(check=True)).copied == ["run"]
+    files.mounted.clear()
+    with hl.open(address) as there:
+        assert not there.verify().findings
+
+
+def test_the_same_number_of_others_expired_there(robot: hl.Store, address: str) -> None:
+    """The last look before payloads go compares what expired, not how much of it."""
+    expire(robot, "run", [0])
+
+    class Other(BucketPlace):
+        def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
+            found = super().segments(recording)
+            return {n: (digest, {"/scan"} if n == 1 else set()) for n, (digest, _) in found.items()}
+
+    target = RemoteDirectory.create_in(address)
+    place = Other(target, robot.directory, robot.catalog, robot.session.tables)
+    report = run(robot.directory, place, robot.summaries(), THEN)
+    assert report.copied == ["run"]
+    assert "Payloads of run stay: its copy in" in report.problems[0]
