@@ -479,7 +479,7 @@ def readme_rows(results: Results) -> list[Row]:
 def readme(journal: Journal) -> str:
     """The README's table with what belongs to it, from `BEGIN` to `END`."""
     results = Results(journal)
-    lines, bags = [], []
+    lines, bags, at_least = [], [], False
     for what, short, values, best, unit, above in readme_rows(results):
 
         def shown(name: str, of: Values = values, unit: str = unit, up: Any = above) -> str:
@@ -491,6 +491,7 @@ def readme(journal: Journal) -> str:
         strongest = best(rivals, key=rivals.__getitem__) if rivals else None
         rival = f"{shown(strongest)} ({title(strongest).split(' (')[0]})" if strongest else ""
         bag = shown("bagfile") if "bagfile" in values else ""
+        at_least |= bool(above)
         lines.append(_line([what, shown(OURS) if OURS in values else "", rival, bag]))
         if bag and OURS in values:
             two = {name: values[name].median for name in (OURS, "bagfile")}
@@ -498,10 +499,11 @@ def readme(journal: Journal) -> str:
                 bags.append(short)
     ahead = f"A ROS bag is ahead in {' and '.join(bags)}. " if bags else ""
     option = "" if results.scale == "full" else f" --{results.scale}"
+    offered = "≥: no more could be offered, so two such figures rank nothing. " if at_least else ""
     short = "It was a short run, in which loads are only doubled. " if option else ""
     text = (
         f"{conditions(results)} `python -m benchmarks{option}` makes them again in under an hour. "
-        f"{short}The best database is the best of MongoDB, PostgreSQL and SQLite. "
+        f"{short}{offered}The best database is the best of MongoDB, PostgreSQL and SQLite. "
         f"{ahead}A ROS bag neither compresses nor indexes; to count in it is a loop over its "
         "messages. The [benchmarks](docs/benchmarks.md) have the other systems, the spread of "
         "each figure, and what a store costs in use."

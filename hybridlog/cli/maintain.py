@@ -66,7 +66,7 @@ def verify_command(given: _Verify) -> None:
 def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
     for finding in result.findings:
         of = f"{finding.recording}: " if finding.recording else ""
-        output.say(f"{of}{finding.place}: {finding.problem}; {finding.cure}")
+        output.say(f"{of}{finding.place}: {finding.problem.removesuffix('.')}; {finding.cure}")
     if quiet:
         return
     verdict = "all is well" if result.index else "all is well in the files"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -425,6 +426,8 @@ def _is_field(path: str, known: Mapping[str, str]) -> bool:
 
 
 def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
+    if re.search(r"\[[0-9:]", path):
+        return f"{path!r} is a part of an array, and no column: take the array, or ask in SQL."
     near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
     return (
         f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "

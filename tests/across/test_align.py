@@ -356,6 +356,8 @@ def test_what_is_refused(logs: Logs) -> None:
         store.align("base", "left/pose", fields={"weather": ["n"]})
     with pytest.raises(TopicError, match="no field 'z'"):
         store.align("base", "left/pose", fields={"base": ["z"]})
+    with pytest.raises(TopicError, match="a part of an array"):
+        store.align("base", "left/pose", fields={"base": ["list[0]"]})
     with pytest.raises(TimeError, match="not a duration"):
         store.align("base", "left/pose", tolerance="soon")
     with pytest.raises(UsageError, match="given by topic"):

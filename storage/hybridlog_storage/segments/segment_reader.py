@@ -304,7 +304,7 @@ class SegmentReader:
         except _NoSummaryError as error:
             raise SegmentError(
                 f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
-                "changed since: restore it, or see what is left with `mcap recover`."
+                "changed since; a repair makes the summary again from chunks that are whole."
             ) from error
 
     def _tail(self) -> tuple[int, memoryview]:
