@@ -13,6 +13,7 @@ import hybridlog as hl
 from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.cli.within import answer
 from tests.test_identity import COUNT, make_log, payload
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
@@ -108,6 +109,13 @@ def test_what_can_be_proven_is_put_right(store: Path, fault: Callable[[Path], No
     assert {n: file(store, n).read_bytes() for n in range(4)} == whole
     assert sorted(p.name for p in (store / "recordings" / "one").iterdir()) == names
     assert look(store) == ("complete", COUNT, 0)
+
+
+def test_a_damaged_summary_names_its_cure(store: Path) -> None:
+    flip_the_summary(store)
+    said = answer("verify", "--mongo", "none", store=store, code=1).out
+    assert "A repair makes the summary again" in said
+    assert "`mcap recover`; run `hybridlog repair`" in said
 
 
 def test_a_segment_whose_messages_are_damaged_stays_as_it_is(store: Path) -> None:

@@ -304,7 +304,8 @@ class SegmentReader:
         except _NoSummaryError as error:
             raise SegmentError(
                 f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
-                "changed since; a repair makes the summary again from chunks that are whole."
+                "changed since. A repair makes the summary again if all chunks are whole; else "
+                "restore the file, or see what is left with `mcap recover`."
             ) from error
 
     def _tail(self) -> tuple[int, memoryview]:
