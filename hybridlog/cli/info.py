@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.drawing.density import Density
     from hybridlog.query.answers.video import VideoSummary
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
+    from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
 
 
 _MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
@@ -231,7 +231,8 @@ def _as_dict(
                 "rate_hz": _rate(c),
                 "first_ns": c.stats.first,
                 "last_ns": c.stats.last,
-                "skew_ns": _skew(c),
+                "skew_ns": _skew(c.stats),
+                "unset_stamps": c.stats.unset if entry.is_decoded else None,
                 "unreadable": c.stats.unreadable if entry.is_decoded else None,
                 "surplus": c.stats.surplus if entry.is_decoded else None,
                 "not_indexed": c.unindexed,
@@ -251,16 +252,11 @@ def _rate(channel: ChannelEntry) -> float | None:
     return mean_rate(stats.messages, stats.first or 0, stats.last or 0)
 
 
-def _skew(channel: ChannelEntry) -> dict[str, float | int | None] | None:
-    """Log time minus header stamp, ns; None if there are stamps of zero, which were not set."""
-    stats = channel.stats
-    if not stats.stamped or stats.first_stamp == 0:
+def _skew(stats: ChannelStats) -> dict[str, float | int | None] | None:
+    """Log time minus header stamp, ns; None if no stamp was set."""
+    if stats.mean_skew is None:
         return None
-    return {
-        "mean": stats.skew_sum / stats.stamped,
-        "min": stats.skew_min,
-        "max": stats.skew_max,
-    }
+    return {"mean": stats.mean_skew, "min": stats.skew_min, "max": stats.skew_max}
 
 
 def _print_recording(
@@ -436,10 +432,12 @@ def _channel_row(
     if video is not None and video.frames:
         notes.append(_video_text(video, stats.messages))
     skew = "-" if is_decoded else "?"
-    if stats.first_stamp == 0:
-        skew = "not set" if stats.last_stamp == 0 else "not always set"
-    elif stats.stamped:
-        skew = output.short_duration(round(stats.skew_sum / stats.stamped))
+    if stats.mean_skew is not None:
+        skew = output.short_duration(round(stats.mean_skew))
+        if stats.unset:
+            notes.append(f"{output.counted(stats.unset, 'stamp')} not set")
+    elif stats.unset:
+        skew = "not set"
     encoding = encoding_of(channel.message_encoding, channel.metadata)
     kind = channel.type or encoding
     cells = [

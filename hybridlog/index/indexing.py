@@ -223,18 +223,30 @@ class _StatsByChunk:
         rows, stamps = np.concatenate(self._stamped), np.concatenate(self._stamps)
         order = np.argsort(rows)
         rows, stamps = rows[order], stamps[order]
+        begins = run_starts(self._number[rows])
+        numbers = self._number[rows[begins]].tolist()
+        counts = run_lengths(begins, len(rows)).tolist()
+        for number, count, (first, last) in zip(
+            numbers, counts, _spans(stamps, begins), strict=True
+        ):
+            stats = found[number]
+            stats.stamped = stats.unset = count
+            stats.first_stamp, stats.last_stamp = first, last
+        rows, stamps = rows[stamps != 0], stamps[stamps != 0]
+        if not len(rows):
+            return
         skew = self._batch.log_time[rows] - stamps
         begins = run_starts(self._number[rows])
         numbers = self._number[rows[begins]].tolist()
         counts = run_lengths(begins, len(rows)).tolist()
         # Integers could overflow.
         sums = np.add.reduceat(skew, begins, dtype=np.float64).tolist()
-        for number, count, total, (first, last), (least, most) in zip(
-            numbers, counts, sums, _spans(stamps, begins), _spans(skew, begins), strict=True
+        for number, count, total, (least, most) in zip(
+            numbers, counts, sums, _spans(skew, begins), strict=True
         ):
             stats = found[number]
-            stats.stamped, stats.skew_sum = count, total
-            stats.first_stamp, stats.last_stamp = first, last
+            stats.unset -= count
+            stats.skew_sum = total
             stats.skew_min, stats.skew_max = least, most
 
 

@@ -423,7 +423,7 @@ def _not_decoded(entry: RecordingEntry) -> RecordingEntry:
     """An entry as it is before its messages are decoded."""
     channels = []
     for channel in entry.channels:
-        stats = replace(channel.stats, unreadable=0, surplus=0, stamped=0, skew_sum=0.0)
+        stats = replace(channel.stats, unreadable=0, surplus=0, stamped=0, unset=0, skew_sum=0.0)
         stats.first_stamp = stats.last_stamp = stats.skew_min = stats.skew_max = None
         channels.append(replace(channel, stats=stats))
     return replace(entry, channels=channels, is_decoded=False)

@@ -29,6 +29,8 @@ _TOPICS: Final = pa.schema(
         ("last_time", TIME),
         ("first_t", pa.int64()),
         ("last_t", pa.int64()),
+        ("mean_skew", pa.float64()),
+        ("unset_stamps", pa.int64()),
         ("problem", pa.string()),
     ]
 )
@@ -98,6 +100,8 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "messages": total.messages,
                 "bytes": total.payload_bytes,
                 **times(total.first, total.last),
+                "mean_skew": total.mean_skew,
+                "unset_stamps": total.unset,
                 "problem": "; ".join(problems) or None,
             }
 

@@ -95,6 +95,7 @@ _STAMPS = RowType(
     ("unreadable", "<u4"),
     ("surplus", "<u4"),
     ("stamped", "<u4"),
+    ("unset", "<u4"),
     ("first_stamp", "<i8"),
     ("last_stamp", "<i8"),
     ("skew_sum", "<f8"),
@@ -104,13 +105,19 @@ _STAMPS = RowType(
 """Results of decoding; one row for each row of `ChunkTable.parts`."""
 
 
+_COUNTS: Final = (
+    "messages", "payload_bytes", "unreadable", "surplus", "stamped", "unset", "skew_sum",
+)  # fmt: skip
+
+
 @dataclass(slots=True)
 class ChannelStats:
     """Statistics of the messages of one channel, in a chunk or in a recording.
 
     Times are nanoseconds; `first` and `last` are both inclusive; None without messages
-    or, for stamps, without a header. Skew is log time minus header stamp. `surplus` counts
-    messages with bytes left over behind their last field.
+    or, for stamps, without a header. Skew is log time minus header stamp, of stamps that were
+    set: `unset` counts those of zero. `surplus` counts messages with bytes left over behind
+    their last field.
     """
 
     messages: int = 0
@@ -124,15 +131,21 @@ class ChannelStats:
     first_stamp: int | None = None
     last_stamp: int | None = None
     stamped: int = 0
+    unset: int = 0
     skew_sum: float = 0.0
     skew_min: int | None = None
     skew_max: int | None = None
     longest: int = 0
     """Longest span of log time of the channel's messages in one chunk."""
 
+    @property
+    def mean_skew(self) -> float | None:
+        """Mean skew, ns; None if no stamp was set."""
+        return self.skew_sum / (self.stamped - self.unset) if self.stamped > self.unset else None
+
     def add(self, other: ChannelStats) -> None:
         """Add the messages of another part of the channel."""
-        for name in ("messages", "payload_bytes", "unreadable", "surplus", "stamped", "skew_sum"):
+        for name in _COUNTS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_publish", "first_stamp", "skew_min"):
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
@@ -428,10 +441,13 @@ def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
     rows = rows[rows["stamped"] > 0]
     if len(rows):
         stats.stamped = int(rows["stamped"].sum())
+        stats.unset = int(rows["unset"].sum())
         # Exact, so that the order of segments and chunks does not matter.
         stats.skew_sum = math.fsum(rows["skew_sum"].tolist())
         stats.first_stamp = int(rows["first_stamp"].min())
         stats.last_stamp = int(rows["last_stamp"].max())
+    rows = rows[rows["stamped"] > rows["unset"]]
+    if len(rows):
         stats.skew_min = int(rows["skew_min"].min())
         stats.skew_max = int(rows["skew_max"].max())
 
@@ -471,6 +487,7 @@ def _decoded(stats: ChannelStats) -> tuple[float, ...]:
         stats.unreadable,
         stats.surplus,
         stats.stamped,
+        stats.unset,
         stats.first_stamp or 0,
         stats.last_stamp or 0,
         stats.skew_sum,

@@ -20,7 +20,7 @@ from urllib.parse import quote, unquote
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 
-VERSION: Final = 7
+VERSION: Final = 8
 MAX_PART_BYTES: Final = 48 << 10
 """Size of a part from which it takes no more recordings."""
 SUMMARY: Final = "0-summary"

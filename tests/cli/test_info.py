@@ -136,10 +136,16 @@ def test_stamps_that_were_not_set_are_no_delay(tmp_path: Path) -> None:
         line.split()[0]: line for line in run("info", "mine", store=tmp_path / "s").lines if line
     }
     assert "  not set" in told["/never"]
-    assert "  not always set" in told["/late"]
+    assert "  2s" in told["/late"]
+    assert told["/late"].endswith("  1 stamp not set")
     assert "  2s" in told["/all"]
     found = run("info", "mine", "--json", store=tmp_path / "s").json["channels"]
-    assert [one["topic"] for one in found if one["skew_ns"]] == ["/all"]
+    given = {one["topic"]: (one["skew_ns"] and one["skew_ns"]["mean"]) for one in found}
+    assert given == {"/never": None, "/late": 2e9, "/all": 2e9}
+    assert {one["topic"]: one["unset_stamps"] for one in found}["/late"] == 1
+    with hl.open(tmp_path / "s", mongo="none") as store:
+        rows = store.sql("select topic, mean_skew, unset_stamps from topics order by all").rows()
+        assert rows == [("/all", 2e9, 0), ("/late", 2e9, 1), ("/never", None, 2)]
 
 
 def test_a_recording_that_is_not_there(store: Path) -> None:
