@@ -15,7 +15,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.schema.arrow_types import COMPUTED_AS, is_bytes, is_list, is_text, is_time
+from hybridlog.schema.arrow_types import (
+    COMPUTED_AS,
+    is_bytes,
+    is_list,
+    is_text,
+    is_time,
+    time_of_day,
+)
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -113,12 +120,14 @@ def _times(array: pa.Array) -> pa.Array:
     if is_time(kind):
         unit = pa.timestamp("ns", kind.tz) if pa.types.is_timestamp(kind) else pa.duration("ns")
         return array.cast(unit).cast(pa.int64()).cast(pa.string())
-    # Dates, times of day, intervals.
-    texts = [None if value is None else _temporal(value) for value in array.to_pylist()]
-    return pa.array(texts, pa.string())
+    return pa.array([_temporal(one) if one.is_valid else None for one in array], pa.string())
 
 
-def _temporal(value: object) -> str:
+def _temporal(one: pa.Scalar) -> str:
+    """A date, a time of day, or an interval."""
+    if pa.types.is_time(one.type):
+        return f'"{time_of_day(one)}"'
+    value = one.as_py()
     if isinstance(value, pa.MonthDayNano):
         names = ("months", "days", "nanoseconds")
         return json.dumps({name: getattr(value, name) for name in names})

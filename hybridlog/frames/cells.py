@@ -56,11 +56,12 @@ def _forms(
     from pyarrow import types
 
     from hybridlog.query.times import format_duration
-    from hybridlog.schema.arrow_types import is_bytes, is_list
+    from hybridlog.schema.arrow_types import is_bytes, is_list, time_of_day
 
     return [
         (types.is_floating, _exact if exact else lambda value: f"{value.as_py():.6g}"),
         (types.is_timestamp, _time),
+        (types.is_time, time_of_day),
         (types.is_duration, lambda value: format_duration(value.value)),
         (types.is_map, functools.partial(_map, exact=exact)),
         (is_list, functools.partial(_list, exact=exact)),

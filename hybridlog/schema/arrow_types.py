@@ -68,6 +68,12 @@ def is_array(kind: pa.DataType) -> bool:
     return is_list(kind) or is_bytes(kind)
 
 
+def time_of_day(value: pa.Scalar) -> str:
+    """A time of day as text: the end of a day is 24:00, as in SQL, and not midnight."""
+    text = str(value.as_py())
+    return "24:00:00" if value.value and text == "00:00:00" else text
+
+
 def is_time(kind: pa.DataType) -> bool:
     """True for times and durations."""
     return bool(_types.is_timestamp(kind) or _types.is_duration(kind))
