@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from shlex import quote
@@ -306,38 +306,28 @@ def _print_recording(
     if not entry.channels:
         return
     output.say()
-    narrow = output.is_narrow()
-    columns: list[output.Column] = [
+    columns: Sequence[output.Column] = [
         ("topic", "left"),
         ("type", "left"),
         ("messages", "right"),
         ("Hz", "right"),
+        ("payload", "right"),
         ("log - header", "right"),
         ("note", "left"),
     ]
-    if not narrow:
-        columns.insert(4, ("payload", "right"))
     from hybridlog.schema.states import shown_channels
 
     channels = sorted(shown_channels(entry.channels), key=lambda c: c.topic)
-
-    def rows_with(*, short: bool) -> list[list[str]]:
-        return [
-            _channel_row(
-                c,
-                is_decoded=entry.is_decoded,
-                narrow=narrow,
-                short=short,
-                video=videos.get(c.topic),
-            )
-            for c in channels
-        ]
-
-    cells = rows_with(short=narrow)
+    cells = _with_short_types(
+        columns,
+        [_channel_row(c, is_decoded=entry.is_decoded, video=videos.get(c.topic)) for c in channels],
+    )
+    if output.is_narrow():
+        columns, cells = output.fitted(columns, cells, ("payload",))
     if drawn is not None:
         headings = [name for name, _ in columns]
         # Names of types are cut short if that makes room for lines.
-        for shown in (cells, rows_with(short=True)):
+        for shown in (cells, _short_types(cells)):
             # The heading has taken its share of the room.
             room = output.room([*headings, _OVER_TIME], shown)
             lines = _sparklines(drawn, room + len(_OVER_TIME) if room >= 0 else 0)
@@ -346,9 +336,21 @@ def _print_recording(
                     [*row[:-1], lines.get(channel.topic, ""), row[-1]]
                     for channel, row in zip(channels, shown, strict=True)
                 ]
-                columns.insert(-1, (_OVER_TIME, "whole"))
+                columns = [*columns[:-1], (_OVER_TIME, "whole"), columns[-1]]
                 break
     output.print_table(*output.fitted(columns, cells, ("log - header",)))
+
+
+_Rows = Sequence[Sequence[str]]
+
+
+def _with_short_types(columns: Sequence[output.Column], rows: _Rows) -> _Rows:
+    """Rows of a topic and its type, short where the terminal has no room for the package."""
+    return rows if output.fits([name for name, _ in columns], rows) else _short_types(rows)
+
+
+def _short_types(rows: _Rows) -> _Rows:
+    return [[topic, kind.rpartition("/")[2], *others] for topic, kind, *others in rows]
 
 
 def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
@@ -404,9 +406,7 @@ def _channel_row(
     channel: ChannelEntry,
     *,
     is_decoded: bool,
-    narrow: bool,
-    short: bool,
-    video: VideoSummary | None = None,
+    video: VideoSummary | None,
 ) -> list[str]:
     from hybridlog.query.latching import depth_of
     from hybridlog.schema.states import State, encoding_of, state_of
@@ -439,18 +439,15 @@ def _channel_row(
     elif stats.unset:
         skew = "not set"
     encoding = encoding_of(channel.message_encoding, channel.metadata)
-    kind = channel.type or encoding
-    cells = [
+    return [
         channel.topic,
-        kind.rpartition("/")[2] if short else kind,
+        channel.type or encoding,
         str(stats.messages),
         f"{rate:.2f}" if rate is not None else "-",
+        output.size(stats.payload_bytes),
         skew,
         "; ".join(notes),
     ]
-    if not narrow:
-        cells.insert(4, output.size(stats.payload_bytes))
-    return cells
 
 
 def _video_text(video: VideoSummary, messages: int) -> str:
@@ -535,13 +532,11 @@ def show_segment(path: Path, *, as_json: bool) -> None:
         ],
     )
     output.say()
-    output.print_table(
-        [("topic", "left"), ("type", "left"), ("messages", "right"), ("chunks", "right")],
-        [
-            (str(c["topic"]), str(c["type"] or ""), str(c["messages"]), str(c["chunks"]))
-            for c in channels
-        ],
-    )
+    columns: Sequence[output.Column] = [
+        ("topic", "left"), ("type", "left"), ("messages", "right"), ("chunks", "right")
+    ]  # fmt: skip
+    rows = [["" if c[n] is None else str(c[n]) for n, _ in columns] for c in channels]
+    output.print_table(columns, _with_short_types(columns, rows))
 
 
 def _refuse_log(path: Path) -> None:

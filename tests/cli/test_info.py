@@ -232,7 +232,7 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
 def test_notes_of_a_channel() -> None:
     def notes(encoding: str, **metadata: str) -> str:
         entry = ChannelEntry(1, "/a", encoding, None, "T", metadata, False, None)
-        return _channel_row(entry, is_decoded=True, narrow=False, short=False)[-1]
+        return _channel_row(entry, is_decoded=True, video=None)[-1]
 
     assert notes("cdr", offered_qos_profiles="- durability: 1\n  depth: 1") == "latched"
     assert notes("cdr", offered_qos_profiles="- durability: 2") == ""

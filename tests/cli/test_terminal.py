@@ -135,7 +135,8 @@ def test_no_word_is_broken_at_eighty_columns(store: Path) -> None:
 
 def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
     topics = {one["topic"] for one in run("check", "-r", "robot", "--json", store=store).json}
-    for command in (("info", "robot"), ("check", "-r", "robot")):
+    segment = store / "recordings/robot/000000.mcap"
+    for command in (("info", "robot"), ("info", segment), ("check", "-r", "robot")):
         code, shown = on_terminal(*command, "--store", store, width=80)
         assert code == 0
         assert {*re.findall(r"(?m)^(/\S+)  ", plain(shown))} == topics
