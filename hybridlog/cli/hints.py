@@ -6,6 +6,7 @@ import difflib
 import shlex
 import textwrap
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,8 +14,17 @@ import click
 
 from hybridlog_storage.errors import TopicError
 
-_FIRST: Final = ("topic", "between", "where", "fields", "output", "form", "recording")
-_LAST: Final = ("store", "mongo", "verbose", "quiet", "help")
+_FIRST: Final = ("topic", "between", "where", "fields", "output", "form")
+_SECTIONS: Final[dict[str, tuple[str, ...]]] = {
+    "Live recording": (),
+    "Choosing recordings": (
+        "recording", "tag", "has", "types", "during", "last", "older_than", "conditions",
+    ),
+    "Common options": (
+        "force", "strict", "as_json", "quiet", "verbose", "store", "mongo", "_click_default_help",
+    ),
+}  # fmt: skip
+"""Sections of help behind the options of a command alone, and what is in them everywhere."""
 _NEAR: Final = 0.75  # likeness of an option that is suggested
 _NAMED: Final = {"recording": "-r", "topic": "-t", "fields": "--fields"}
 """Options whose values people type as arguments, and how they are written."""
@@ -47,9 +57,6 @@ MOVED: Final = {
     "trust": "index trust",
     "untag": "tag RECORDING --remove KEY",
     **dict.fromkeys(("diff -r", "diff --tag"), "diff RECORDING RECORDING"),
-    **dict.fromkeys(
-        ("diff --last", "diff --older-than"), "diff RECORDING RECORDING --between T0 T1"
-    ),
 }
 """Other names and options that people try, and the commands that do this."""
 
@@ -111,8 +118,22 @@ class Command(click.Command):
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """The parameters: those that most people need first, those of all commands last."""
         order = {name: n - len(_FIRST) for n, name in enumerate(_FIRST)}
-        order |= {name: n for n, name in enumerate(_LAST, 1)}
+        order |= {name: n for n, name in enumerate(chain(*_SECTIONS.values()), 1)}
         return sorted(super().get_params(ctx), key=lambda one: order.get(one.name or "", 0))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options in sections: those of the command alone first."""
+        known = {name: title for title, names in _SECTIONS.items() for name in names}
+        rows: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Options", *_SECTIONS)}
+        for one in self.get_params(ctx):
+            record = one.get_help_record(ctx)
+            if record is not None and isinstance(one, click.Option):
+                title = getattr(one, "section", known.get(one.name or "", "Options"))
+                rows[title].append(record)
+        for title, found in rows.items():
+            if found:
+                with formatter.section(title):
+                    formatter.write_dl(found)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the words; one too many may be the value of an option."""

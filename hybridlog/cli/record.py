@@ -55,8 +55,8 @@ def record_command(choices: RecordChoices) -> None:
     stored, and the rest is reported.
 
     With --ros1, --ros2, --foxglove or --replay, messages are recorded as they arrive, until
-    Ctrl-C. Lost messages are counted: see `hybridlog info --losses`. Options marked "Live" are for
-    this.
+    Ctrl-C. Lost messages are counted: see `hybridlog info --losses`. Options under
+    "Live recording" are for this.
     """
     choices = replace(choices, live_options=_live_options())
     check_choices(choices)

@@ -36,12 +36,7 @@ DEFAULT_CHUNK: Final = 2 << 20
 class LiveOption(click.Option):
     """An option for live recording, which is refused when logs are given."""
 
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """The help, which says that it is for live recording."""
-        record = super().get_help_record(ctx)
-        if record is None or record[1].startswith("With --"):
-            return record
-        return record[0], f"Live: {record[1]}"
+    section = "Live recording"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -300,6 +300,8 @@ def test_help_breaks_no_word_at_eighty_columns(name: str) -> None:
     if name == "fetch":
         shown = [line.split()[0].strip(",") for line in lines if line.startswith("  -")]
         assert shown[:6] == ["-t", "--between", "--where", "--fields", "-o", "-F"]
+        sections = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
+        assert sections[1:] == ["Options:", "Choosing recordings:", "Common options:"]
 
 
 def test_only_the_module_of_the_command_is_imported(store: Path) -> None:
