@@ -15,6 +15,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
+from tests.json_schemas import misfit, schema_of
 
 from .running import recordings, run, started
 
@@ -50,6 +51,7 @@ def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
     assert done["bytes_stored"] == stored
     assert done["ratio"] == pytest.approx(done["bytes_in"] / stored, abs=1e-3)
     assert done["damage"] == []
+    assert not misfit(done, schema_of(["record"]))
 
 
 def test_choices(logs: Path, tmp_path: Path) -> None:
@@ -119,6 +121,7 @@ def test_several_paths(logs: Path, tmp_path: Path) -> None:
     )
     assert [item["exit_code"] for item in again.json if "error" in item] == [8]
     assert again.json[1]["recording"] == "robot"
+    assert not misfit(again.json, schema_of(["record"]))
 
 
 def test_the_same_content_is_noticed(logs: Path, fresh: Path, tmp_path: Path) -> None:
