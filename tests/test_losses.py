@@ -7,7 +7,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridlog.record.losses import Cause, Ledger, joined
+from hybridlog.record.losses import Cause, Ledger, Loss, joined
 
 SECOND = 1_000_000_000
 notes = st.lists(
@@ -38,7 +38,7 @@ def test_rows_hold_all_that_was_noted(
             rows.extend(ledger.take())
             continue
         topic, cause, count, first, length = one
-        ledger.note(topic, cause, count, first=first * SECOND, last=(first + length) * SECOND)
+        ledger.note(Loss(topic, cause, count, first=first * SECOND, last=(first + length) * SECOND))
         if count is None:
             unknown.add((topic, cause.value))
         else:
@@ -72,14 +72,12 @@ def test_a_loss_that_goes_on_is_one_row() -> None:
     ledger = Ledger()
     rows = []
     for second in range(3600):
-        ledger.note(
-            "/scan", Cause.QUEUE, 3, first=second * SECOND, last=second * SECOND, detail="x"
-        )
+        ledger.note(Loss("/scan", Cause.QUEUE, 3, second * SECOND, second * SECOND, "x"))
         rows.extend(ledger.take())
     (row,) = joined(rows)
     assert (row["count"], row["from"], row["to"], row["reason"]) == (10_800, 0, 3599 * SECOND, "x")
     # What stops for a minute and begins again is another.
-    ledger.note("/scan", Cause.QUEUE, 1, first=4000 * SECOND, last=4000 * SECOND, detail="x")
+    ledger.note(Loss("/scan", Cause.QUEUE, 1, first=4000 * SECOND, last=4000 * SECOND, detail="x"))
     assert len(joined(rows + ledger.take())) == 2
 
 
@@ -88,7 +86,7 @@ def test_rows_within_twelve_seconds_of_one_another_are_one() -> None:
         ledger = Ledger()
         found = []
         for first in (0, SECOND + pause):
-            ledger.note("/scan", Cause.QUEUE, 1, first=first, last=first + SECOND)
+            ledger.note(Loss("/scan", Cause.QUEUE, 1, first=first, last=first + SECOND))
             found += ledger.take()
         return len(joined(found))
 
@@ -99,7 +97,7 @@ def test_rows_within_twelve_seconds_of_one_another_are_one() -> None:
 def test_what_the_user_wants_is_a_row_each_ten_seconds() -> None:
     ledger = Ledger()
     for last, count in ((0, 0), (10 * SECOND - 1, 0), (10 * SECOND, 1), (11 * SECOND, 0)):
-        ledger.note("/scan", Cause.THROTTLE, 1, first=last, last=last)
+        ledger.note(Loss("/scan", Cause.THROTTLE, 1, first=last, last=last))
         assert len(ledger.take()) == count
     assert [row["count"] for row in ledger.take(everything=True)] == [1]
 

@@ -17,11 +17,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from hybridlog.live.sources.base import Sink
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
@@ -44,16 +44,6 @@ class _Message(NamedTuple):
     received: int
     sent: int | None
     sequence: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Loss:
-    topic: str
-    cause: Cause
-    count: int | None
-    first: int
-    last: int
-    detail: str
 
 
 class Recording(Sink, Protocol):
@@ -88,7 +78,7 @@ class SimulatedTime(Sink):
         self._latest = (0, 0)
         self._ticks: deque[tuple[int, int]] = deque(maxlen=_MAX_TICKS)
         self._jumps = 0
-        self._held: deque[_Message | _Loss] | None = deque()
+        self._held: deque[_Message | Loss] | None = deque()
         self._held_bytes = 0
 
     @property
@@ -129,7 +119,7 @@ class SimulatedTime(Sink):
         with self._lock:
             held, self._held = self._held, None
         for item in held or ():
-            if isinstance(item, _Loss):
+            if isinstance(item, Loss):
                 self._report(item, item.first, item.last)
             else:
                 self._drop(item, item.received)
@@ -174,22 +164,12 @@ class SimulatedTime(Sink):
         if self._held is None or not self._hold(message):
             self._record(message, self.at(received))
 
-    def lost(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
+    def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
-        if not self._is_recorded(topic):
+        if not self._is_recorded(loss.topic):
             return
-        loss = _Loss(topic, cause, count, first, last, detail)
         if self._held is None or not self._hold(loss):
-            self._report(loss, self.at(first), self.at(last))
+            self._report(loss, self.at(loss.first), self.at(loss.last))
 
     def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
         """See `Sink.topic_came`."""
@@ -214,7 +194,7 @@ class SimulatedTime(Sink):
     def _is_recorded(self, topic: str) -> bool:
         return self._is_clock_recorded or topic != CLOCK
 
-    def _hold(self, item: _Message | _Loss) -> bool:
+    def _hold(self, item: _Message | Loss) -> bool:
         """Keep an item until the clock comes; False once everything held has been passed on."""
         size = _OVERHEAD + (len(item.payload) if isinstance(item, _Message) else 0)
         with self._lock:
@@ -250,10 +230,8 @@ class SimulatedTime(Sink):
         channel, payload, _, sent, sequence = message
         self._recorder.take(channel, payload, received=log_time, sent=sent, sequence=sequence)
 
-    def _report(self, loss: _Loss, first: int, last: int) -> None:
-        self._recorder.lost(
-            loss.topic, loss.cause, loss.count, first=first, last=last, detail=loss.detail
-        )
+    def _report(self, loss: Loss, first: int, last: int) -> None:
+        self._recorder.lost(replace(loss, first=first, last=last))
 
     def _drop(self, message: _Message, at: int) -> None:
         self._recorder.drop(

@@ -40,7 +40,7 @@ from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
 from hybridlog.maintenance.keep import Own, RetentionThread
 from hybridlog.query.times import format_duration, format_time
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import CLOCK_SET, CONTRACT, mark_channel, mark_payload
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
@@ -594,18 +594,10 @@ class Recorder:
             self._refuse(cause, str(error))
             self._lose(recorded, cause, str(error), received)
 
-    def lost(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
+    def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
-        self._note(topic, cause, count, first=first, last=last, detail=detail)
+        self._count_lost(loss.topic, loss.cause, loss.count or 0)
+        self._target.ledger.note(loss)
 
     def clock(self, now: int, *, received: int) -> None:
         """See `Sink.clock`; `SimulatedTime` uses it."""
@@ -798,13 +790,7 @@ class Recorder:
         self._lose(recorded, Cause.QUEUE, "the memory budget was used up", received)
 
     def _lose(self, recorded: _RecordedChannel, cause: Cause, detail: str, received: int) -> None:
-        self._note(recorded.channel.topic, cause, 1, first=received, last=received, detail=detail)
-
-    def _note(
-        self, topic: str, cause: Cause, count: int | None, *, first: int, last: int, detail: str
-    ) -> None:
-        self._count_lost(topic, cause, count or 0)
-        self._target.ledger.note(topic, cause, count, first=first, last=last, detail=detail)
+        self.lost(Loss(recorded.channel.topic, cause, 1, received, received, detail))
 
     def _count_lost(self, topic: str, cause: Cause, count: int) -> None:
         with self._lock:

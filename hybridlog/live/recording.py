@@ -26,7 +26,7 @@ from hybridlog.index.index_writer import INTERVAL_S
 from hybridlog.live.memory import MIN_USER_BUDGET, MemoryReservation, default_budget, frozen_objects
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Backpressure, Capture
-from hybridlog.record.losses import Cause, Ledger
+from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog.record.recorder import RecordReport
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
@@ -475,14 +475,8 @@ class LiveRecording:
                 first, last = sorted(
                     (self._first[index] if written is None else written, self._last[index])
                 )
-                self.ledger.note(
-                    channel.topic,
-                    Cause.DISK,
-                    count,
-                    first=first,
-                    last=last,
-                    detail="the disk was full",
-                )
+                detail = "the disk was full"
+                self.ledger.note(Loss(channel.topic, Cause.DISK, count, first, last, detail))
         return self.ledger.take(everything=True)
 
     def abort(self) -> None:

@@ -20,7 +20,7 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import numbers_at, to_bool
 from hybridlog.query.predicate.types import check
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
-from hybridlog.record.losses import Cause, Ledger
+from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog.schema.codec import plain_message
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.index_bodies import index_fields
@@ -411,12 +411,14 @@ class Snapshots:
             self._active = recording
         for row in lost:
             recording.ledger.note(
-                row["topic"] or "",
-                Cause(row["cause"]),
-                row["count"],
-                first=row["from"],
-                last=row["to"],
-                detail=row["reason"],
+                Loss(
+                    row["topic"] or "",
+                    Cause(row["cause"]),
+                    row["count"],
+                    first=row["from"],
+                    last=row["to"],
+                    detail=row["reason"],
+                )
             )
         self._say(f"snapshot {recording.label} because of {reason!r}")
         try:

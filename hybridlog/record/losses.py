@@ -65,6 +65,27 @@ class _Open:
     count: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Messages that are lost.
+
+    Attributes:
+        topic: Their topic; empty if unknown.
+        cause: The reason.
+        count: Number of messages; None if unknown.
+        first: Beginning of the loss, ns since the epoch, by the recorder's clock.
+        last: End of the loss, by the same clock, which may have gone back between them.
+        detail: Explanation for people: a publisher's name, a reason.
+    """
+
+    topic: str
+    cause: Cause
+    count: int | None
+    first: int
+    last: int
+    detail: str = ""
+
+
 class Ledger:
     """Collects losses and returns them as rows. Thread safe."""
 
@@ -72,35 +93,17 @@ class Ledger:
         self._lock = threading.Lock()
         self._open: dict[tuple[str, Cause, str], _Open] = {}
 
-    def note(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
-        """Note lost messages.
-
-        Args:
-            topic: Topic of the messages; empty if unknown.
-            cause: The reason.
-            count: Number of messages; None if unknown.
-            first: Beginning of the loss, ns since the epoch, by the recorder's clock.
-            last: End of the loss, ns since the epoch, by the recorder's clock, which may have
-                gone back between them.
-            detail: Explanation for people.
-        """
-        first, last = sorted((first, last))
+    def note(self, loss: Loss) -> None:
+        """Note lost messages."""
+        first, last = sorted((loss.first, loss.last))
+        key = loss.topic, loss.cause, loss.detail
         with self._lock:
-            row = self._open.get((topic, cause, detail))
+            row = self._open.get(key)
             if row is None:
-                self._open[topic, cause, detail] = _Open(first, last, count)
+                self._open[key] = _Open(first, last, loss.count)
             else:
                 row.first, row.last = min(row.first, first), max(row.last, last)
-                row.count = _sum(row.count, count)
+                row.count = _sum(row.count, loss.count)
 
     def take(self, *, everything: bool = False) -> list[dict[str, Any]]:
         """The rows since the last call; the ledger forgets them.

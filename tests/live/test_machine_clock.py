@@ -15,7 +15,7 @@ from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.query.times import format_duration
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.messages import Channel
 from tests.live.speaker import TEXT, Speaker, text, text_channel
@@ -111,7 +111,7 @@ def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
     for number, era in enumerate(eras):
         robot.clock.time = era
         if number:
-            robot.recorder.lost("/chatter", Cause.TRANSPORT, 1, first=NOW + YEAR, last=era)
+            robot.recorder.lost(Loss("/chatter", Cause.TRANSPORT, 1, first=NOW + YEAR, last=era))
         robot.play(chatter, *words(20 * number, 20 * number + 20), step=0)
         robot.play(slow, *words(0, 20), step=SECOND // 25)
         robot.play(chatter, "then")
@@ -180,7 +180,7 @@ def test_a_ring_goes_by_the_time_that_passes(store: hl.Store, set_to: int) -> No
     chatter = text_channel()
     robot.play(LATCHED, "map")
     robot.play(chatter, *words(0, 20), step=SECOND)
-    robot.recorder.lost("/chatter", Cause.TRANSPORT, 9, first=NOW, last=NOW + SECOND)
+    robot.recorder.lost(Loss("/chatter", Cause.TRANSPORT, 9, first=NOW, last=NOW + SECOND))
     robot.recorder.look()
     robot.clock.time = set_to
     robot.play(chatter, *words(20, 23), step=SECOND)

@@ -31,7 +31,7 @@ from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveOptions, LiveRecording
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.query.topics import matcher
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.disk import append_file
 from hybridlog_storage.errors import (
@@ -95,8 +95,8 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     for number in range(100):
         robot.speaker.say(chatter, text(str(number)), SECOND + number * SECOND // 20)
         robot.speaker.say(scans, scan(number, 10), SECOND + number * SECOND // 20)
-    robot.recorder.lost("/chatter", Cause.TRANSPORT, 7, first=SECOND, last=2 * SECOND)
-    robot.recorder.lost("/tf", Cause.UNREADABLE, 3, first=SECOND, last=SECOND, detail="no type")
+    robot.recorder.lost(Loss("/chatter", Cause.TRANSPORT, 7, first=SECOND, last=2 * SECOND))
+    robot.recorder.lost(Loss("/tf", Cause.UNREADABLE, 3, SECOND, SECOND, "no type"))
     state = robot.recorder.look()
     assert {t.topic: t.messages for t in state.topics} == {"/chatter": 100, "/scan": 100}
     rows = robot.rows()
@@ -529,7 +529,7 @@ def test_visitors(store: hl.Store) -> None:
 KILLED = """
 import os, signal, sys, time
 import hybridlog as hl
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from tests.live.speaker import Speaker, text, text_channel
 with hl.open(sys.argv[1], create=True, require_database=True) as store:
@@ -541,7 +541,7 @@ with hl.open(sys.argv[1], create=True, require_database=True) as store:
     for number in range(60):
         now = time.time_ns()
         speaker.say(channel, text(str(number)), now)
-        recorder.lost("/scan", Cause.TRANSPORT, 1, first=now, last=now)
+        recorder.lost(Loss("/scan", Cause.TRANSPORT, 1, now, now))
         time.sleep(0.02)
     os.kill(os.getpid(), signal.SIGKILL)
 """

@@ -19,7 +19,7 @@ from hybridlog.live.ring import BufferedMessage, Ring
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots, Trigger, _happened, _Watch
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
@@ -121,11 +121,9 @@ def test_before_and_after_a_trigger(store: hl.Store) -> None:
     start = time.time_ns()
     scans, chatter = scan_channel(), text_channel()
     robot.speaker.say(LATCHED, text("map"), start - 1000 * SECOND)
-    robot.recorder.lost(
-        "/scan", Cause.TRANSPORT, 4, first=start + 18 * SECOND, last=start + 18 * SECOND
-    )
+    robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 4, start + 18 * SECOND, start + 18 * SECOND))
     robot.recorder.look()
-    robot.recorder.lost("/scan", Cause.TRANSPORT, 9, first=start, last=start)
+    robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 9, first=start, last=start))
     for second in range(60):
         # `near` is half the number: the trigger is at 20 s.
         robot.speaker.say(scans, scan(second, 10), start + second * SECOND)

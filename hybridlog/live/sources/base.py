@@ -11,13 +11,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Protocol, Self
 
-from hybridlog.record.losses import Cause
+from hybridlog.record.losses import Cause, Loss
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
 
 
-__all__ = ["Cause", "LiveSource", "Sink"]
+__all__ = ["Cause", "LiveSource", "Loss", "Sink"]
 
 
 class Sink(Protocol):
@@ -62,26 +62,8 @@ class Sink(Protocol):
         """
         ...
 
-    def lost(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
-        """Note messages that are lost.
-
-        Args:
-            topic: Their topic; empty if unknown.
-            cause: Cause of the loss.
-            count: Number of messages, None if unknown.
-            first: Begin of the loss by the recorder's clock, ns since the epoch.
-            last: End of the loss, likewise.
-            detail: Text for the user: a publisher's name, a reason.
-        """
+    def lost(self, loss: Loss) -> None:
+        """Note messages that are lost."""
         ...
 
     def clock(self, now: int, *, received: int) -> None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, cast
 import numpy as np
 
 from hybridlog.formats.detect import open_source
-from hybridlog.live.sources.base import Cause, LiveSource, Sink
+from hybridlog.live.sources.base import Cause, LiveSource, Loss, Sink
 from hybridlog.live.sources.replay_order import Lookahead, Rows
 from hybridlog_storage.errors import SourceError, UsageError
 
@@ -288,9 +288,7 @@ class _Player:
             self._sink.say(detail)
             return
         now = time.time_ns()
-        self._sink.lost(
-            "", Cause.UNREADABLE, damage.messages_lost, first=now, last=now, detail=detail
-        )
+        self._sink.lost(Loss("", Cause.UNREADABLE, damage.messages_lost, now, now, detail))
 
     # The messages.
 

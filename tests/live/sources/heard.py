@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.base import Loss
 from hybridlog_storage.messages import Channel
 
 DEADLINE_S = 20.0
@@ -38,15 +38,6 @@ class Taken(NamedTuple):
     sequence: int | None
 
 
-class Lost(NamedTuple):
-    topic: str
-    cause: Cause
-    count: int | None
-    first: int
-    last: int
-    detail: str
-
-
 class Heard:
     """A sink that remembers all that it is told, in order."""
 
@@ -56,7 +47,7 @@ class Heard:
         self.expected: list[Channel] = []
         self.unexpected: list[Channel] = []
         self.taken: list[Taken] = []
-        self.losses: list[Lost] = []
+        self.losses: list[Loss] = []
         self.topics: list[tuple[Any, ...]] = []
         self.said: list[str] = []
         self.times: list[int] = []
@@ -92,17 +83,8 @@ class Heard:
             self._note(self.unexpected, channel)
         self._note(self.taken, Taken(channel, payload, received, sent, sequence))
 
-    def lost(
-        self,
-        topic: str,
-        cause: Cause,
-        count: int | None,
-        *,
-        first: int,
-        last: int,
-        detail: str = "",
-    ) -> None:
-        self._note(self.losses, Lost(topic, cause, count, first, last, detail))
+    def lost(self, loss: Loss) -> None:
+        self._note(self.losses, loss)
 
     def clock(self, now: int, *, received: int) -> None:
         self._note(self.times, now)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final
 
-from hybridlog.live.sources.base import Cause, Sink, one_line
+from hybridlog.live.sources.base import Cause, Loss, Sink, one_line
 from hybridlog.live.sources.foxglove.connection import Connection
 from hybridlog.live.sources.foxglove.handshake import StoppedError, open_websocket, websocket_uri
 from hybridlog.live.sources.foxglove.protocol import (
@@ -145,7 +145,7 @@ class Session:
             return
         now = time.time_ns()
         detail = f"a message of {size} bytes exceeds the limit of this source"
-        self._sink.lost(topic, Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
+        self._sink.lost(Loss(topic, Cause.UNREADABLE, 1, now, now, detail))
         self._notifier.complain(
             f"{topic!r} has messages that exceed the limit of this source; they are skipped"
         )
@@ -156,7 +156,7 @@ class Session:
         if topic is not None:
             now = time.time_ns()
             detail = "the connection broke in the middle of a message"
-            self._sink.lost(topic, Cause.CONNECTION, 1, first=now, last=now, detail=detail)
+            self._sink.lost(Loss(topic, Cause.CONNECTION, 1, now, now, detail))
 
     def broken(self, reason: str) -> None:
         """Note a malformed binary message."""
@@ -166,7 +166,7 @@ class Session:
     def _ignored(self, detail: str) -> None:
         """Note a lost message of an unknown topic."""
         now = time.time_ns()
-        self._sink.lost("", Cause.UNREADABLE, 1, first=now, last=now, detail=detail)
+        self._sink.lost(Loss("", Cause.UNREADABLE, 1, now, now, detail))
 
     def _topic_of(self, subscription: int) -> str | None:
         route = self._routes.get(subscription)
@@ -237,14 +237,8 @@ class Session:
         self._sink.expect(offer.channel)
         since = self._missed.pop(topic, None)
         if since is not None:
-            self._sink.lost(
-                topic,
-                Cause.CONNECTION,
-                None,
-                first=since,
-                last=time.time_ns(),
-                detail="the connection was down; messages of this time are unknown",
-            )
+            detail = "the connection was down; messages of this time are unknown"
+            self._sink.lost(Loss(topic, Cause.CONNECTION, None, since, time.time_ns(), detail))
         return number
 
     def _unadvertise(self, channels: object) -> None:
@@ -306,14 +300,8 @@ class Session:
         """Notes messages that a publisher counted and that never came, in one row."""
         if gaps:
             gap = joined_gap(gaps)
-            self._sink.lost(
-                topic,
-                Cause.TRANSPORT,
-                gap.missing,
-                first=gap.first,
-                last=gap.last,
-                detail=f"header.seq went from {gap.before} to {gap.after}",
-            )
+            detail = f"header.seq went from {gap.before} to {gap.after}"
+            self._sink.lost(Loss(topic, Cause.TRANSPORT, gap.missing, gap.first, gap.last, detail))
 
     def end(self, *, is_stopped: bool) -> None:
         """End the session.

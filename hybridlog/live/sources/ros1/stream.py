@@ -16,7 +16,7 @@ import termios
 import time
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import Cause, one_line
+from hybridlog.live.sources.base import Cause, Loss, one_line
 from hybridlog.live.sources.ros1.handshake import u32
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
@@ -95,12 +95,14 @@ class Stream:
             self.failure = f"the connection broke: {error.strerror or error}"
             # The kernel discards an unknown number of messages.
             self._sink.lost(
-                self._channel.topic,
-                Cause.CONNECTION,
-                None,
-                first=self._last,
-                last=time.time_ns(),
-                detail=f"{self._publisher}: {self.failure}",
+                Loss(
+                    self._channel.topic,
+                    Cause.CONNECTION,
+                    None,
+                    first=self._last,
+                    last=time.time_ns(),
+                    detail=f"{self._publisher}: {self.failure}",
+                )
             )
             return False
         now = time.time_ns()
@@ -215,14 +217,8 @@ class Stream:
         size = u32(data, pos)[0]
         if size > self._limit:
             self.failure = f"it announced a message of {size} bytes; the limit is {self._limit}"
-            self._sink.lost(
-                self._channel.topic,
-                Cause.UNREADABLE,
-                1,
-                first=now,
-                last=now,
-                detail=f"{self._publisher}: {self.failure}",
-            )
+            detail = f"{self._publisher}: {self.failure}"
+            self._sink.lost(Loss(self._channel.topic, Cause.UNREADABLE, 1, now, now, detail))
             return False
         begun = data[pos + 4 :]
         self._parts = [begun] if begun else []
@@ -245,12 +241,14 @@ class Stream:
         """Reports messages that the publisher counted and that never came."""
         for gap in gaps:
             self._sink.lost(
-                self._channel.topic,
-                Cause.TRANSPORT,
-                gap.missing,
-                first=gap.first,
-                last=gap.last,
-                detail=f"{self._publisher}: dropped in its queue",
+                Loss(
+                    self._channel.topic,
+                    Cause.TRANSPORT,
+                    gap.missing,
+                    first=gap.first,
+                    last=gap.last,
+                    detail=f"{self._publisher}: dropped in its queue",
+                )
             )
 
     def _cut_off(self, now: int) -> None:
@@ -260,14 +258,8 @@ class Stream:
             return
         of = f" of {have + self._missing}" if self._missing else ""
         self.failure = f"it closed in the middle of a message, after {have}{of} bytes"
-        self._sink.lost(
-            self._channel.topic,
-            Cause.CONNECTION,
-            1,
-            first=self._since,
-            last=now,
-            detail=f"{self._publisher}: {self.failure}",
-        )
+        detail = f"{self._publisher}: {self.failure}"
+        self._sink.lost(Loss(self._channel.topic, Cause.CONNECTION, 1, self._since, now, detail))
 
     def _wake_at(self, count: int) -> None:
         """Makes the kernel report the socket only when so many bytes are available.

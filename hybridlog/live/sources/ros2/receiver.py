@@ -7,7 +7,7 @@ import time
 from json import dumps
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.live.sources.base import Cause, one_line
+from hybridlog.live.sources.base import Cause, Loss, one_line
 from hybridlog.live.sources.ros2.child.wire import (
     COUNT,
     ENTRY,
@@ -182,12 +182,14 @@ class Receiver:
             raise WireError("a loss without a cause")
         count = None if event.get("count") is None else _number(event, "count")
         self._sink.lost(
-            _text(event, "topic"),
-            cause,
-            count,
-            first=_number(event, "first"),
-            last=_number(event, "last"),
-            detail=one_line(_text(event, "detail")),
+            Loss(
+                _text(event, "topic"),
+                cause,
+                count,
+                first=_number(event, "first"),
+                last=_number(event, "last"),
+                detail=one_line(_text(event, "detail")),
+            )
         )
 
 
@@ -199,14 +201,8 @@ def report_outage(sink: Sink, topic: str, since: int) -> None:
         topic: The topic.
         since: Begin of the outage, ns since the epoch.
     """
-    sink.lost(
-        topic,
-        Cause.CONNECTION,
-        None,
-        first=since,
-        last=max(since, time.time_ns()),
-        detail="the ROS 2 child had ended",
-    )
+    detail = "the ROS 2 child had ended"
+    sink.lost(Loss(topic, Cause.CONNECTION, None, since, max(since, time.time_ns()), detail))
 
 
 def _read(file: io.BufferedIOBase, size: int) -> bytes:
