@@ -596,7 +596,7 @@ def test_a_message_over_the_limit_is_passed_over_and_counted() -> None:
             heard.until(lambda h: len(h.taken) == 2)
     assert heard.payloads() == [b"small", bytes(1 << 20)]
     (lost,) = heard.losses
-    assert lost[:3] == ("/a", Cause.UNREADABLE, 1)
+    assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.UNREADABLE, 1)
     assert str((1 << 20) + 1) in lost.detail
     assert heard.said_of("exceed the limit")
 
@@ -639,7 +639,7 @@ def test_a_connection_that_ends_is_made_anew(sent: bytes, words: str) -> None:
     assert line.endswith("; trying again")
     assert line.isprintable()
     outage = heard.losses[-1]
-    assert outage[:3] == ("/a", Cause.CONNECTION, None)
+    assert (outage.topic, outage.cause, outage.count) == ("/a", Cause.CONNECTION, None)
     assert heard.taken[0].received <= outage.first <= outage.last <= heard.taken[1].received
     assert heard.topics == [("/a", "T", 1), ("/a",)] * 2
 
@@ -662,7 +662,7 @@ def test_a_connection_that_breaks_in_a_message_is_a_row(*, size: int, is_in_piec
         heard.until(lambda h: h.losses)
     assert heard.taken == []
     (lost,) = heard.losses
-    assert lost[:3] == ("/a", Cause.CONNECTION, 1)
+    assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.CONNECTION, 1)
     assert "in the middle" in lost.detail
 
 
@@ -759,7 +759,7 @@ def test_gaps_of_header_numbers_are_rows(after: int) -> None:
         source.start(heard)
         heard.until(lambda h: len(h.taken) == len(numbers) and h.losses)
         lost = heard.losses[0]
-        assert lost[:3] == ("/scan", Cause.TRANSPORT, 5)
+        assert (lost.topic, lost.cause, lost.count) == ("/scan", Cause.TRANSPORT, 5)
         assert lost.detail == "header.seq went from 99 to 105"
         assert (lost.first, lost.last) == (heard.taken[99].received, heard.taken[100].received)
     assert [loss.cause for loss in heard.losses].count(Cause.TRANSPORT) == 1
