@@ -1112,7 +1112,7 @@ def test_what_is_reserved_is_ignored_or_refused(recorded: hl.Store, tmp_path: Pa
         with pytest.raises(Damaged, match="a feature"):
             FormatReader(tmp_path / "store")
     settings.write_text(text.replace("format = 3", "format = 2"))
-    with pytest.raises(HybridlogError, match="of format 2, which was never released: record"):
+    with pytest.raises(HybridlogError, match="of format 2, and"):
         hl.open(tmp_path / "store")
 
 

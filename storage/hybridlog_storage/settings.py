@@ -87,16 +87,10 @@ def read_settings(path: Path) -> StoreSettings:
     version = values.get("format")
     if type(version) is not int or version < 1:
         raise StoreError(f"{file} names no format version; it should say `format = {FORMAT}`.")
-    if version > FORMAT:
+    if version != FORMAT:
         raise StoreError(
             f"The store {path} is of format {version}, and this hybridlog knows format {FORMAT}. "
-            "Install a newer hybridlog."
-        )
-    if version < FORMAT:
-        raise StoreError(
-            f"The store {path} is of format {version}, which was never released: record its "
-            f"*.mcap files again into a new store, as in `hybridlog record --store NEW "
-            f"{path}/recordings/*/*.mcap`."
+            "Use the hybridlog that wrote it."
         )
     requires = _names(file, values, "requires")
     unknown = [name for name in requires if name not in FEATURES]

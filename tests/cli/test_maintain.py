@@ -98,7 +98,7 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
     for command in (("ls",), ("record", logs / "small.bag"), ("fetch", "-t", "x")):
         done = run(*command, store=store, code=5)
         assert "format 99" in done.err
-        assert "newer hybridlog" in done.err
+        assert "Use the hybridlog that wrote it" in done.err
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")

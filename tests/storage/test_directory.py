@@ -71,7 +71,7 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [(b"", "format"), (b"format = 1\nstore_id = 'x'", "never released")]
+    ("content", "words"), [(b"", "format"), (b"format = 1\nstore_id = 'x'", "format 1, and")]
 )
 def test_settings_that_are_none(store: StoreDirectory, content: bytes, words: str) -> None:
     (store.path / "hybridlog.toml").write_bytes(content)

@@ -1127,18 +1127,12 @@ def test_a_table_that_does_not_end_at_the_summary_is_refused(tmp_path: Path) -> 
         reader.summary()
 
 
-@pytest.mark.parametrize(
-    ("version", "message"),
-    [(4, "Install a newer"), ("x", "Install a newer"), (2, "never released. Record it again")],
-)
+@pytest.mark.parametrize("version", [4, "x", 2])
 @pytest.mark.parametrize("with_table", [True, False])
 def test_a_segment_of_another_format_is_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    version: object,
-    message: str,
-    with_table: bool,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: object, with_table: bool
 ) -> None:
+    message = f"format {version}, and this hybridlog knows format 3"
     monkeypatch.setattr("hybridlog_storage.segments.segment_file.FORMAT_VERSION", version)
     if not with_table:
         monkeypatch.setattr("hybridlog_storage.segments.segment_file.CHUNK_TABLE_OPCODE", 0xF0)

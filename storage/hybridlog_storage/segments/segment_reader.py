@@ -766,17 +766,11 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
         SegmentError: It has.
     """
     version = recording.get("format")
-    if version == FORMAT_VERSION:
-        return
-    if isinstance(version, int) and version < FORMAT_VERSION:
+    if version != FORMAT_VERSION:
         raise SegmentError(
-            f"{path} is of format {version}, which was never released. Record it again into a "
-            "new store."
+            f"{path} is of format {version}, and this hybridlog knows format {FORMAT_VERSION}. "
+            "Use the hybridlog that wrote it."
         )
-    raise SegmentError(
-        f"{path} is of format {version}, and this hybridlog knows format {FORMAT_VERSION}. "
-        "Install a newer hybridlog."
-    )
 
 
 def open_chunk(record: memoryview) -> tuple[Buffer, int]:
