@@ -252,6 +252,7 @@ class DirectoryPlace:
         self.published: list[str] = []
         self._directory = directory
         self._known = known
+        self._ids: dict[str, str] = {}  # by label, as read
         self._recording = ""
         self._held = ExitStack()
         self._proven: dict[str, CopiedFile] = {}
@@ -272,21 +273,27 @@ class DirectoryPlace:
 
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """As of `Place`."""
-        labels = self._labels()
-        return {one: copied_of(self._directory, labels[one]) for one in recordings if one in labels}
+        found = self._labels(recordings).items()
+        return {recording: copied_of(self._directory, label) for recording, label in found}
 
-    def _labels(self) -> dict[str, str]:
-        """Labels of all recordings, by id."""
-        ids = {label: recording for recording, label in self._known().items()}
-        found = {}
-        for label in self._directory.labels():
-            with suppress(StoreError):
-                found[ids.get(label) or self._directory.id_of(label)] = label
+    def _labels(self, recordings: Sequence[str]) -> dict[str, str]:
+        """Labels of those of some recordings that are here, by id."""
+        for _ in range(2):
+            known = {label: recording for recording, label in self._known().items()} | self._ids
+            self._ids = {}
+            for label in self._directory.labels():
+                with suppress(StoreError):
+                    self._ids[label] = known.get(label) or self._directory.id_of(label)
+            labels = {recording: label for label, recording in self._ids.items()}
+            found = {one: labels[one] for one in recordings if one in labels}
+            if all(self._directory.has_label(label, one) for one, label in found.items()):
+                break
+            self._ids, self._known = {}, dict  # other recordings have got their labels
         return found
 
     def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
         """As of `Place`."""
-        return segments_of(self._directory, self._labels().get(recording))
+        return segments_of(self._directory, self._labels([recording]).get(recording))
 
     def begin(self, recording: str, *, wants_payloads: bool, wait_s: float = LOCK_WAIT_S) -> Begun:
         """As of `Place`.
@@ -487,7 +494,7 @@ class DirectoryPlace:
 
     def problems(self, recording: str) -> list[str]:
         """As of `Place`."""
-        return problems_of(self._directory, self._labels().get(recording))
+        return problems_of(self._directory, self._labels([recording]).get(recording))
 
 
 def problems_of(

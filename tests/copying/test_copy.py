@@ -472,3 +472,25 @@ def test_a_silent_side_holds_nothing(tmp_path: Path, limit: Limit, said: bytes) 
     os.close(to_write)
     with StoreDirectory(tmp_path / "lab").retaining() as is_free:
         assert is_free
+
+
+def test_labels_are_read_once(robots: Path, tmp_path: Path, calls: Calls) -> None:
+    """The cost of a copy does not grow with those before it; labels that others change are seen."""
+    lab = tmp_path / "lab"
+    read = calls(StoreDirectory, "id_of")
+    with directory_at(lab) as place:
+        counts = []
+        for label in STATES:
+            read.clear()
+            copied(robots, place, label)
+            counts.append(sum(directory.path == lab for directory, _ in read))
+        assert counts[-1] <= counts[1]
+        with hl.open(lab, mongo="none") as store:
+            ids = {name: store.entry(name).id for name in ("recorded", "noted")}
+            store.rename("recorded", "other")
+            store.rename("noted", "recorded")
+        found = place.have([*ids.values()])
+    assert {name: found[one].label for name, one in ids.items()} == {
+        "recorded": "other",
+        "noted": "recorded",
+    }
