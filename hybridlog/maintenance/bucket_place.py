@@ -32,6 +32,7 @@ from hybridlog.maintenance.places import (
     content_of,
     copied_of,
     edits_of,
+    has_lost,
     pieces_of,
     problems_of,
     segments_of,
@@ -40,7 +41,13 @@ from hybridlog.schema.states import expired_messages
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import PAYLOADS
-from hybridlog_storage.errors import ObjectChangedError, ObjectExistsError, StoreError, unreadable
+from hybridlog_storage.errors import (
+    HeldError,
+    ObjectChangedError,
+    ObjectExistsError,
+    StoreError,
+    unreadable,
+)
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.bucket import Upload, other_name, path_of
@@ -210,8 +217,16 @@ class BucketPlace:
                 if listed != there:
                     target.add_recording(label, ListedRecording(recording, listed), fields)
                     self._describe(label, entry)
-                return label
-        raise StoreError(f"{self.name} changes all the time. Copy again.")
+                break
+        else:
+            raise StoreError(f"{self.name} changes all the time. Copy again.")
+        if is_whole and has_lost(self.segments(recording), state):
+            raise HeldError(
+                f"another process has copied it into {self.name} at this moment, with fewer "
+                "payloads.",
+                is_recording=False,
+            )
+        return label
 
     def _entry(self, recording: str) -> RecordingEntry | None:
         """The entry of a recording in the store that is copied, as its files are now."""

@@ -21,8 +21,8 @@ from hybridlog.maintenance.places import (
     CopiedFile,
     RefusedError,
     content_of,
-    expired_in,
     files_of,
+    has_lost,
     pieces_of,
 )
 from hybridlog.wording import counted
@@ -206,8 +206,7 @@ class _Copying:
         for recording, sent in self._proven.items():
             now, found = there.get(recording), self._place.segments(recording)
             is_whole = now is not None and not (now.lacks_payloads or now.is_damaged)
-            gone = (topics - sent.expired.get(n, set()) for n, (_, topics) in found.items())
-            if not is_whole or any(gone):
+            if not is_whole or has_lost(found, sent):
                 problems.append(f"Payloads of {sent.name} stay: its copy in {name} has lost some.")
                 continue
             digests = {number: one.digest for number, one in sent.sealed.items()}
@@ -285,7 +284,7 @@ class _Copying:
                 "--only-fields mends it."
             )
         may_lack = known.expired and not known.lacks_payloads
-        if may_lack and known.expired > expired_in(state):
+        if may_lack and has_lost(self._place.segments(one.id), state):
             self._report.lacking.append(known.label)
         self._check_there(one, known, state)
 
@@ -295,7 +294,7 @@ class _Copying:
         """Read a copy that is there before payloads expire here."""
         if self._options.then_expire:
             problems = self._place.problems(one.id)
-            if known.lacks_payloads or known.expired:
+            if known.lacks_payloads or has_lost(self._place.segments(one.id), state):
                 problems.append("payloads of it have expired there")
             if problems:
                 self._report.problems.append(
@@ -303,7 +302,7 @@ class _Copying:
                     f"whole: {'; '.join(problems[:3])}."
                 )
             else:
-                self._proven[one.id] = replace(state, expired={})
+                self._proven[one.id] = state
 
     def _missing(self, recording: str, state: JournalState, known: Copied) -> int:
         """Number of segments that its copy does not have, but for marks: they do not follow."""

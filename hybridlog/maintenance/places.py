@@ -526,6 +526,11 @@ def segments_of(directory: StoreDirectory, label: str | None) -> dict[int, tuple
     return {n: (one.digest, state.expired.get(n, set())) for n, one in state.sealed.items()}
 
 
+def has_lost(there: Mapping[int, tuple[str, set[str]]], state: JournalState) -> bool:
+    """True if payloads expired in a copy that a journal still has; `there` as of `segments`."""
+    return any(topics - state.expired.get(number, set()) for number, (_, topics) in there.items())
+
+
 def copied_of(directory: StoreDirectory, label: str) -> Copied:
     """A recording of a store, by its journal."""
     state = journal.read(directory.recording(label)) or JournalState()

@@ -279,6 +279,18 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
             assert answers(lab, label) == right[label]
 
 
+def test_what_expired_before_keeps_no_other_payloads(robots: Path, tmp_path: Path) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    with hl.open(robot, mongo="none") as store:
+        expire(store, "recorded", [1])
+        store.copy(lab, ["recorded"])
+        for frees in (True, False):
+            report = store.copy(lab, ["recorded"], CopyOptions(then_expire=True))
+            assert (report.known, report.problems) == (["recorded"], [])
+            assert bool(report.freed_bytes) == frees
+
+
 def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
     robot, lab, told = tmp_path / "robot", tmp_path / "lab", dict[str, Any]()
     shutil.copytree(robots, robot)

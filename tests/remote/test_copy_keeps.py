@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 from collections import Counter
 from pathlib import Path
@@ -18,6 +19,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
 from tests.cli import running as commands
 from tests.cli.within import answer
 from tests.copying.conftest import expire
@@ -72,6 +74,31 @@ def test_only_lost_objects_are_replaced(robot: hl.Store, address: str) -> None:
     assert (report.copied, report.problems) == (["run"], [])
     assert states(robot.directory.path) == {"expired": COUNT}  # all of it is there
     assert states(address) == {"whole": COUNT}
+
+
+def test_another_store_that_lost_more_was_faster(
+    robot: hl.Store, address: str, tmp_path: Path, calls: Calls
+) -> None:
+    """Payloads that only this store has stay, and the copy is not called whole."""
+    shutil.copytree(robot.directory.path, tmp_path / "other")
+    expire(robot, "run", [0])
+    before = states(robot.directory.path)
+
+    def meanwhile(*_: object, **__: object) -> None:
+        if len(published) > 1:  # by the other store
+            return
+        with hl.open(tmp_path / "other", mongo="none") as other:
+            expire(other, "run", [1])
+            assert other.copy(address).copied == ["run"]
+
+    published = calls(BucketPlace, "publish", meanwhile)
+    report = robot.copy(address, options=THEN)
+    assert "with fewer payloads" in report.refused["run"]
+    assert report.held == [robot.entry("run").id]
+    report = robot.copy(address, options=THEN)
+    assert (report.known, report.lacking) == (["run"], ["run"])
+    assert "run stay" in report.problems[0]
+    assert states(robot.directory.path) == before
 
 
 def test_what_neither_has_is_told(robot: hl.Store, address: str) -> None:
