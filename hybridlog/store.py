@@ -1640,7 +1640,8 @@ class Store:
             return (chosen if recordings.is_everything else chosen.check()).summaries
         if recordings is None:
             return self.summaries()
-        ids = {entry.id for entry in self.select(recordings)}
+        names = [recordings] if isinstance(recordings, str) else recordings
+        ids = {entry.id for entry in self.select(names)}
         return [one for one in self.summaries() if one.id in ids]
 
     def repair(

@@ -56,7 +56,10 @@ MOVED: Final = {
     "trigger --rehearse": "intervals --rehearse EXPRESSION",
     "trust": "index trust",
     "untag": "tag RECORDING --remove KEY",
-    **dict.fromkeys(("diff -r", "diff --tag"), "diff RECORDING RECORDING"),
+    **dict.fromkeys(
+        ("diff -r", "diff --tag", "diff --last", "diff --older-than"),
+        "diff RECORDING RECORDING --between T0 T1",
+    ),
 }
 """Other names and options that people try, and the commands that do this."""
 

@@ -60,7 +60,7 @@ class Choice:
             TimeError: `during` is not a pair.
         """
         if during is not None and (isinstance(during, str) or len(during) != 2):
-            raise TimeError(f"during takes two times, (begin, end), not {during!r}.")
+            raise TimeError(f"A range takes two times, (begin, end), not {during!r}.")
         return cls(
             _texts(name),
             _tags(tag),

@@ -260,6 +260,9 @@ def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
     assert (none.rows(), none.counts.files) == ([], set())
     arrays = store.sql("select max(ranges[1]), count(*) from scan", between=("start", "+21ms"))
     assert (arrays.rows(), arrays.counts.payload_bytes) == ([(10.0, 11)], 11 * len(scan(0)))
+    assert store.sql(count, recordings="second").rows() == [(40,)]
+    with pytest.raises(TimeError, match="A range takes two times"):
+        store.sql(count, between="now")  # type: ignore[arg-type]
     with pytest.raises(TimeError, match="Nothing was recorded between"):
         store.sql(count, between=("2001-01-01", "2001-01-02"))
     with pytest.raises(TopicError, match="There is no recording with the tag site=park"):
