@@ -98,10 +98,11 @@ class SqlEngine:
 
     def content(self, scope: Question = EVERYWHERE) -> StoreContent:
         """Recordings and views of a scope as they are now."""
-        with self._lock, self.session.at_one_moment():
+        with self._lock:
             known = self._content
             if known is None or known.scope != scope or known.snapshot is not self.session.look():
-                known = self._content = StoreContent(self.session, scope)
+                with self.session.at_one_moment():
+                    known = self._content = StoreContent(self.session, scope)
             return known
 
     def tree(self, cursor: Any, text: str) -> str:
@@ -181,10 +182,11 @@ class SqlConnection:
         Raises:
             IncompleteError: Messages are lost, or not written yet.
         """
-        content = self.content
-        named = (content.names.topic(name) for name in content.names.named(text))
-        topics = {topic for topic in named if topic is not None}
-        self.completeness(topics, content.having(topics)).check()
+        with self.engine.session.at_one_moment():
+            content = self.content
+            named = (content.names.topic(name) for name in content.names.named(text))
+            topics = {topic for topic in named if topic is not None}
+            self.completeness(topics, content.having(topics)).check()
 
     def completeness(self, topics: Collection[str], recordings: Collection[str]) -> Completeness:
         """Completeness of the answer of a query."""
@@ -228,12 +230,13 @@ class SqlConnection:
             )
         if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
             raise UsageError("Only queries are possible here, such as select and show.")
-        self._names.update(self.content.names.named(text))
-        self.register()
-        answers = [
-            self._prepared(statement, params if statement is statements[-1] else None, timeout)
-            for statement in statements
-        ]
+        with self.engine.session.at_one_moment():
+            self._names.update(self.content.names.named(text))
+            self.register()
+            answers = [
+                self._prepared(statement, params if statement is statements[-1] else None, timeout)
+                for statement in statements
+            ]
         return answers[-1]
 
     def _prepared(self, statement: Any, params: Params, timeout: float | None) -> SqlAnswer:

@@ -223,6 +223,7 @@ def test_missing_and_damaged_tables_are_made_again(own: hl.Store, limit: Limit) 
     own.close()
     path.write_bytes(data)
     with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
+        assert again.sql("select * from large", between=("start", "end")).rows()
         assert again.sql("select * from large").to_arrow().num_rows == wanted[0][0]
         assert again.sql(query).rows() == wanted
         again.mend()

@@ -12,6 +12,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live import LiveRecording
+from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.open_segment import OpenSegment
@@ -41,13 +42,14 @@ def reader(tmp_path: Path, server: str, limit: Limit) -> Iterator[tuple[LiveReco
                 yield recording, opened
 
 
-def wait_for(store: hl.Store, query: str, wanted: int) -> None:
+def wait_for(store: hl.Store | SqlConnection, query: str, wanted: int) -> None:
+    ask = store.sql if isinstance(store, hl.Store) else store.query
     until = time.monotonic() + 60
     found = -1
     while found != wanted:
         assert time.monotonic() < until, f"{found} of {wanted} rows"
         time.sleep(0.02)
-        ((found,),) = store.sql(query).rows()
+        ((found,),) = ask(query).rows()
 
 
 def test_flushed_chunks_answer(reader: tuple[LiveRecording, hl.Store]) -> None:
@@ -72,6 +74,11 @@ def test_flushed_chunks_answer(reader: tuple[LiveRecording, hl.Store]) -> None:
     assert store.sql("select ranges[1], echo.far[2] from scan").rows() == [(7.0, 1.75)]
     wait_for(store, "select count(*) from note", 2)
     assert store.sql("select a.b, c from note order by t").rows() == [(1.0, None), (2.5, "x")]
+    # A prompt, which asks again in one connection.
+    connection = store.sql_engine.connect()
+    wait_for(connection, "select count(*) from note", 2)
+    recording.write(JSON, b"{}", log_time=BASE + 503)
+    wait_for(connection, "select count(*) from note", 3)
     times = store.sql(f"select t from large where t >= {BASE + 290}")
     assert [t for (t,) in times.rows()] == [BASE + n for n in range(290, 300)]
     assert times.counts.chunks <= 2
