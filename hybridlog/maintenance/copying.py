@@ -255,10 +255,29 @@ class _Copying:
             if problems and not (found is not None and found.is_damaged):
                 self._report.problems.append(
                     f"{known.label} in {self._place.name} is damaged: {'; '.join(problems[:3])}. "
-                    f"Restore it, or remove it there (`hybridlog rm {known.label}`), and copy "
-                    "again."
+                    f"{self._cure(recording, known.label)}"
                 )
         return self._place.have([*there])
+
+    def _cure(self, recording: str, there: str) -> str:
+        """What to do about a copy: to be removed, it must have nothing that is not here."""
+        segments = self._place.segments(recording)
+        with suppress(StoreError):
+            for label in self._source.labels_of(recording):
+                inventory = take_inventory(self._source, label)
+                state = inventory.state or JournalState()
+                gone = (
+                    topics - segments.get(n, ("", set()))[1] for n, topics in state.expired.items()
+                )
+                if (
+                    inventory.is_proven
+                    and not (inventory.misfits or state.lacks_payloads or any(gone))
+                    and segments.keys() <= state.sealed.keys()
+                ):
+                    return (
+                        f"Restore it, or remove it there (`hybridlog rm {there}`), and copy again."
+                    )
+        return "Restore it from another copy: not all of it is here."
 
     def _state(self, recording: str) -> JournalState:
         """The journal of a recording here; an empty one if it cannot be read."""
@@ -273,8 +292,8 @@ class _Copying:
         if missing:
             self._report.refused[one.label] = (
                 f"{known.label} in {self._place.name} lacks {counted(missing, 'segment')} of "
-                f"recording {one.label!r}: it may have been copied by hand before its end. Remove "
-                f"it there (`hybridlog rm {known.label}`), and copy again."
+                f"recording {one.label!r}: it may have been copied by hand before its end. "
+                f"{self._cure(one.id, known.label)}"
             )
             return
         self._report.known.append(known.label)

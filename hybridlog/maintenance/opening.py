@@ -322,12 +322,12 @@ class StoreFiles:
     ) -> RecordingSummary:
         """Choose one of several directories with the same recording, and put it in the catalog.
 
-        The most complete one; of equals the one in the catalog, then the one with the older
-        journal.
+        The most complete one, with the most payloads; of equals the one in the catalog, then the
+        one with the older journal.
         """
         whole = ["complete", "open", "recovered", "unfinished", "unproven", "damaged"]
 
-        def rank(one: RecordingSummary) -> tuple[int, int, bool, int, str]:
+        def rank(one: RecordingSummary) -> tuple[int, int, int, bool, int, str]:
             place = whole.index(one.status) if one.status in whole else 0
             was_known = one.label in known and known[one.label].id == one.id
             try:
@@ -335,7 +335,8 @@ class StoreFiles:
                 written = files.status(path).st_ctime_ns
             except OSError:
                 written = time.time_ns()
-            return -one.messages, place, not was_known, written, one.label
+            lacks = one.expired + one.not_copied
+            return -one.messages, place, lacks, not was_known, written, one.label
 
         chosen, *others = sorted(copies, key=rank)
         for other in others:

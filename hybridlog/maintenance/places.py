@@ -464,7 +464,8 @@ class DirectoryPlace:
     def _name(self, label: str, *, is_there: bool) -> str:
         """Give the recording its label; the copy that lacked payloads goes.
 
-        After a crash in between there are two copies, and the store names them.
+        After a crash in between there are two copies: the whole one answers, and the store names
+        the other one.
         """
         free = self._directory.free_label(label)
         self._directory.move(self._path.name, free)

@@ -506,3 +506,41 @@ def test_labels_are_read_once(robots: Path, tmp_path: Path, calls: Calls) -> Non
         "recorded": "other",
         "noted": "recorded",
     }
+
+
+def test_a_cure_deletes_nothing_that_is_not_here(robots: Path, tmp_path: Path) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    with hl.open(robot, mongo="none") as store:
+        store.copy(lab, ["recorded"])
+        path = lab / "recordings" / "recorded" / "000001.mcap"
+        data = bytearray(path.read_bytes())
+        data[len(data) // 3] ^= 1
+        path.write_bytes(data)
+        (said,) = store.copy(lab, ["recorded"], CopyOptions(check=True)).problems
+        assert "`hybridlog rm recorded`" in said
+        expire(store, "recorded", [0])
+        (said,) = store.copy(lab, ["recorded"], CopyOptions(check=True)).problems
+        assert "`hybridlog rm" not in said
+        assert "from another copy" in said
+
+
+def test_a_crash_before_the_copy_of_fields_goes(
+    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole copy answers, and what the store advises to remove is the other one."""
+    lab = tmp_path / "lab"
+    with directory_at(lab) as place:
+        copied(robots, place, "recorded", only_fields=True)
+    with monkeypatch.context() as patch:
+        Calls(patch).fail(StoreDirectory, "hide", KeyboardInterrupt)
+        with suppress(KeyboardInterrupt), directory_at(lab) as place:
+            copied(robots, place, "recorded")
+    assert labels_in(lab) == ["recorded-2"]
+    assert answers(lab, "recorded-2") == answers(robots, "recorded")
+    with directory_at(lab) as place:
+        assert copied(robots, place, "recorded").known == ["recorded-2"]
+    with hl.open(lab, mongo="none") as store:
+        assert store.repairs.copies == {"recorded": "recorded-2"}
+        store.remove("recorded")
+    assert labels_in(lab) == ["recorded-2"]
