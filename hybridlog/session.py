@@ -169,6 +169,7 @@ class Session:
         directory: The store's directory.
         connection: The connection to MongoDB.
         repairs: Repairs made when the store was opened.
+        unavailable: The reason why MongoDB is unavailable; None while that is unknown.
         cache: What was read or worked out; chunks of single messages are a kind of it.
         invalidations: How often everything that was read was dropped.
         field_indexes: The indexes on fields in MongoDB; empty without a connection.
@@ -190,7 +191,7 @@ class Session:
         self.cache = Cache()
         self.field_indexes: list[FieldIndex] = []
         self._uncertain: tuple[int, dict[str, set[str]]] | None = None
-        self._unavailable: HybridlogError | None = None
+        self.unavailable: HybridlogError | None = None
         self._rests_until = 0.0
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
@@ -226,11 +227,6 @@ class Session:
     def connected(self) -> Database | None:
         """The index, if it is connected already."""
         return self.connection.database
-
-    @property
-    def unavailable(self) -> HybridlogError | None:
-        """The reason why MongoDB is unavailable; None while that is unknown."""
-        return self._unavailable
 
     @property
     def database(self) -> Database | None:
@@ -286,7 +282,7 @@ class Session:
             except BaseException as error:
                 self.disconnect()
                 if isinstance(error, HybridlogError):
-                    self._unavailable = error
+                    self.unavailable = error
                     self._rests_until = time.monotonic() + _REST_S
                 raise
 
@@ -323,7 +319,7 @@ class Session:
             self.repairs.indexed.update(repairs.indexed)
             self.repairs.unreadable.update(repairs.unreadable)
             self.repairs.removed += repairs.removed
-        self._unavailable = None
+        self.unavailable = None
         self._rests_until = 0.0
         self._stale = set() if wanted is None else self._stale - wanted.keys()
         known = self._indexed.copy()
@@ -343,7 +339,7 @@ class Session:
         """Record in the index that the store is at this location."""
         self._index_version = None
         self.connection.take_over()
-        self._unavailable = None
+        self.unavailable = None
         self._rests_until = 0.0
 
     def database_for(self, purpose: str, *, writes: bool = False) -> Database:
@@ -371,7 +367,7 @@ class Session:
         return database
 
     def _missing_database(self, purpose: str) -> DatabaseError:
-        return DatabaseError(f"{purpose} needs MongoDB. {self._unavailable or ''}".strip())
+        return DatabaseError(f"{purpose} needs MongoDB. {self.unavailable or ''}".strip())
 
     @property
     def writable_database(self) -> Database | None:
@@ -394,13 +390,13 @@ class Session:
             self.disconnect()
         # Those that a crash has cut are brought into the index by another opening.
         database = self._connected_for(None if self._recovers else [])
-        if database is None and self._unavailable is not None:
-            if isinstance(self._unavailable, ConnectionLostError):
-                return IndexTarget(failure=self._unavailable, renew=self._another_database)
+        if database is None and self.unavailable is not None:
+            if isinstance(self.unavailable, ConnectionLostError):
+                return IndexTarget(failure=self.unavailable, renew=self._another_database)
             if self.connection.has_none:
                 return IndexTarget()
-            if isinstance(self._unavailable, StoreError):
-                raise self._unavailable
+            if isinstance(self.unavailable, StoreError):
+                raise self.unavailable
         database = self._checked(database, purpose, writes=True)
         return IndexTarget(database, renew=self._another_database)
 

@@ -7,7 +7,6 @@ known what they were replaced by.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ import pyarrow as pa
 
 from hybridlog.columns import payload_files
 from hybridlog.columns.field_files import FieldColumns, FieldFile, newest
-from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of
+from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of
 from hybridlog.columns.payload_files import RecordingPayloads, next_number
 from hybridlog.columns.payload_rows import Piece
 from hybridlog.columns.payload_writer import TopicWriter
@@ -98,15 +97,11 @@ def _join(
         for key, found in having.items():
             if not _are_same(_tables(found, key), _tables(new.get(key, ()), key)):
                 raise StoreError(f"The joined fields of {path} do not come back.")
-        for file in made:
-            files.sync_folder((folder / file.file).parent, depth=IN_PAYLOADS - 1)
+        deleted = [file.file for file in old]
+        payload_files.announce(path, made, journal.EXPIRED, Journal(path), deleted)
     except BaseException:
-        files.remove_tree(folder, depth=files.IN_RECORDING)
+        payload_files.take_back(path, state)
         raise
-    files.sync_folder(folder, depth=files.IN_RECORDING)
-    files.sync_folder(path)
-    new_files, deleted = [asdict(file) for file in made], [file.file for file in old]
-    Journal(path).append(journal.event(journal.EXPIRED, files=new_files, deleted=deleted))
     payload_files.publish(path, journal.read(path))
     return sum(file.bytes for file in old) - sum(file.bytes for file in made)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import threading
 from collections import defaultdict
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.field_files import FieldFile
     from hybridlog.columns.payload_reader import PayloadReader
     from hybridlog.columns.topic_table import TopicTable
-    from hybridlog_storage.journal import JournalState, PayloadFile
+    from hybridlog_storage.journal import Journal, JournalState, PayloadFile
     from hybridlog_storage.messages import Buffer
     from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
@@ -42,6 +43,32 @@ def next_number(state: JournalState) -> int:
     """The least number that no file of columns of a recording has had."""
     names = (name.rpartition("-")[2] for name in state.payloads.keys() | state.deleted)
     return 1 + max((int(name.partition(".")[0]) for name in names), default=-1)
+
+
+def announce(
+    recording: Path, made: Sequence[PayloadFile], event: str, log: Journal, deleted: Sequence[str]
+) -> None:
+    """List new files, still among unfinished ones, and files that go, in the journal.
+
+    Raises:
+        HybridlogError: The journal cannot be written.
+        OSError: The names of the files cannot be forced to the disk.
+    """
+    parts = recording / PAYLOAD_PARTS
+    for folder in {(parts / file.file).parent for file in made}:
+        files.sync_folder(folder, depth=IN_PAYLOADS - 1)
+    files.sync_folder(parts, depth=files.IN_RECORDING)
+    files.sync_folder(recording)
+    gone = {"deleted": deleted} if deleted else {}
+    log.append(journal.event(event, files=[asdict(file) for file in made], **gone))
+
+
+def take_back(recording: Path, before: JournalState) -> None:
+    """Remove unfinished files, unless the journal lists them: then the next opening goes on."""
+    with suppress(StoreError, OSError):
+        state = journal.read(recording)
+        if state is not None and state.payloads.keys() == before.payloads.keys():
+            files.remove_tree(recording / PAYLOAD_PARTS, depth=files.IN_RECORDING)
 
 
 def publish(recording: Path, state: JournalState | None) -> None:

@@ -227,7 +227,7 @@ class Recorder:
         self._expected = 0
         self._unended = len(sources)
         self._over = threading.Event()
-        self._reason = ""
+        self.reason = ""  # for the end; empty while the recorder runs
         self._left, self._room = options.max_messages, options.max_bytes
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
@@ -337,11 +337,6 @@ class Recorder:
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
         return self._over.wait(seconds)
-
-    @property
-    def reason(self) -> str:
-        """The reason for the end; empty while the recorder runs."""
-        return self._reason
 
     def stop(self) -> list[RecordReport]:
         """Stop the sources; flush, index and seal everything.
@@ -805,7 +800,7 @@ class Recorder:
         now = self._now()
         with self._lock:
             self._ended_at = now if self._ended_at is None else self._ended_at
-            self._reason = self._reason or reason
+            self.reason = self.reason or reason
             self._closed = self._closed or self._refused is None
         self._over.set()
 

@@ -206,7 +206,8 @@ class LiveRecording:
         self._is_closing = False
         self._compression_pressure = _PressureTimer(_SKIP_COMPRESSION_AT)
         self._index_pressure = _PressureTimer(_DELAY_INDEX_AT)
-        self._failure: BaseException | None = None
+        self.failure: BaseException | None = None
+        """The error that stopped the recording, None while it works."""
         self._report: RecordReport | None = None
         self.ledger = Ledger()
         """Messages that are missing from this recording."""
@@ -399,11 +400,6 @@ class LiveRecording:
         """The error that stopped the index, None while it works."""
         return self._capture.index.failure
 
-    @property
-    def failure(self) -> BaseException | None:
-        """The error that stopped the recording, None while it works."""
-        return self._failure
-
     def close(self) -> RecordReport:
         """Write, index and seal everything, and return a report.
 
@@ -437,10 +433,10 @@ class LiveRecording:
         with self._frozen:
             try:
                 end = {"status": "complete", "losses": []}
-                if isinstance(self._failure, DiskFullError):
+                if isinstance(self.failure, DiskFullError):
                     failure = self._capture.close_truncated(end, self._cut_off())
-                elif self._failure is not None:
-                    raise self._failure
+                elif self.failure is not None:
+                    raise self.failure
                 else:
                     failure = self._close_whole(end)
             except BaseException:
@@ -513,8 +509,8 @@ class LiveRecording:
             self._calls.put(None)
 
     def _check(self) -> None:
-        if self._failure is not None:
-            raise self._failure
+        if self.failure is not None:
+            raise self.failure
         if self._ended:
             raise UsageError(f"The recording {self.label!r} was closed.")
 
@@ -568,7 +564,7 @@ class LiveRecording:
             yield
         except BaseException as error:
             with self._lock:
-                self._failure = self._failure or error
+                self.failure = self.failure or error
                 self._room.notify_all()
             raise
 

@@ -81,6 +81,10 @@ class Ring:
     Args:
         span_ns: The span, by the messages' steady times.
         max_bytes: Limit for the payload bytes in the ring.
+
+    Attributes:
+        payload_bytes: Payload bytes in the ring.
+        is_short: Whether memory did not suffice for the whole span.
     """
 
     def __init__(self, span_ns: int, max_bytes: int) -> None:
@@ -88,20 +92,20 @@ class Ring:
         self._max_bytes = max_bytes
         self._messages: deque[BufferedMessage] = deque()
         self._latched: dict[Hashable, _Latched] = {}
-        self._bytes = 0
-        self._cut = False
+        self.payload_bytes = 0
+        self.is_short = False
 
     def add(self, message: BufferedMessage) -> None:
         """Add a message, and drop those that are too old or too many."""
         self._messages.append(message)
-        self._bytes += len(message.payload)
+        self.payload_bytes += len(message.payload)
         oldest = message.steady - self._span
-        while (is_full := self._bytes > self._max_bytes) or (
+        while (is_full := self.payload_bytes > self._max_bytes) or (
             self._messages and self._messages[0].steady < oldest
         ):
-            self._cut |= is_full
+            self.is_short |= is_full
             dropped = self._messages.popleft()
-            self._bytes -= len(dropped.payload)
+            self.payload_bytes -= len(dropped.payload)
             _latch(self._latched, dropped)
 
     def since(self, begin: int) -> list[BufferedMessage]:
@@ -138,18 +142,8 @@ class Ring:
         return found
 
     @property
-    def payload_bytes(self) -> int:
-        """Payload bytes in the ring."""
-        return self._bytes
-
-    @property
     def held_s(self) -> float:
         """Seconds between the oldest and the newest message."""
         if not self._messages:
             return 0.0
         return (self._messages[-1].steady - self._messages[0].steady) / 1e9
-
-    @property
-    def is_short(self) -> bool:
-        """Tells whether memory did not suffice for the whole span."""
-        return self._cut

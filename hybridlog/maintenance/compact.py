@@ -9,8 +9,7 @@ removes; after it, the next opening finishes.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import count, pairwise
 from typing import TYPE_CHECKING
@@ -111,13 +110,14 @@ def compact(
             if chosen:
                 work.write(chosen)
                 work.prove(chosen)
-                work.announce(chosen)
+                if made := [file for topic in chosen for file in topic.files]:
+                    log = Journal(work.path)
+                    payload_files.announce(work.path, made, journal.COMPACTED, log, ())
                 payload_files.publish(work.path, journal.read(work.path))
-        except OSError as error:
-            work.take_back()
-            raise durability.explain(error, work.path, "writing columns of") from error
-        except BaseException:
-            work.take_back()
+        except BaseException as error:
+            payload_files.take_back(work.path, work.state)
+            if isinstance(error, OSError):
+                raise durability.explain(error, work.path, "writing columns of") from error
             raise
         try:
             if drop_mcap:
@@ -142,7 +142,7 @@ class _Compaction:
             raise StoreError(
                 f"The journal of recording {label!r} has no end: run `hybridlog repair` first."
             )
-        self._state = state
+        self.state = state
         self._size = sum(summary.size for summary in self._inventory.summaries.values())
         self._report = reporter(progress, label, 2 * self._size)  # what is written is proved
 
@@ -154,7 +154,7 @@ class _Compaction:
         """
         from hybridlog.columns.payload_rows import TopicColumns
 
-        have = {f.topic for f in self._state.payloads.values() if not f.has_fields}
+        have = {f.topic for f in self.state.payloads.values() if not f.has_fields}
         found: dict[tuple[str, str], _Topic] = {}
         refused: dict[str, CompactedTopic] = {}
         for number, channel, messages in self._channels():
@@ -276,25 +276,6 @@ class _Compaction:
         for file in topic.files:
             files.unlink(self.path / PAYLOAD_PARTS / file.file, depth=IN_PAYLOADS)
         topic.files = []
-
-    def announce(self, chosen: Sequence[_Topic]) -> None:
-        """List the files in the journal."""
-        made = [file for topic in chosen for file in topic.files]
-        if made:
-            # Names have to be on the disk before the journal refers to them.
-            for folder in {(self.path / PAYLOAD_PARTS / file.file).parent for file in made}:
-                files.sync_folder(folder, depth=IN_PAYLOADS - 1)
-            files.sync_folder(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
-            files.sync_folder(self.path)
-            line = journal.event(journal.COMPACTED, files=[asdict(file) for file in made])
-            Journal(self.path).append(line)
-
-    def take_back(self) -> None:
-        """Remove unfinished files, unless the journal lists them: then the next opening goes on."""
-        with suppress(StoreError, OSError):
-            state = journal.read(self.path)
-            if state is not None and state.payloads.keys() == self._state.payloads.keys():
-                files.remove_tree(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
 
     def _chunks(
         self, topics: Sequence[_Topic], report: Callable[[int], None] = lambda _: None

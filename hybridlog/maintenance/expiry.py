@@ -21,7 +21,7 @@ messages expires; until then it keeps the others, and room is freed in segments 
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Final
@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.columns import payload_files
-from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of
+from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of
 from hybridlog.columns.payload_files import RecordingPayloads, next_number, walk
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.thinning import replace_chunks
@@ -192,9 +192,9 @@ class _Expiry:
             if not self._chosen:
                 return done
             directory.require(EXPIRED)
-            self._announce(made)
+            payload_files.announce(self._path, made, journal.EXPIRED, self._log, ())
         except BaseException as error:
-            self._take_back()
+            payload_files.take_back(self._path, self._state)
             if isinstance(error, OSError):
                 raise durability.explain(error, self._path, "writing fields of") from error
             raise
@@ -288,21 +288,6 @@ class _Expiry:
 
         channels = {(topic, schema): w.channel for (topic, schema, _), w in self._writers.items()}
         return join(self._path, channels.values(), max_files)
-
-    def _announce(self, made: list[PayloadFile]) -> None:
-        """List the files in the journal."""
-        folder = self._path / PAYLOAD_PARTS
-        for inside in {(folder / file.file).parent for file in made}:
-            files.sync_folder(inside, depth=IN_PAYLOADS - 1)
-        files.sync_folder(folder, depth=files.IN_RECORDING)
-        files.sync_folder(self._path)
-        self._log.append(journal.event(journal.EXPIRED, files=[asdict(file) for file in made]))
-
-    def _take_back(self) -> None:
-        """Remove unfinished files, unless the journal lists them: then the next opening goes on."""
-        with suppress(StoreError, OSError):
-            if self._journal().payloads.keys() == self._state.payloads.keys():
-                files.remove_tree(self._path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
 
     def _replace(self, segment: WalkedSegment) -> int:
         chosen = self._chosen[segment.number]
