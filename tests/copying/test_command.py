@@ -13,6 +13,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli import watching
 from hybridlog.cli.signals import Stopped
+from hybridlog.drawing.density import density
 from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
@@ -158,6 +159,10 @@ def _told(path: Path) -> Counter[State]:
         sql = store.sql("select state, count(*) from cloud group by 1").to_arrow().to_pydict()
         assert dict(zip(*sql.values(), strict=True)) == found
         (one,) = store.summaries()
+        assert one.span is not None
+        span = one.span[0], one.span[1] + 1
+        drawn = density(store.session, store.entry(one.id), span, 8, ["/cloud"])
+        assert drawn.counts.sum() == found.total()
         (listed,) = answer("ls", "--json", store=path).json
         assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)
     raw = answer("fetch", "cloud", "-o", path / "cut.mcap", "--force", store=path).err

@@ -272,10 +272,15 @@ def test_only_fields_name_a_damaged_copy(robot: hl.Store, address: str) -> None:
     Bucket(address).delete([o.name for o in Bucket(address).objects("tables")])
     files.mounted.clear()
     assert robot.copy(address).known == ["run"]  # messages answer, too
+    expire(robot, "run", [0])
+    shutil.rmtree(robot.directory.path / "tables")
+    robot.repair()  # now its tables say so, and those that are sent
     assert robot.copy(address, options=CopyOptions(check=True)).copied == ["run"]
     files.mounted.clear()
     with hl.open(address) as there:
         assert not there.verify().findings
+        states = there.sql("select distinct state from scan").to_arrow()["state"]
+        assert states.to_pylist() == ["whole"]
 
 
 def test_the_same_number_of_others_expired_there(robot: hl.Store, address: str) -> None:

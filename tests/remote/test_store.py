@@ -545,6 +545,8 @@ def test_all_commands_tell_of_lost_objects(here: Path, address: str) -> None:
         "/journal": ("journal lost", "an unknown number lost"),
     }.items():
         lose(address, lost, run)
+        files.mounted.clear()
+        assert hl.open(address).topic("arm").completeness().has_losses
         assert listed in told("ls").out
         assert told("ls", "--json").json[0]["status"] != "complete"
         for count in ("n < 10", "n > 10000"):
