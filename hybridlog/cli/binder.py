@@ -107,15 +107,11 @@ def command(
     """
 
     def bound(function: Callable[..., Any]) -> click.Command:
-        parameters = parameters_of(kind)
-        own = [str(parameter.name) for parameter in parameters]
-
         @wraps(function)
         def call(**values: Any) -> Any:
-            return function(kind(**{name: values.pop(name) for name in own}), **values)
+            return function(kind(**values))
 
-        known = getattr(function, "__click_params__", [])
-        call.__click_params__ = [*known, *reversed(parameters)]  # type: ignore[attr-defined]
+        call.__click_params__ = parameters_of(kind)[::-1]  # type: ignore[attr-defined]
         make: Any = click.command(name, **{"cls": Command, **settings})
         made: click.Command = make(call)
         if to is not None:

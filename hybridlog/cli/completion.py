@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -93,20 +94,17 @@ def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) 
     return []
 
 
-def complete_field(context: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """Topics, with the colon that a field follows; then its fields."""
-    if ":" in incomplete:
-        return complete_path(context, param, incomplete)
-    return [f"{topic}:" for topic in complete_topic(context, param, incomplete)]
-
-
 def complete_condition(
-    context: click.Context, param: click.Parameter, incomplete: str
+    context: click.Context, param: click.Parameter, incomplete: str, space: str = " "
 ) -> list[str]:
     """Topics, with the colon and space that fields or a predicate follow; then its fields."""
     if ":" in incomplete:
         return complete_path(context, param, incomplete)
-    return [f"{topic}: " for topic in complete_topic(context, param, incomplete)]
+    return [f"{topic}:{space}" for topic in complete_topic(context, param, incomplete)]
+
+
+complete_field: Final = partial(complete_condition, space="")
+"""The same for a field, which follows without a space."""
 
 
 def complete_path(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:

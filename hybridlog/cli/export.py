@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -21,7 +21,7 @@ from hybridlog.cli.answers import (
     write_answer,
 )
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.lerobot import LEROBOT, check_options, export_set, lerobot_options
+from hybridlog.cli.lerobot import LEROBOT, Training, export_set
 from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
@@ -48,7 +48,7 @@ _FILES = formats_of("table", "lines", "video")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Topics, Slices):
+class _Given(Topics, Slices, Training):
     target: Path = argument(
         "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"
     )
@@ -62,8 +62,7 @@ class _Given(Topics, Slices):
 
 
 @command(_Given)
-@lerobot_options
-def export_command(given: _Given, **training: Any) -> None:
+def export_command(given: _Given) -> None:
     """Export whole recordings; tables get one file a topic.
 
     `lerobot` makes a training set for robot learning.
@@ -72,7 +71,7 @@ def export_command(given: _Given, **training: Any) -> None:
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or _form(target)
-    check_options(training, form)
+    given.check_form(form)
     options.check_latched(
         no_latched=given.no_latched, original_times=given.original_times, form=form
     )
@@ -90,7 +89,7 @@ def export_command(given: _Given, **training: Any) -> None:
         if form == LEROBOT:
             if split is not None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")
-            export_set(store, query, target, training, force=force, quiet=quiet)
+            export_set(store, query, target, given, force=force, quiet=quiet)
             return
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:

@@ -17,6 +17,9 @@ from hybridlog_storage.errors import TopicError
 _FIRST: Final = ("topic", "between", "where", "fields", "output", "form")
 _SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "Live recording": (),
+    "With lerobot": (
+        "features", "propose_map", "fps", "episodes_by", "task", "task_topic", "vcodec", "on_gap",
+    ),
     "Choosing recordings": (
         "recording", "tag", "has", "types", "during", "last", "older_than", "conditions",
     ),

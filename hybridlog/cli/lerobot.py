@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import PATH
+from hybridlog.cli.binder import option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.signals import if_stopped
@@ -23,64 +23,56 @@ if TYPE_CHECKING:
 
 LEROBOT: Final = "lerobot"
 _FPS: Final = 30
-_OPTIONS: Final = (
-    click.option("--map", "features", type=PATH, help="For lerobot: topics and fields, in YAML."),
-    click.option(
-        "--propose-map",
-        is_flag=True,
-        help="For lerobot: write a map for the topics that are there to OUTPUT, and nothing else.",
-    ),
-    click.option("--fps", type=click.IntRange(1, 1000), help=f"For lerobot; without, {_FPS}."),
-    click.option(
-        "--episodes-by",
-        metavar="HOW",
-        help="For lerobot: an episode for each `recording`, `mark`, or interval of a predicate.",
-    ),
-    click.option("--task", help="For lerobot: what the robot does, in words."),
-    click.option(
-        "--task-topic",
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """Options of training sets."""
+
+    features: Path | None = option("Topics and fields, in YAML.", "FILE", name="--map")
+    propose_map: bool = option(
+        "Write a map for the topics that are there to OUTPUT, and nothing else."
+    )
+    fps: int | None = option(
+        f"Frames a second; without, {_FPS}.", "N", type=click.IntRange(1, 1000)
+    )
+    episodes_by: str | None = option(
+        "An episode for each `recording`, `mark`, or interval of a predicate.", "HOW"
+    )
+    task: str | None = option("What the robot does, in words.", "TEXT")
+    task_topic: str | None = option(
+        "A topic of texts that say it, at the begin of each episode.",
+        "TOPIC",
         shell_complete=complete_topic,
-        help="For lerobot: a topic of texts that say it, at the begin of each episode.",
-    ),
-    click.option(
-        "--vcodec", type=click.Choice(["h264", "av1"]), help="For lerobot; without, h264."
-    ),
-    click.option(
-        "--on-gap",
+    )
+    vcodec: Literal["h264", "av1"] | None = option(
+        "Without, h264.", type=click.Choice(["h264", "av1"])
+    )
+    on_gap: Literal["refuse", "drop", "hold"] | None = option(
+        "Refuse an episode with a gap (the default), cut it there, or keep the last value.",
         type=click.Choice(["refuse", "drop", "hold"]),
-        help="For lerobot: refuse an episode with a gap (the default), cut it there, or keep the "
-        "last value.",
-    ),
-)
+    )
 
-
-def lerobot_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of training sets."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
-
-
-def check_options(given: dict[str, Any], form: str) -> None:
-    """Refuse options of training sets with another format."""
-    used = sorted(name for name, value in given.items() if value not in {None, False})
-    if used and form != LEROBOT:
-        name = "--map" if used[0] == "features" else f"--{used[0].replace('_', '-')}"
-        raise UsageError(f"{name} is for lerobot, not for {form}.")
+    def check_form(self, form: str) -> None:
+        """Refuse these options with another format."""
+        used = sorted(one.name for one in fields(Training) if getattr(self, one.name))
+        if used and form != LEROBOT:
+            name = "--map" if used[0] == "features" else f"--{used[0].replace('_', '-')}"
+            raise UsageError(f"{name} is for lerobot, not for {form}.")
 
 
 def export_set(
-    store: Store, query: Query, target: Path, given: dict[str, Any], *, force: bool, quiet: bool
+    store: Store, query: Query, target: Path, given: Training, *, force: bool, quiet: bool
 ) -> None:
     """Write a training set, or propose a map for one.
 
     Raises:
         UsageError: An option does not fit, a gap is refused, or the output exists.
     """
-    if given["propose_map"]:
+    if given.propose_map:
         _write_map(_proposed(query), target, force=force, quiet=quiet)
         return
-    if given["features"] is None:
+    if given.features is None:
         raise UsageError(
             "Name a map with --map FILE. `hybridlog export map.yaml --format lerobot "
             "--propose-map` writes one to begin with."
@@ -98,17 +90,17 @@ def export_set(
 
         report = store.to_lerobot(
             query,
-            given["features"],
+            given.features,
             target,
-            fps=given["fps"] or _FPS,
-            episodes_by=given["episodes_by"] or "recording",
-            task=given["task"] or "",
-            task_topic=given["task_topic"],
-            codec=given["vcodec"] or "h264",
-            on_gap=given["on_gap"] or "refuse",
+            fps=given.fps or _FPS,
+            episodes_by=given.episodes_by or "recording",
+            task=given.task or "",
+            task_topic=given.task_topic,
+            codec=given.vcodec or "h264",
+            on_gap=given.on_gap or "refuse",
             progress=tell,
         )
-    _print_report(report, given["fps"], quiet=quiet)
+    _print_report(report, given.fps, quiet=quiet)
 
 
 def _proposed(query: Query) -> str:
