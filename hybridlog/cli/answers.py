@@ -249,7 +249,7 @@ class Listing(Tabular):
         elif titles or spare:
             shown = [cells(row) for row in limited]
             if shown:
-                output.print_rows(*output.fitted(columns, shown, spare), titles)
+                output.print_rows(columns, shown, titles, spare)
         else:
             first = list(islice(limited, 1))
             if first:
@@ -653,25 +653,29 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
     Returns:
         Number of rows of the tables.
     """
-    from hybridlog.frames.cells import cells
+    from hybridlog.frames.cells import MAX_LINE, cells
+    from hybridlog.schema.arrow_types import is_text
 
     most = SCREEN_ROWS if limit is None else limit
     read = 0
 
-    def rows() -> Iterator[tuple[list[str], list[str]]]:
+    def rows() -> Iterator[tuple[tuple[list[str], list[int]], list[str]]]:
         nonlocal read
         for table in tables:
-            names, wanted = table.column_names, table.slice(0, max(most - read, 0))
+            wanted = table.slice(0, max(most - read, 0))
             read += table.num_rows
-            for row in cells(wanted):
-                yield names, row
+            texts = [n for n, column in enumerate(table.schema) if is_text(column.type)]
+            columns = table.column_names, texts
+            for row in cells(wanted, most=MAX_LINE):
+                yield columns, row
 
     # Headings are printed again only where the columns change.
-    for names, alike in groupby(rows(), itemgetter(0)):
+    for (names, texts), alike in groupby(rows(), itemgetter(0)):
         lines = (row for _, row in alike)
         first = list(islice(lines, output.ROWS_AT_ONCE))
-        if output.fits(names, first):
-            output.print_table([(name, "left") for name in names], chain(first, lines))
+        short = partial(_shortened, texts=texts)
+        if output.fits(names, [*map(short, first)]):
+            output.print_table([(name, "left") for name in names], map(short, chain(first, lines)))
             continue
         begin = 2 if len(topics) > 1 else 1  # the first column is the time, the second the topic
         for row in chain(first, lines):
@@ -680,6 +684,13 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
             fields = zip(names[begin:], row[begin:], strict=True)
             output.print_record(title, [(name, cell) for name, cell in fields if cell])
     return read
+
+
+def _shortened(row: list[str], texts: list[int]) -> list[str]:
+    """A row for a table: the texts in some columns are cut off."""
+    from hybridlog.frames.cells import MAX_CELL
+
+    return [output.cut(cell, MAX_CELL) if n in texts else cell for n, cell in enumerate(row)]
 
 
 def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:

@@ -62,7 +62,8 @@ def _print_topic(item: dict[str, Any]) -> None:
     output.say(f"{item['topic']}  {item['type'] or '(no type)'}  ({encoding})")
     if item["definition"]:
         for line in str(item["definition"]).splitlines():
-            output.say("  " + line)
+            is_rule = sys.stdout.isatty() and {*line} == {"="}
+            output.say("  " + (line[: output.console().width - 2] if is_rule else line))
     if item["not_indexed"]:
         output.say(f"not indexed: {item['not_indexed']}")
     if item["fields"]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import re
 import subprocess
 from collections.abc import Iterator
 from importlib import metadata
+from shlex import quote
 from typing import Final
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from hybridlog import __version__
 from hybridlog.cli import output
@@ -29,6 +33,7 @@ NEEDED_FOR: Final = {
 
 _NAME: Final = re.compile(r"[\w.-]+")
 _EXTRA: Final = re.compile(r"extra == ['\"]([\w-]+)['\"]")
+_OWN: Final = re.compile(r"pip install 'hybridlog\[(\w+)\]'")
 _LIMIT_S: Final = 10
 
 
@@ -36,16 +41,17 @@ def print_installed() -> None:
     """Print the versions of hybridlog, Python, MongoDB and all packages, and missing extras."""
     here = f"{platform.system()} {platform.machine()}"
     output.say(f"hybridlog {__version__}, Python {platform.python_version()}, {here}")
-    output.say(f"MongoDB: {mongodb()}")
+    output.say_folded(f"MongoDB: {mongodb()}")
     own = (f"{name} {version}" for name, version in packages() if version)
-    output.say(f"Packages: {', '.join(own)}")
+    output.say_folded(f"Packages: {', '.join(own)}")
     output.say()
     rows = []
     for extra, purpose in NEEDED_FOR.items():
         found = list(packages(extra))
         has = ", ".join(f"{name} {version}" for name, version in found if version)
         is_there = all(version for _, version in found)
-        rows.append((extra, purpose, has if is_there else f"pip install 'hybridlog[{extra}]'"))
+        cure = "" if is_there else from_here(f"pip install 'hybridlog[{extra}]'")
+        rows.append((extra, purpose, cure or has))
     columns = ("extra", "needed for", "installed, or the cure")
     output.print_table([(heading, "left") for heading in columns], rows)
 
@@ -63,6 +69,19 @@ def packages(extra: str | None = None) -> Iterator[tuple[str, str | None]]:
             except metadata.PackageNotFoundError:
                 if "sys_platform" not in line:  # the MongoDB of another system
                     yield name[0], None
+
+
+def from_here(text: str) -> str:
+    """A text in which `pip install 'hybridlog[…]'` names the checkout of this hybridlog, if any."""
+    try:
+        origin = json.loads(metadata.distribution("hybridlog").read_text("direct_url.json") or "{}")
+        path = url2pathname(urlsplit(origin["url"]).path) if "dir_info" in origin else ""
+    except (KeyError, ValueError, metadata.PackageNotFoundError):
+        path = ""
+    if not path:
+        return text
+    edits = "-e " if origin["dir_info"].get("editable") else ""
+    return _OWN.sub(lambda found: f"pip install {edits}{quote(f'{path}[{found[1]}]')}", text)
 
 
 def mongodb() -> str:

@@ -202,6 +202,7 @@ def play(query: Query, names: Sequence[str], *, quiet: bool, **how: Any) -> None
     server = PlaybackServer(log, name, PlaybackOptions(**how), output.note)
     if not quiet:
         print_remarks(query, is_empty=False)
+        print_unplayed(query)
         _print_undefined(log)
     asyncio.run(_until_signal(server, quiet=quiet))
 
@@ -227,6 +228,14 @@ def _print_address(port: int, *, quiet: bool) -> None:
         output.note(f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}")
         output.note(f"In a browser: {url}")
         output.note("Ctrl-C ends it.")
+
+
+def print_unplayed(query: Query) -> None:
+    """Print the topics with messages that are left out, since their payload is gone."""
+    topics = {each.channel.topic for each in query.channels() if each.is_reduced}
+    if topics:
+        found = listed(sorted(topics), _MAX_SHOWN)
+        output.note(f"Messages without their payload are not played; there are some of {found}.")
 
 
 def _print_undefined(log: PlayedLog) -> None:

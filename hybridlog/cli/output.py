@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from itertools import islice, zip_longest
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TextIO
 
 from hybridlog import wording
 
@@ -28,8 +28,9 @@ Column = tuple[str, Literal["left", "right", "whole"]]
 """Heading and justification; `whole` is left and never folded, as numbers on the right are."""
 
 ROWS_AT_ONCE = 10_000
-_MAX_LINE = 100  # characters of a note, an attachment and the like
 """Rows of a table that are laid out together."""
+_MAX_LINE = 100  # characters of a note, an attachment and the like
+_MIN_ROOM = 20  # characters of a folded value
 
 
 def console(*, error: bool = False) -> Console:
@@ -191,18 +192,25 @@ def room(names: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     return console().width - sum(widths) - 2 * len(widths)
 
 
-def print_rows(columns: Sequence[Column], rows: Sequence[Sequence[str]], titles: int) -> None:
+def print_rows(
+    columns: Sequence[Column],
+    rows: Sequence[Sequence[str]],
+    titles: int,
+    spare: Sequence[str] = (),
+) -> None:
     """Print a table, or a block for each row where the screen would break words of a table.
 
     Args:
         columns: Headings, and the side on which the cells stand.
         rows: Cells.
         titles: Number of cells that are the title of a block.
+        spare: Columns that a table may leave out, see `fitted`; a block has them all.
     """
-    widths = [len(heading) for heading, _ in columns]
-    _widen(widths, rows)
-    if not sys.stdout.isatty() or widths_within(columns, rows, widths) is not None:
-        print_table(columns, rows)
+    less, cells = fitted(columns, rows, spare)
+    widths = [len(heading) for heading, _ in less]
+    _widen(widths, cells)
+    if not sys.stdout.isatty() or widths_within(less, cells, widths) is not None:
+        print_table(less, cells)
         return
     for row in rows:
         named = zip(columns[titles:], row[titles:], strict=True)
@@ -210,11 +218,16 @@ def print_rows(columns: Sequence[Column], rows: Sequence[Sequence[str]], titles:
 
 
 def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:
-    """Print one message: a title, a line a field, and an empty one."""
+    """Print one message: a title, a line a field, folded on a terminal, and an empty one."""
     width = max((len(name) for name, _ in fields), default=0)
+    room = max(console().width - width - 4, _MIN_ROOM) if sys.stdout.isatty() else None
     say(title)
     for name, value in fields:
-        say(f"  {name:<{width}}  {value}")
+        lines = [value]
+        if room is not None:
+            lines = textwrap.wrap(printable(value), room, break_on_hyphens=False) or [""]
+        for heading, line in zip_longest([name], lines, fillvalue=""):
+            say(f"  {heading:<{width}}  {line}".rstrip())
     say()
 
 
@@ -266,10 +279,16 @@ def note(text: str) -> None:
     print(folded(text), file=sys.stderr)  # noqa: T201
 
 
-def folded(text: str) -> str:
-    """A line for standard error, which a terminal shows without broken words."""
+def say_folded(text: str) -> None:
+    """A long line of the answer, which a terminal shows without broken words."""
+    for line in folded(text, sys.stdout).split("\n"):
+        say(line)
+
+
+def folded(text: str, stream: TextIO | None = None) -> str:
+    """A line for standard error or another stream: a terminal shows it without broken words."""
     text = printable(text)
-    if not sys.stderr.isatty():
+    if not (stream or sys.stderr).isatty():
         return text
     width = shutil.get_terminal_size().columns
     return textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)

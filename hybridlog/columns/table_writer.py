@@ -242,6 +242,7 @@ class TableWriter:
     Args:
         root: The store.
         recording: Id of the recording.
+        label: Its label, for people.
         topics: The topics with tables; None for all.
         is_new: True if the recording has no tables yet.
     """
@@ -250,12 +251,14 @@ class TableWriter:
         self,
         root: Path,
         recording: str,
+        label: str,
         *,
         topics: Collection[str] | None = None,
         is_new: bool = True,
     ) -> None:
         self._root = root
         self._recording = recording
+        self._label = label
         self._wanted = topics
         self._is_new = is_new
         self._parts = parts_folder(root, recording)
@@ -345,7 +348,7 @@ class TableWriter:
         except Exception as error:
             self.has_failed = True
             reason = getattr(error, "strerror", None) or error or repr(error)
-            _log.warning("Recording %s has no tables yet: %s", self._recording, reason)
+            _log.warning("Recording %s has no tables yet: %s", self._label, reason)
             self.discard()
 
     # From chunks to rows in memory.

@@ -17,25 +17,28 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-_MAX_CELL: Final = 40
-_MAX_LINE: Final = 200
+MAX_CELL: Final = 40
+"""Characters of a text in a table."""
+MAX_LINE: Final = 200
+"""Characters of a value on lines of its own."""
 _MAX_ITEMS: Final = 4
 UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 """Nanoseconds of the units of timestamps."""
 
 
-def cells(table: pa.Table, *, exact: bool = False) -> list[list[str]]:
+def cells(table: pa.Table, *, exact: bool = False, most: int = MAX_CELL) -> list[list[str]]:
     """The rows of a table, a short text for each value; empty for a null.
 
     Args:
         table: The table.
         exact: Numbers with all digits that tell them apart, not with six.
+        most: Characters of a text.
     """
-    columns = [[_cell(value, exact=exact) for value in column] for column in table.columns]
+    columns = [[_cell(value, exact=exact, most=most) for value in each] for each in table.columns]
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def _cell(value: pa.Scalar, *, exact: bool) -> str:
+def _cell(value: pa.Scalar, *, exact: bool, most: int = MAX_CELL) -> str:
     """A value in few characters."""
     if not value.is_valid:
         return ""
@@ -43,7 +46,7 @@ def _cell(value: pa.Scalar, *, exact: bool) -> str:
         if applies(value.type):
             return shown(value)
     try:
-        return _cut(str(value.as_py()), _MAX_CELL)
+        return _cut(str(value.as_py()), most)
     except OverflowError:  # DuckDB has infinite dates
         return f"{value.value} days"
 
@@ -89,7 +92,7 @@ def _time(value: pa.Scalar) -> str:
 
 def _struct(value: pa.Scalar, *, exact: bool) -> str:
     inside = (f"{name}: {_cell(item, exact=exact)}" for name, item in value.items())
-    return _cut("{" + ", ".join(inside) + "}", _MAX_LINE)
+    return _cut("{" + ", ".join(inside) + "}", MAX_LINE)
 
 
 def _map(value: pa.Scalar, *, exact: bool) -> str:
@@ -97,7 +100,7 @@ def _map(value: pa.Scalar, *, exact: bool) -> str:
         f"{_cell(item['key'], exact=exact)}: {_cell(item['value'], exact=exact)}"
         for item in value.values
     )
-    return _cut("{" + ", ".join(inside) + "}", _MAX_LINE)
+    return _cut("{" + ", ".join(inside) + "}", MAX_LINE)
 
 
 def _list(value: pa.Scalar, *, exact: bool) -> str:
@@ -105,9 +108,9 @@ def _list(value: pa.Scalar, *, exact: bool) -> str:
     if inner is None or not len(inner):
         return "[]"
     if len(inner) <= _MAX_ITEMS:
-        return _cut("[" + ", ".join(_cell(item, exact=exact) for item in inner) + "]", _MAX_LINE)
+        return _cut("[" + ", ".join(_cell(item, exact=exact) for item in inner) + "]", MAX_LINE)
     first = ", ".join(_cell(inner[i], exact=exact) for i in range(2))
-    return _cut(f"[{first}, … {len(inner)} in all]", _MAX_LINE)
+    return _cut(f"[{first}, … {len(inner)} in all]", MAX_LINE)
 
 
 def _cut(text: str, most: int) -> str:

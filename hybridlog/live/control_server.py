@@ -244,6 +244,7 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
     Raises:
         UsageError: No recorder runs, several run and no name is given, or a name matches
             none or several.
+        StoreError: There is no store.
     """
     names = running(store)
     if named:
@@ -254,10 +255,11 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
                 f"No recorder runs in the bucket of {store}; `hybridlog mark --at` marks "
                 "recordings there."
             )
-        where = f"{store} is no store: no recorder runs there"
-        if (store / NAME).is_file():
-            where = "No recorder runs on this store"
-        raise UsageError(f"{where}; start one with `hybridlog record`.")
+        if not (store / NAME).is_file():
+            raise StoreError(
+                f"{store} is no store: no recorder runs there; start one with `hybridlog record`."
+            )
+        raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
     if len(names) > 1:
         raise UsageError(f"Several recorders run; name one of {', '.join(names)}.")
     return names

@@ -268,7 +268,7 @@ class StoreIndex:
 
         directory, catalog = self.directory, self.catalog
         topics = tables.missing(directory, entry)
-        writer = TableWriter(directory.path, entry.id, topics=topics, is_new=False)
+        writer = TableWriter(directory.path, entry.id, entry.label, topics=topics, is_new=False)
         indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, self.database, through)
         sent = time.monotonic()
         # A chunk that is indexed already may be missing in the tables all the same.

@@ -86,7 +86,9 @@ def make(
             from hybridlog.columns.table_writer import TableWriter
 
             entry = replace(entry, label=label)
-            writer = TableWriter(directory.path, entry.id, topics=wanted, is_new=is_new)
+            writer = TableWriter(
+                directory.path, entry.id, entry.label, topics=wanted, is_new=is_new
+            )
             try:
                 channels = channels_of(entry, wanted)
                 numbers = [number for number, _, _ in entry.spans]

@@ -133,7 +133,7 @@ class Capture:
             self._held = self._held.pop_all()
         self._target = target
         recording = directory.recording(self.entry.label)
-        self._tables = TableWriter(directory.path, self.entry.id)
+        self._tables = TableWriter(directory.path, self.entry.id, self.entry.label)
         self.index = IndexWriter(
             recording,
             self.entry,

@@ -338,7 +338,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     assert json.loads(found.out.splitlines()[0])["text"] == "gripper slipped"
     for command in (["top"], ["mark", "x"], ["trigger", "x"]):
         assert "No recorder runs on this store" in run(*command, store=store, code=2).err
-        assert "nope is no store" in run(*command, store=store / "nope", code=2).err
+        assert "nope is no store" in run(*command, store=store / "nope", code=5).err
 
 
 def assert_it_is_told_as_it_is(store: Path) -> None:

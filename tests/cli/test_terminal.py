@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pty
 import re
@@ -15,8 +16,12 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+import hybridlog as hl
+from hybridlog_storage.messages import Channel
 
 from .running import COMMAND, environment, open_bytes, recordings, run
 
@@ -156,6 +161,49 @@ def test_statistics_at_eighty_columns_break_no_name(store: Path) -> None:
         assert lines == [name, *(row[name] for row in rows)]
 
 
+def test_a_block_of_statistics_has_all_of_them(store: Path) -> None:
+    code, shown = on_terminal(
+        "stats", "scan", "imu/data", "-r", "robot", "--store", store, width=40
+    )
+    assert code == 0
+    assert len(re.findall(r"(?m)^  std +\S", plain(shown))) > 10
+
+
+def test_rates_are_sorted_by_topic(store: Path) -> None:
+    rows = run("stats", "--rate", "-r", "robot", "--json", store=store).json
+    topics = [row["topic"] for row in rows]
+    assert topics == sorted(topics)
+    assert len(topics) > 10
+
+
+def test_the_cure_for_a_missing_extra_can_be_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
+    from hybridlog.cli.installed import from_here
+
+    said = "SQL needs DuckDB: pip install 'hybridlog[sql]'"
+
+    def pretend(origin: str | None) -> str:
+        found = SimpleNamespace(read_text=lambda _: origin)
+        monkeypatch.setattr("importlib.metadata.distribution", lambda _: found)
+        return from_here(said)
+
+    place = {"url": "file:///home/me/my%20robot"}
+    assert pretend(json.dumps({**place, "dir_info": {"editable": True}})) == (
+        "SQL needs DuckDB: pip install -e '/home/me/my robot[sql]'"
+    )
+    assert pretend(json.dumps({**place, "dir_info": {}})) == (
+        "SQL needs DuckDB: pip install '/home/me/my robot[sql]'"
+    )
+    assert pretend(json.dumps({"url": "https://somewhere/x.whl"})) == pretend(None) == said
+
+
+def test_versions_and_definitions_break_no_word(store: Path) -> None:
+    for words in (("--version", "--all"), ("info", "-t", "scan", "-r", "robot", "--store", store)):
+        code, shown = on_terminal(*words)
+        assert code == 0
+        lines = [line.rstrip() for line in plain(shown).splitlines() if "/mongod" not in line]
+        assert max(map(len, lines)) <= 80
+
+
 def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None:
     code, shown = on_terminal("info", "robot", "--store", store, width=80)
     assert code == 0
@@ -213,6 +261,23 @@ def test_an_answer_is_a_block_a_message_when_it_does_not(store: Path) -> None:
     assert len(re.findall(r"(?m)^\d{4}-\S+Z  /base/scan$", text)) == 2
     assert len(re.findall(r"(?m)^  header\.frame_id +\S", text)) == 2
     assert re.search(r"ranges +\[\S+, \S+, … \d+ in all\]", text)
+
+
+def test_a_long_text_of_a_block_is_whole_and_breaks_between_words(tmp_path: Path) -> None:
+    text = "Something went wrong loading the typesupport library for message type Debug of it all"
+    with (
+        hl.open(tmp_path / "store", mongo="none", create=True) as opened,
+        opened.start("one") as recording,
+    ):
+        fields = {"name": "node", "msg": text, "file": "/opt/ros/include/rclcpp/publisher.hpp"}
+        recording.write(Channel("/rosout", "json", None), json.dumps(fields).encode(), log_time=1)
+    code, shown = on_terminal("fetch", "rosout", "--store", tmp_path / "store")
+    lines = plain(shown).splitlines()
+    assert code == 0
+    assert max(map(len, lines)) <= 80
+    begin = next(n for n, line in enumerate(lines) if line.startswith("  msg "))
+    assert " ".join([lines[begin].split(maxsplit=1)[1], lines[begin + 1].strip()]) == text
+    assert lines[begin + 1].startswith(" " * 8)
 
 
 def test_the_message_at_a_time_is_one_on_a_terminal(store: Path) -> None:

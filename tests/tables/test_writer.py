@@ -335,7 +335,7 @@ def test_memory_does_not_grow_with_the_recording(
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
         path = write_log(tmp_path / f"{count}.mcap", said)
         entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
-        writer = TableWriter(store.directory.path, entry.id, is_new=False)
+        writer = TableWriter(store.directory.path, entry.id, entry.label, is_new=False)
         held = []
         for chunk, channels in chunks_of(store, entry):
             writer.add(chunk, channels)
@@ -359,7 +359,7 @@ def test_chunks_that_come_late_are_put_in_their_place(
     assert entry.segments > 1
     chunks = chunks_of(store, entry)
     making.remove(store.directory, entry.id)
-    writer = TableWriter(store.directory.path, entry.id)
+    writer = TableWriter(store.directory.path, entry.id, entry.label)
     late = chunks[3::5]
     counts = Counter(number for c, _ in chunks for number in [c.segment] * len(c.batch))
     for chunk, channels in [c for c in chunks if not any(c is other for other in late)]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -126,9 +127,9 @@ class Rates:
             yield Stretch(summary, part.topic, span, inner)
 
     def _stretches(self) -> Iterator[Stretch]:
-        """Topics and spans of the question, by recording."""
+        """Topics and spans of the question, by recording and topic."""
         for summary, span in RangeResolver(self._session, self._question).spans():
-            yield from self.stretches_in(summary, span)
+            yield from sorted(self.stretches_in(summary, span), key=attrgetter("topic"))
 
     def _overall(self, stretch: Stretch) -> tuple[NDArray[Any], ...]:
         """First and last time, messages and mean rate."""
