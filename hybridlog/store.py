@@ -850,6 +850,8 @@ class Store:
         """
         from hybridlog.across.sync import Synced
 
+        if isinstance(topics, str):
+            raise UsageError("Topics are a list: sync(['scan', 'odom']).")
         queries = [self._query_of(one, {}) for one in topics]
         questions = [
             query.with_topic(topic).question for query in queries for topic in query.topics

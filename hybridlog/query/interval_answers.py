@@ -102,6 +102,7 @@ class IntervalAnswers(Steps):
         """
         if not fields:
             raise UsageError("Name at least one field; `hybridlog info -t TOPIC` lists them.")
+        self._as_they_came("Changes")
         self.fields(*fields)  # refuses unknown fields
         with self.counters.timed():
             return self._intervals().changes(fields, pause, tolerance)

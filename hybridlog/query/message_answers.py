@@ -34,7 +34,12 @@ class MessageAnswers(Steps):
     """Answers with the messages themselves."""
 
     def __iter__(self) -> Iterator[Message]:
-        """The messages, ordered by log time, recording and arrival."""
+        """The messages as they came, ordered by log time, recording and arrival.
+
+        Raises:
+            UsageError: it has `in_frame`, which is for tables and arrays.
+        """
+        self._as_they_came("Messages")
         from hybridlog.message import messages_in
         from hybridlog.query.answers.video import picture_of
 
@@ -70,8 +75,13 @@ class MessageAnswers(Steps):
 
         Raises:
             TopicError: no such message exists.
-            UsageError: the question has a time range, or another clock than log time.
+            UsageError: the question has a time range, `in_frame`, or another clock than log
+                time.
         """
+        self._as_they_came("Messages")
+        return self._at(moment)
+
+    def _at(self, moment: TimeLike) -> Message:
         if not self.question.is_unbounded or self.question.clock != "log":
             raise UsageError(
                 "A message at a time is the last one by log time; `between`, `during` and "
@@ -94,7 +104,7 @@ class MessageAnswers(Steps):
         """
         from hybridlog.query.answers.last_message import just_before
 
-        found = self.at(moment)
+        found = self._at(moment)
         time = found.log_time_ns
         question = just_before(self.question, found.recording, time, time)
         # What is lost between the message and the moment may have been the current one.
@@ -163,6 +173,7 @@ class MessageAnswers(Steps):
         """
         from hybridlog.query.answers.index_documents import index_documents
 
+        self._as_they_came("Documents")
         self.session.renew()
         self.counters.reset()
         return index_documents(self.session, self.question, self.counters)

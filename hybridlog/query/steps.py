@@ -410,6 +410,11 @@ class Steps:
             others = tuple(topic for topic in others if topic in there)
         return self._with(topics=topics, recordings=chosen, namesakes=others)
 
+    def _as_they_came(self, what: str) -> None:
+        """Refuse `in_frame` for answers that it would not change."""
+        if self.question.frame is not None:
+            raise UsageError(f"{what} are of messages as they came: leave out in_frame.")
+
     def _planner(self) -> Planner:
         """A planner for an answer, of a moment that begins now."""
         self.session.renew()

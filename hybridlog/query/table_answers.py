@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.query.steps import Steps
 from hybridlog.session import of_one_moment
-from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -190,7 +189,3 @@ class TableAnswers(Steps):
         query = self.fields(*fields) if fields else self
         with self.counters.timed():
             return statistics(self.session, query.question, self.counters)
-
-    def _as_they_came(self, what: str) -> None:
-        if self.question.frame is not None:
-            raise UsageError(f"{what} are of messages as they came: leave out in_frame.")

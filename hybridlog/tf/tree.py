@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.query.times import format_time, parse_duration, parse_time
+from hybridlog.query.times import format_time, parse_duration, parse_time, units_of
 from hybridlog.tf.transform import Transform, identity, interpolated
 from hybridlog.wording import counted, listed
-from hybridlog_storage.errors import TopicError, TransformError
+from hybridlog_storage.errors import TopicError, TransformError, UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -246,6 +246,7 @@ class FrameTree:
 
         Raises:
             TopicError: no such frame.
+            UsageError: `times` are floats or texts.
             TimeError: `extrapolate` is no duration.
         """
         wanted, given = self.check(target), self.check(source)
@@ -331,7 +332,7 @@ class FrameTree:
         if found.missing:
             raise TransformError(
                 f"There is no transform from {source} to {target} at {format_time(at)}: "
-                f"{next(iter(found.missing))}."
+                f"{next(iter(found.missing))}.{units_of(time)}"
             )
         return Transform(found.translation[0], found.rotation[0])
 
@@ -409,4 +410,6 @@ def _nanoseconds(times: ArrayLike) -> Times:
     found = np.asarray(times)
     if found.dtype == object or found.dtype.kind == "M":  # pandas keeps zones in objects
         found = np.asarray(times, "datetime64[ns]")
+    elif found.size and found.dtype.kind not in "iu":
+        raise UsageError("Times are whole nanoseconds since 1970, or datetimes.")
     return np.ascontiguousarray(found.reshape(-1), np.int64)

@@ -252,5 +252,16 @@ def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:
         store.recordings("robot").topic("battery").in_frame("map").to_arrow()
     with pytest.raises(UsageError, match="of one topic"):
         store.recordings("robot").topic("odom", "scan").in_frame("map").to_arrow()
-    with pytest.raises(UsageError, match="as they came: leave out in_frame"):
-        store.sync([store.topic("odom").in_frame("map"), "scan"])
+    odom = store.topic("odom").in_frame("map")
+    for ask in (
+        lambda: store.sync([odom, "scan"]),
+        lambda: next(iter(odom)),
+        odom.first,
+        lambda: odom.at("+1s"),
+        odom.documents,
+        lambda: odom.changes("pose.pose.position.x"),
+    ):
+        with pytest.raises(UsageError, match="as they came: leave out in_frame"):
+            ask()
+    with pytest.raises(UsageError, match="are a list"):
+        store.sync("scan")

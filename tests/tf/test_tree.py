@@ -15,7 +15,7 @@ import hybridlog as hl
 from hybridlog.tf.reader import frames_and_stamps
 from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import FrameTree
-from hybridlog_storage.errors import TopicError, TransformError
+from hybridlog_storage.errors import TopicError, TransformError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 
 S = 10**9
@@ -141,6 +141,11 @@ def test_there_is_no_transform_outside(log: Log) -> None:
     assert sorted(found.missing.values()) == [1, 1]
     with pytest.raises(TransformError, match="after the last transform of base, 2023"):
         tree.transform("odom", "base", int(times[-1]))
+    with pytest.raises(TransformError, match=r"1700000001\.0 is seconds"):
+        tree.transform("odom", "base", 1_700_000_001)
+    for odd in ([1_700_000_001.5], ["+1s"]):
+        with pytest.raises(UsageError, match="whole nanoseconds"):
+            tree.lookup("odom", "base", odd)
     held = tree.lookup("odom", "base", at(-1.1, 0, 5, 5.1), extrapolate="2s")
     assert held.is_known.tolist() == [False, True, True, False]
     assert held.translation[1:3, 0].tolist() == [0, 2]
