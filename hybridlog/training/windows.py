@@ -125,6 +125,8 @@ class Windows(OpensAgain, Sequence[dict[str, Any]]):
         """Sentences about the windows: frames that are in none, and what the topics may lack."""
         gaps, short = self.left_out
         found = []
+        if not (self._episodes or gaps or short):
+            found.append("There is no episode in these recordings, so there is no window.")
         if gaps:
             found.append(f"{counted(gaps, 'frame')} left out, because a topic has a gap there.")
         if short:

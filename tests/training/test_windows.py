@@ -89,6 +89,8 @@ def test_windows_are_those_of_the_log_and_of_the_export(plain: Path, tmp_path: P
         assert len(found) == 25 + 40 - 2 * (FRAMES - 1)
         assert found.left_out == (15, 0)
         assert found.remarks() == ["15 frames left out, because a topic has a gap there."]
+        none = windows(store, episodes_by="mark")
+        assert (len(none), none.remarks()[0][:19]) == (0, "There is no episode")
         assert (found[-1]["log_time"] == found[len(found) - 1]["log_time"]).all()
         assert [one["episode"] for one in found[17:19]] == [0, 1]
         with pytest.raises(IndexError):
