@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
 
 from hybridlog_storage.disk.unfinished import Unfinished, beside
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.settings import NAME as SETTINGS
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -313,7 +314,19 @@ def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
         raise UsageError(f"{target} is a directory; name a file in it")
     if not path.parent.is_dir():
         raise UsageError(f"cannot write {target}: there is no directory {path.parent}")
+    _check_outside(path)
     return path, path.is_file() or not path.exists()
+
+
+def _check_outside(path: Path) -> None:
+    """Raise if a path is within a store, whose files are not to be replaced.
+
+    Raises:
+        UsageError: It is.
+    """
+    for folder in path.parents:
+        if (folder / SETTINGS).is_file():
+            raise UsageError(f"{path} is within the store {folder}; write it elsewhere")
 
 
 def new_directory(target: str | os.PathLike[str], content: str) -> tuple[Path, Unfinished]:
@@ -328,6 +341,7 @@ def new_directory(target: str | os.PathLike[str], content: str) -> tuple[Path, U
         OSError: It cannot be made.
     """
     path = Path(os.path.realpath(target))
+    _check_outside(path)
     if path.exists() and not path.is_dir():
         raise UsageError(f"{target} is a file; {content}")
     if path.is_dir() and next(path.iterdir(), None) is not None:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import IN_TYPE, SHARED, SUFFIX
 from hybridlog.entries import describe, put_entry, take_inventory
-from hybridlog.maintenance.copying import SENDING, at_work, is_at_work
+from hybridlog.maintenance.copying import at_work
 from hybridlog.maintenance.keep import pin_of
-from hybridlog.maintenance.opening import open_catalog
+from hybridlog.maintenance.opening import is_at_work, open_catalog
 from hybridlog.maintenance.places import (
     Begun,
     Copied,
@@ -40,7 +40,7 @@ from hybridlog.maintenance.places import (
 from hybridlog.schema.states import expired_messages
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import PAYLOADS
+from hybridlog_storage.disk.directory import PAYLOADS, SENDING
 from hybridlog_storage.errors import (
     HeldError,
     ObjectChangedError,

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.entries import take_inventory
+from hybridlog.maintenance.opening import clear_stopped
 from hybridlog.maintenance.places import (
     Copied,
     CopiedFile,
@@ -28,7 +29,7 @@ from hybridlog.maintenance.places import (
 from hybridlog.wording import counted
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import REMOVED, StoreDirectory
+from hybridlog_storage.disk.directory import REMOVED, SENDING, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError, unreadable
 from hybridlog_storage.journal import JOURNAL, JournalState
 from hybridlog_storage.remote.bucket import digest_like
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
 _READ: Final = 1 << 20  # bytes read at once
 _ASKED_AT_ONCE: Final = 1000  # recordings in a question
 _TRIES: Final = 3  # of a recording that is compacted or expires meanwhile
-SENDING: Final = ".copying-"
-"""Prefix of hidden folders of copies under way in the store that is copied."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,23 +530,15 @@ def at_work(source: StoreDirectory) -> Iterator[Path]:
     source.check_writable()
     folder, held = source.path / f"{SENDING}{secrets.token_hex(4)}", ExitStack()
     try:
-        for name in files.names(source.path, depth=0):
-            if name.startswith(SENDING) and not is_at_work(source, name):
-                files.remove_tree(source.path / name, depth=files.IN_STORE)
-        files.make_folder(folder, depth=files.IN_STORE)
-        held.enter_context(files.locked_folder(folder, files.IN_STORE))
+        clear_stopped(source)
+        while folder.name not in files.names(source.path, depth=0):
+            held.close()
+            files.make_folder(folder, depth=files.IN_STORE)
+            with suppress(FileNotFoundError):  # another process has just opened the store
+                held.enter_context(files.locked_folder(folder, files.IN_STORE))
         yield folder
     except OSError as error:
         raise durability.explain(error, folder, "copying from") from error
     finally:
         with held, suppress(OSError):
             files.remove_tree(folder, depth=files.IN_STORE)
-
-
-def is_at_work(source: StoreDirectory, name: str) -> bool:
-    """True if a hidden folder of a copy is locked: the copy goes on."""
-    try:
-        with files.locked_folder(source.path / name, files.IN_STORE, 0):
-            return False
-    except OSError as error:
-        return isinstance(error, BlockingIOError)

@@ -28,7 +28,7 @@ from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import LOCK, REMOVED
+from hybridlog_storage.disk.directory import LOCK, REMOVED, SENDING
 from hybridlog_storage.errors import (
     CatalogError,
     DiskFullError,
@@ -117,6 +117,8 @@ class StoreFiles:
             for name in directory.names():
                 if name.startswith(REMOVED):
                     directory.sweep(name)
+            with suppress(OSError):  # the next opening tries again
+                clear_stopped(directory)
         rows = catalog.summaries()
         if mends:  # before the index is compared with entries, which may be lost then
             catalog.drop_damaged()
@@ -460,6 +462,30 @@ def clear_away(directory: StoreDirectory, label: str) -> None:
                 files.unlink(path / name)
             except OSError as error:
                 raise durability.explain(error, path / name, "removing") from error
+
+
+def clear_stopped(directory: StoreDirectory) -> None:
+    """Remove the hidden folders of copies out of a store that were stopped.
+
+    They have second names of payloads, which could not be deleted otherwise.
+
+    Raises:
+        OSError: They cannot be removed.
+    """
+    for name in files.names(directory.path, depth=0):
+        path = directory.path / name
+        if name.startswith(SENDING):
+            with suppress(BlockingIOError), files.locked_folder(path, files.IN_STORE, 0):
+                files.remove_tree(path, depth=files.IN_STORE)
+
+
+def is_at_work(source: StoreDirectory, name: str) -> bool:
+    """True if a hidden folder of a copy is locked: the copy goes on."""
+    try:
+        with files.locked_folder(source.path / name, files.IN_STORE, 0):
+            return False
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
 
 
 def moving_name(name: str, number: int) -> str:

@@ -544,3 +544,17 @@ def test_a_crash_before_the_copy_of_fields_goes(
         assert store.repairs.copies == {"recorded": "recorded-2"}
         store.remove("recorded")
     assert labels_in(lab) == ["recorded-2"]
+
+
+def test_what_a_stopped_copy_left_goes_when_the_store_is_opened(
+    robots: Path, tmp_path: Path
+) -> None:
+    robot = tmp_path / "robot"
+    shutil.copytree(robots, robot)
+    (robot / ".copying-0" / "store").mkdir(parents=True)
+    (robot / ".copying-0" / "store" / "000000.mcap").write_bytes(b"second name")
+    with copying.at_work(StoreDirectory(robot)) as folder:
+        (robot / ".copying-1").mkdir()
+        with hl.open(robot, mongo="none"):
+            assert [*robot.glob(".copying-*")] == [folder]
+    assert [*robot.glob(".copying-*")] == []

@@ -136,6 +136,9 @@ def test_wrong_places(name: str, tmp_path: Path) -> None:
         fill(name, tmp_path / "dir")
     with pytest.raises(UsageError, match=r"[Tt]oo long"):
         fill(name, tmp_path / ("x" * 300)).close()  # type: ignore[attr-defined]
+    (tmp_path / "dir" / "hybridlog.toml").touch()
+    with pytest.raises(UsageError, match="is within the store"):
+        fill(name, tmp_path / "dir" / "inner" / "out")
     assert list(tmp_path.iterdir()) == [tmp_path / "dir"]
 
 
