@@ -29,7 +29,6 @@ from hybridlog.cli.options import (
     InStore,
     names_argument,
     query_of,
-    recordings_of,
 )
 from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.choice import Choice
@@ -139,7 +138,7 @@ def _show_part(store: Store, given: _Given) -> bool:
 
 def _show(store: Store, given: _Given) -> None:
     choice = given.choice
-    chosen = [with_misfits(store, entry) for entry in recordings_of(store, choice)]
+    chosen = [with_misfits(store, entry) for entry in given.recordings_in(store)]
     extras = {entry.id: _extras(store, entry) for entry in chosen}
     videos = {entry.id: _videos(store, entry) for entry in chosen[:_MAX_DRAWN]}
     if given.as_json:

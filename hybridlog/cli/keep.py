@@ -11,10 +11,9 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_condition, complete_topic
-from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of, recordings_of
+from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
-from hybridlog.query.choice import Choice
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
@@ -63,117 +62,114 @@ class _Given(Choosing, InStore, AsJson, Quiet):
 
 
 @command(_Given)
-def keep_command(asked: _Given) -> None:
+def keep_command(given: _Given) -> None:
     """Keep the store within a quota; pin what never goes.
 
     Payloads go, fields and counts stay. Without options for rules, those of [retention] in
     hybridlog.toml hold. Above 80 % of the quota payloads of the topics of --topic go, above
     90 % whole segments, the oldest first. Exits with 1 when not enough may go.
     """
-    given, choice = vars(asked), asked.choice
-    as_json, quiet = asked.as_json, asked.quiet
-    pinning = [name for name in ("pin", "pins", "unpin", "tidy") if given[name]]
-    rules = _rules(given) if not given["pin"] else {}
-    _check(pinning, rules, choice, given)
-    with asked.opened() as opened:
-        if given["pin"]:
-            found = _pin(opened, choice, given)
-            if as_json:
+    rules = {} if given.pin else _rules(given)
+    _check(given, rules)
+    with given.opened() as store:
+        if given.pin:
+            found = _pin(store, given)
+            if given.as_json:
                 output.print_json(found)
-            elif not quiet:
+            elif not given.quiet:
                 output.say(f"{output.counted(len(found), 'pin')}: {listed(found)}")
-        elif given["tidy"]:
-            _tidy(opened, dry_run=given["dry_run"], as_json=as_json, quiet=quiet)
-        elif given["unpin"]:
-            opened.unpin(*given["unpin"])
-        elif given["pins"]:
-            _show_pins(opened, choice, as_json=as_json)
+        elif given.tidy:
+            _tidy(store, given)
+        elif given.unpin:
+            store.unpin(*given.unpin)
+        elif given.pins:
+            _show_pins(store, given)
         else:
-            _keep(opened, rules, given, as_json=as_json, quiet=quiet)
+            _keep(store, rules, given)
 
 
-def _tidy(store: Store, *, dry_run: bool, as_json: bool, quiet: bool) -> None:
-    count, size = store.tidy(dry_run=dry_run)
-    if as_json:
-        output.print_json({"objects": count, "bytes": size, "dry_run": dry_run})
-    elif not quiet:
-        did = "would go" if dry_run else "deleted"
+def _tidy(store: Store, given: _Given) -> None:
+    count, size = store.tidy(dry_run=given.dry_run)
+    if given.as_json:
+        output.print_json({"objects": count, "bytes": size, "dry_run": given.dry_run})
+    elif not given.quiet:
+        did = "would go" if given.dry_run else "deleted"
         output.say(f"{output.counted(count, 'object')}, {output.size(size)}: {did}")
 
 
-def _rules(given: dict[str, Any]) -> dict[str, Any]:
+def _rules(given: _Given) -> dict[str, Any]:
     """Options in the form of the table `[retention]`."""
-    named = {key.replace("_", "-"): given[key] for key in ("quota", "min_free", "max_age")}
-    named |= {"fields-age": given["fields_age"], "never-tag": [*given["never_tag"]]}
-    topics = [word.rpartition("=") for word in given["topic"]]
-    for word, (pattern, _, age) in zip(given["topic"], topics, strict=True):
+    named: dict[str, Any] = {
+        name: getattr(given, name.replace("-", "_"))
+        for name in ("quota", "min-free", "max-age", "fields-age")
+    }
+    named["never-tag"] = [*given.never_tag]
+    topics = [word.rpartition("=") for word in given.topic]
+    for word, (pattern, _, age) in zip(given.topic, topics, strict=True):
         if not pattern or not age:
             raise UsageError(f"--topic takes TOPIC=AGE, such as '/camera/**=7d', not {word!r}.")
     named["topic"] = {pattern: age for pattern, _, age in topics}
     return {key: value for key, value in named.items() if value}
 
 
-def _check(
-    pinning: list[str], rules: dict[str, Any], choice: Choice, given: dict[str, Any]
-) -> None:
+def _check(given: _Given, rules: dict[str, Any]) -> None:
     """Refuse options that do not go together.
 
     Raises:
         UsageError: They do not.
     """
-    plans = given["dry_run"] and not given["tidy"]
-    if len(pinning) > 1 or (pinning and (rules or given["save"] or plans)):
+    plans, is_all = given.dry_run and not given.tidy, given.choice.is_everything
+    pinning = sum(map(bool, (given.pin, given.pins, given.unpin, given.tidy)))
+    if pinning > 1 or (pinning and (rules or given.save or plans)):
         raise UsageError("Give --pin, --unpin, --pins, --tidy or rules, one of them at a time.")
-    if not given["pin"] and (given["at"] or given["when"] or given["reason"]):
+    if not given.pin and (given.at or given.when or given.reason):
         raise UsageError("--at, --when and --reason are for --pin.")
-    if given["pin"] and choice.is_everything:
+    if given.pin and is_all:
         raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
-    if not pinning and not choice.is_everything:
+    if not pinning and not is_all:
         raise UsageError("Rules are for the whole store; --never-tag leaves recordings out.")
-    if given["save"] and not rules:
+    if given.save and not rules:
         raise UsageError("--save needs rules: --quota 200GB.")
 
 
-def _pin(store: Store, choice: Choice, given: dict[str, Any]) -> list[str]:
+def _pin(store: Store, given: _Given) -> list[str]:
     """Pin what is asked for; returns the names of the pins."""
     topics = None
-    if given["topic"]:
-        topics = query_of(store, given["topic"], choice).topics
-    spans = [*_spans(store, choice, given)]
+    if given.topic:
+        topics = query_of(store, given.topic, given.choice).topics
+    spans = [*_spans(store, given)]
     if len(spans) > _MAX_PINS:
         raise UsageError(
             f"These are {len(spans)} times, and {_MAX_PINS} can be pinned at once: join them "
             "with --before and --after."
         )
     if not spans:
-        why = "the predicate never held" if given["when"] else "no recording has messages then"
+        why = "the predicate never held" if given.when else "no recording has messages then"
         raise UsageError(f"Nothing to pin: {why}.")
-    reason = given["reason"] or "; ".join(given["when"])
+    reason = given.reason or "; ".join(given.when)
     return [store.pin(name, begin, end, topics, reason) for name, begin, end in spans]
 
 
-def _spans(
-    store: Store, choice: Choice, given: dict[str, Any]
-) -> Iterator[tuple[str, int | None, int | None]]:
+def _spans(store: Store, given: _Given) -> Iterator[tuple[str, int | None, int | None]]:
     """Id of a recording, begin and end of what is to be pinned of it; None for all."""
     from hybridlog.maintenance.keep import may_hold
     from hybridlog.query.times import parse_duration, parse_time
     from hybridlog.query.topics import split_topic
     from hybridlog.record.losses import extent_of
 
-    before, after = given["before"], given["after"]
-    if given["at"] is not None:
-        for entry in recordings_of(store, choice):
+    before, after = given.before, given.after
+    if given.at is not None:
+        for entry in given.recordings_in(store):
             start, end = extent_of(entry)
-            at = parse_time(given["at"], start=start, end=end)
+            at = parse_time(given.at, start=start, end=end)
             span = at - parse_duration(before), at + parse_duration(after) + 1
             if may_hold(entry, *span):
                 yield entry.id, *span
-    elif not given["when"]:
-        yield from ((one.id, None, None) for one in recordings_of(store, choice).summaries)
-    for condition in given["when"]:
+    elif not given.when:
+        yield from ((one.id, None, None) for one in given.recordings_in(store).summaries)
+    for condition in given.when:
         pattern, predicate = split_topic(condition)
-        query = query_of(store, [pattern], choice)
+        query = query_of(store, [pattern], given.choice)
         query = query.where(predicate) if predicate else query
         if predicate and not _are_marks(store, query.topics):
             found = query.intervals().widened(before, after)
@@ -189,10 +185,10 @@ def _are_marks(store: Store, topics: Sequence[str]) -> bool:
     return {*topics} <= {*mark_topics(store.session)}
 
 
-def _show_pins(store: Store, choice: Choice, *, as_json: bool) -> None:
-    chosen = recordings_of(store, choice)
+def _show_pins(store: Store, given: _Given) -> None:
+    chosen = given.recordings_in(store)
     rows = [{"recording": entry.label, **pin} for entry in chosen for pin in entry.pins]
-    if as_json:
+    if given.as_json:
         output.print_json(rows)
     elif rows:
         cells = [[row["id"], row["recording"], *pin_cells(row)] for row in rows]
@@ -209,9 +205,7 @@ def pin_cells(pin: dict[str, Any]) -> list[str]:
     return [*times, "all" if pin["topics"] is None else listed(pin["topics"]), pin["reason"]]
 
 
-def _keep(
-    store: Store, rules: dict[str, Any], given: dict[str, Any], *, as_json: bool, quiet: bool
-) -> None:
+def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
     from hybridlog.maintenance.retention import Rules
 
     wanted = rules or store.directory.settings.retention
@@ -220,19 +214,19 @@ def _keep(
             "No rule says what may go: give --quota, --min-free, --max-age, --topic or "
             "--fields-age, or write them into [retention] of hybridlog.toml, as --save does."
         )
-    if given["save"]:
+    if given.save:
         Rules.of(rules).check_place(is_remote=store.directory.is_remote)
         store.directory.check_changes()
         store.directory.change_settings(retention=rules)
-    dry_run = given["dry_run"]
+    dry_run = given.dry_run
     with (
         if_stopped("What was not deleted is as it was; run it again."),
-        progress_bar("keep", 0, quiet=quiet or as_json) as bar,
+        progress_bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
     ):
         found = store.keep(wanted, dry_run=dry_run, progress=Stages(bar))
-    if as_json:
+    if given.as_json:
         output.print_json({**asdict(found), "dry_run": dry_run})
-    elif not quiet:
+    elif not given.quiet:
         for line in _lines(found, dry_run=dry_run):
             output.say(line)
     for problem in (*found.problems, *found.plan.warnings, *_useless(store, Rules.of(wanted))):
