@@ -158,7 +158,7 @@ def _print(
             lacks = label in report.lacking
             more = f"; payloads that were deleted {words[1]} were not copied" if lacks else ""
             output.say(f"{label} is {words[1]} already{more}")
-        if report.freed_bytes:
+        if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
             output.say(f"{output.size(report.freed_bytes)} freed")
 
 

@@ -128,8 +128,8 @@ class Completeness:
             )
         if self.untested:
             raise IncompleteError(
-                f"{counted(self.untested, 'message')} could not be tested: arrays were deleted "
-                "to make room. Without --strict the rest is given."
+                f"{counted(self.untested, 'message')} could not be tested: their arrays were "
+                "deleted, or not copied yet. Without --strict the rest is given."
             )
         if payloads and self.reduced:
             raise IncompleteError(
