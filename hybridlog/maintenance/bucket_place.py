@@ -26,6 +26,7 @@ from hybridlog.maintenance.places import (
     Begun,
     Copied,
     CopiedFile,
+    CopiedSegment,
     RefusedError,
     adopted_line,
     check_proven,
@@ -121,9 +122,10 @@ class BucketPlace:
             found = Copied(label, content=content_of(_digests(row[1])))
         return replace(found, is_damaged=bool(self._target.lost_of(label)))
 
-    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
+    def segments(self, recording: str) -> dict[int, CopiedSegment]:
         """As of `Place`."""
-        return segments_of(self._target, self._target.labels_by_id().get(recording))
+        label = self._target.labels_by_id().get(recording)
+        return {} if label is None else segments_of(journal.read(self._target.recording(label)))
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """As of `Place`."""

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 from hybridlog.columns.layout import IN_PAYLOADS
 from hybridlog.columns.payload_files import open_file
@@ -149,6 +149,24 @@ class Copied:
     is_damaged: bool = False
 
 
+class CopiedSegment(NamedTuple):
+    """A segment of a recording that a place has.
+
+    Attributes:
+        digest: Its digest as it was sealed.
+        now: That of its file, if payloads of it have expired; else empty.
+        expired: Topics whose payloads have.
+    """
+
+    digest: str
+    now: str = ""
+    expired: tuple[str, ...] = ()
+
+    def holds(self, other: CopiedSegment) -> bool:
+        """True if it surely has all that another copy of the segment has."""
+        return self.digest == other.digest and self.now in {"", other.now}
+
+
 @dataclass(frozen=True, slots=True)
 class Begun:
     """A recording that is about to be copied.
@@ -179,8 +197,8 @@ class Place(Protocol):
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """Those of some recordings that it has, by id."""
 
-    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
-        """Segments of a recording: digests as sealed, and topics that expired, by number."""
+    def segments(self, recording: str) -> dict[int, CopiedSegment]:
+        """Segments of a recording, by number."""
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """Begin or go on with a recording; nobody else copies it here until `leave`.
@@ -291,9 +309,10 @@ class DirectoryPlace:
             self._ids, self._known = {}, dict  # other recordings have got their labels
         return found
 
-    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
+    def segments(self, recording: str) -> dict[int, CopiedSegment]:
         """As of `Place`."""
-        return segments_of(self._directory, self._labels([recording]).get(recording))
+        label = self._labels([recording]).get(recording)
+        return {} if label is None else segments_of(journal.read(self._directory.recording(label)))
 
     def begin(self, recording: str, *, wants_payloads: bool, wait_s: float = LOCK_WAIT_S) -> Begun:
         """As of `Place`.
@@ -521,15 +540,19 @@ def problems_of(
     return found + [f"{f.file} is damaged" for f in files_of(inventory) if not is_whole(f)]
 
 
-def segments_of(directory: StoreDirectory, label: str | None) -> dict[int, tuple[str, set[str]]]:
+def segments_of(state: JournalState | None) -> dict[int, CopiedSegment]:
     """As of `Place`, by the journal of a recording."""
-    state = (label and journal.read(directory.recording(label))) or JournalState()
-    return {n: (one.digest, state.expired.get(n, set())) for n, one in state.sealed.items()}
+    state = state or JournalState()
+    now = {number: state.thinned[number][-1][0] for number in state.expired}
+    return {
+        n: CopiedSegment(one.digest, now.get(n, ""), tuple(state.expired.get(n, ())))
+        for n, one in state.sealed.items()
+    }
 
 
-def has_lost(there: Mapping[int, tuple[str, set[str]]], state: JournalState) -> bool:
+def has_lost(there: Mapping[int, CopiedSegment], state: JournalState) -> bool:
     """True if payloads expired in a copy that a journal still has; `there` as of `segments`."""
-    return any(topics - state.expired.get(number, set()) for number, (_, topics) in there.items())
+    return any({*one.expired} - state.expired.get(n, set()) for n, one in there.items())
 
 
 def copied_of(directory: StoreDirectory, label: str) -> Copied:

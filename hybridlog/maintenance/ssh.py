@@ -21,7 +21,7 @@ from threading import Event, Lock
 from typing import IO, TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
-from hybridlog.maintenance.places import Begun, Copied, CopiedFile, RefusedError
+from hybridlog.maintenance.places import Begun, Copied, CopiedFile, CopiedSegment, RefusedError
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -154,13 +154,15 @@ class Server:
         found = _mapping(self._ask("have", recordings=[*recordings]))
         return {one: _copied(value) for one, value in found.items() if one in recordings}
 
-    def segments(self, recording: str) -> dict[int, tuple[str, set[str]]]:
+    def segments(self, recording: str) -> dict[int, CopiedSegment]:
         """As of `Place`."""
         found = _mapping(self._ask("segments", recording=recording))
         return {
-            int(number): (str(one[0]), {*map(str, one[1:])})
+            int(number): CopiedSegment(str(one[0]), str(one[1]), tuple(map(str, one[2])))
             for number, one in found.items()
-            if number.isdigit() and isinstance(one, list) and one
+            if number.isdigit()
+            and isinstance(one, list)
+            and list(map(type, one)) == [str, str, list]
         }
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
@@ -338,10 +340,7 @@ def _have(place: DirectoryPlace, request: Mapping[str, Any], _: bytes) -> Any:
 _ANSWERS: Final[Mapping[str, Callable[[DirectoryPlace, Mapping[str, Any], bytes], Any]]] = {
     "sees": lambda place, request, _: place.sees(str(request["mark"])),
     "have": _have,
-    "segments": lambda place, request, _: {
-        number: [digest, *topics]
-        for number, (digest, topics) in place.segments(str(request["recording"])).items()
-    },
+    "segments": lambda place, request, _: place.segments(str(request["recording"])),
     "hold": lambda place, request, _: place.hold([str(one) for one in request["recordings"]]),
     "drop": lambda place, *_: place.drop(),
     "begin": _begin,
