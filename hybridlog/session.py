@@ -975,7 +975,8 @@ class Session:
                 raise
             labels = listed((snapshot.summaries[place].label for place in others), _MAX_NAMES)
             have = "has" if len(others) == 1 else "have"
-            raise TopicError(f"{error}; in the store, {labels} {have} such a topic") from error
+            join = " In" if str(error).endswith("?") else "; in"
+            raise TopicError(f"{error}{join} the store, {labels} {have} such a topic") from error
 
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None

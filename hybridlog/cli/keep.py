@@ -228,7 +228,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
         output.print_json({**asdict(found), "dry_run": dry_run})
     elif not given.quiet:
         for line in _lines(found, dry_run=dry_run):
-            output.say(line)
+            output.say_folded(line)
     for problem in (*found.problems, *found.plan.warnings, *_useless(store, Rules.of(wanted))):
         output.note(problem)
     if found.problems or found.plan.is_short:

@@ -197,11 +197,15 @@ def test_the_cure_for_a_missing_extra_can_be_pasted(monkeypatch: pytest.MonkeyPa
 
 
 def test_versions_and_definitions_break_no_word(store: Path) -> None:
-    for words in (("--version", "--all"), ("info", "-t", "scan", "-r", "robot", "--store", store)):
-        code, shown = on_terminal(*words)
-        assert code == 0
+    for words, width, expected in (
+        (("--version", "--all"), 80, 0),
+        (("info", "-t", "scan", "-r", "robot", "--store", store), 80, 0),
+        (("keep", "--quota", "100kB", "--dry-run", "--store", store), 60, 1),
+    ):
+        code, shown = on_terminal(*words, width=width)
+        assert code == expected
         lines = [line.rstrip() for line in plain(shown).splitlines() if "/mongod" not in line]
-        assert max(map(len, lines)) <= 80
+        assert max(map(len, lines)) <= width
 
 
 def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None:

@@ -192,6 +192,8 @@ def test_a_short_name_that_topics_of_other_recordings_end_with(tmp_path: Path) -
             store.recordings(["o*", "t*"]).topic("scan").remarks(is_empty=False) == query.remarks()
         )
         assert query.in_recording("one").remarks(is_empty=False) == []
+        with pytest.raises(TopicError, match=r"\? In the store, two has such a topic$"):
+            store.recordings("one").topic("base/scan")
         answer = store.sql("select count(*) from scan")
         assert answer.to_arrow().to_pylist() == [{"count_star()": 1}]
         assert answer.sentences() == ["/scan was asked, not the view base__scan."]
