@@ -165,7 +165,7 @@ def _told(path: Path) -> Counter[State]:
         assert drawn.counts.sum() == found.total()
         (listed,) = answer("ls", "--json", store=path).json
         assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)
-    raw = answer("fetch", "cloud", "-o", path / "cut.mcap", "--force", store=path).err
+    raw = answer("fetch", "cloud", "-o", path.with_suffix(".mcap"), "--force", store=path).err
     words = {State.EXPIRED: one.expired, State.NOT_COPIED: one.not_copied}
     for state, number in words.items():
         told_by = (
