@@ -97,6 +97,9 @@ class Bins:
                 row = (known - times[0]) // self._grid.step
                 begin = int(np.searchsorted(row, 0))
                 made.add(table.slice(begin), row[begin:])
+        for field in self._reader.question.fields or ():
+            if made.has_no_number(field):
+                raise _no_number(field, self._reader.question.topics[0])
         return self._reader.named(
             made.table(), self._reader.prefix + _COUNT, pa.array(made.messages)
         )
@@ -155,12 +158,16 @@ def _numbers_of(session: Session, stream: Stream, how: Aggregate) -> tuple[str, 
     for field in question.fields:
         below = [path for path in single if path == field or path.startswith(f"{field}.")]
         if not below and not is_summary(field, known):
-            raise UsageError(
-                f"{field} of {question.topics[0]} is no single number; ask for a summary, such as "
-                f"{field}.min, or for its first or last value."
-            )
+            raise _no_number(field, question.topics[0])
         chosen += below or [field]
     return tuple(dict.fromkeys(chosen))
+
+
+def _no_number(field: str, topic: str) -> UsageError:
+    return UsageError(
+        f"{field} of {topic} is no single number; ask for a summary, such as {field}.min, or for "
+        "its first or last value."
+    )
 
 
 class _Rows:
@@ -174,6 +181,7 @@ class _Rows:
         self._how: Aggregate = how
         self._size = size
         self.messages = np.zeros(size, np.int64)
+        self._others: set[str] = set()  # columns with values that are no numbers
         self._columns: dict[str, _Column] = {}
         self._whole: list[pa.Table] = []
         self._place = np.full(size, -1, np.int64)  # row of the first or last message of a bin
@@ -195,6 +203,8 @@ class _Rows:
                 if found is not None and not has_none:
                     made = self._columns.setdefault(name, _Column(self._how, self._size))
                     made.add(column.type, *found, row)
+                elif not pa.types.is_null(column.type):
+                    self._others.add(name)
         elif self._how != _COUNT:
             is_new = self.messages[bins] == 0
             chosen = begins[is_new] if self._how == "first" else begins + counts - 1
@@ -203,6 +213,14 @@ class _Rows:
             self._whole.append(table.take(pa.array(chosen)))
             self._given += len(chosen)
         self.messages[bins] += counts
+
+    def has_no_number(self, field: str) -> bool:
+        """True if a field has values, and none of them is a single number."""
+        mine = [
+            {name for name in names if name == field or name.startswith(f"{field}.")}
+            for names in (self._others, self._columns)
+        ]
+        return bool(mine[0]) and not mine[1]
 
     def table(self) -> pa.Table:
         """The columns."""

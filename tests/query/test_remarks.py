@@ -11,7 +11,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.query.topics import namesakes
-from hybridlog_storage.errors import TimeError, TopicError
+from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -100,6 +100,15 @@ def test_a_topic_that_lacks_a_field_of_the_predicate(store: hl.Store) -> None:
     assert absent.remarks() == [
         "1 message could not be tested: it does not fit its definition, or has none."
     ]
+
+
+def test_columns_of_messages_without_a_definition(store: hl.Store) -> None:
+    query = store.topic("/j").fields("speed", "n", "seq", "list[].deep", "long.min")
+    assert query.to_arrow().num_rows
+    assert query.remarks() == ["No message of /j has a field 'speed'."]
+    assert "n" in store.topic("/j").fields("n").resample("1s", how="mean").to_arrow().column_names
+    with pytest.raises(UsageError, match="list of /j is no single number"):
+        store.topic("/j").fields("n", "list").resample("1s", how="mean").to_arrow()
 
 
 def test_header_stamps_of_another_epoch(store: hl.Store) -> None:

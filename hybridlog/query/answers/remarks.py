@@ -39,6 +39,7 @@ def remarks(session: Session, question: Question, *, is_empty: bool) -> Iterator
     if question.clock == "header" and question.bounds is not None:
         yield from _about_stamps(session, question)
     yield from _missing_fields(session, question, is_empty=is_empty)
+    yield from _missing_columns(session, question)
     if is_empty and question.limit != 0:
         yield from _causes(session, question)
 
@@ -107,10 +108,30 @@ def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> 
         if known is None and is_empty:
             known = _fields_in_tables(session, question, topic)
         for path in paths if known is not None else ():
-            if not any(_is_near(path, name.replace("[]", "")) for name in known or ()):
-                near = difflib.get_close_matches(path, known or (), n=_MAX_NAMES, cutoff=0.5)
-                hint = f"; did you mean {', '.join(near)}?" if near else "."
-                yield f"No message of {topic} has a field {path!r}{hint}"
+            yield from _missing(topic, path, known or ())
+
+
+def _missing_columns(session: Session, question: Question) -> Iterator[str]:
+    """Fields that a table was asked for and no message has, where no definition fixes them."""
+    if not question.fields or session.field_types(question.topics, question.recordings) is not None:
+        return
+    from hybridlog.frames.names import is_own
+
+    found = [_fields_in_tables(session, question, topic) for topic in question.topics]
+    if all(known is not None for known in found):
+        known = {path for one in found for path in one or ()}
+        for path in question.fields:
+            if not is_own(path):
+                yield from _missing(", ".join(question.topics), path, known)
+
+
+def _missing(topic: str, path: str, known: Collection[str]) -> Iterator[str]:
+    """That no message of a topic has a field, if it is none of the known ones."""
+    plain = path.replace("[]", "")
+    if not any(_is_near(plain, name.replace("[]", "")) for name in known):
+        near = difflib.get_close_matches(path, known, n=_MAX_NAMES, cutoff=0.5)
+        hint = f"; did you mean {', '.join(near)}?" if near else "."
+        yield f"No message of {topic} has a field {path!r}{hint}"
 
 
 def _is_near(path: str, name: str) -> bool:
