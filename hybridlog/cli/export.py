@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.answers import (
     Destination,
     check_room,
@@ -72,12 +72,8 @@ def export_command(given: _Given) -> None:
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or _form(target)
     given.check_form(form)
-    options.check_latched(
-        no_latched=given.no_latched, original_times=given.original_times, form=form
-    )
     front = Front(latched=not given.no_latched, original_times=given.original_times)
-    options.check_tags(given.tags, form)
-    settings = options.bag_settings(given.storage, given.file_size, form)
+    settings = given.settings(form)
     if form in _LOGS and split is None:
         check_room(target, force=force, is_directory=is_directory(form, target))
     with given.opened() as store:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.answers import (
     SCREEN,
     Destination,
@@ -208,11 +208,7 @@ def _destination(choices: _Choices) -> Destination:
     _check_together(choices)
     to = choices.destination()
     form = to.form
-    to = replace(to, settings=options.bag_settings(choices.storage, choices.file_size, form))
-    options.check_latched(
-        no_latched=choices.no_latched, original_times=choices.original_times, form=form
-    )
-    options.check_tags(choices.tags, form)
+    to = replace(to, settings=choices.settings(form))
     as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
     if choices.frame is not None and (as_it_came or form == "raw"):
         raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")

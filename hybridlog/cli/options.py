@@ -354,6 +354,23 @@ class Latched:
         "Latched messages and frames from before the time range keep their log time."
     )
 
+    def check_latched(self, form: str | None) -> None:
+        """Refuse what has no effect in a format; None for a recording.
+
+        Raises:
+            UsageError: The options contradict each other, or the format has no such messages.
+        """
+        if self.no_latched and self.original_times:
+            raise UsageError(
+                "--no-latched leaves no messages for --original-times: give one of them."
+            )
+        logs = formats_of("log")
+        if self.original_times and form not in {None, *logs}:
+            raise UsageError(
+                f"Latched messages from before the time range are in {' and '.join(logs)}, not in "
+                f"{form}: leave out --original-times."
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Slices(Latched, Forced):
@@ -374,6 +391,26 @@ class Slices(Latched, Forced):
         "For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
         "SIZE",
     )
+
+    def settings(self, form: str) -> dict[str, Any]:
+        """Arguments of the writer of a format.
+
+        Raises:
+            UsageError: Options do not fit it, or each other.
+        """
+        self.check_latched(form)
+        if self.tags is not None and form in formats_of("log", "payloads", "pictures", "video"):
+            raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
+        if form != "rosbag2":
+            if (self.storage, self.file_size) != (None, None):
+                raise UsageError(f"--storage and --file-size are for rosbag2, not for {form}.")
+            return {}
+        settings: dict[str, Any] = {"storage": self.storage or "mcap"}
+        if self.file_size is not None:
+            settings["max_file"] = output.parse_size(self.file_size)
+            if not settings["max_file"]:
+                raise UsageError("--file-size must be more than 0.")
+        return settings
 
 
 def one_recording(
@@ -404,56 +441,6 @@ def cache_size() -> Any:
         envvar="HYBRIDLOG_CACHE_SIZE",
         show_envvar=True,
     )
-
-
-def check_latched(*, no_latched: bool, original_times: bool, form: str | None) -> None:
-    """Refuse options about latched messages that have no effect.
-
-    Args:
-        no_latched: `--no-latched` was given.
-        original_times: `--original-times` was given.
-        form: Format of the output; None for a recording.
-
-    Raises:
-        UsageError: They contradict each other, or the format has no such messages.
-    """
-    if no_latched and original_times:
-        raise UsageError("--no-latched leaves no messages for --original-times: give one of them.")
-    logs = formats_of("log")
-    if original_times and form not in {None, *logs}:
-        raise UsageError(
-            f"Latched messages from before the time range are in {' and '.join(logs)}, not in "
-            f"{form}: "
-            "leave out --original-times."
-        )
-
-
-def bag_settings(storage: str | None, file_size: str | None, form: str) -> dict[str, Any]:
-    """Arguments of the writer of a bag of ROS 2.
-
-    Raises:
-        UsageError: The format is another one, or the size is none.
-    """
-    if (storage, file_size) != (None, None) and form != "rosbag2":
-        raise UsageError(f"--storage and --file-size are for rosbag2, not for {form}.")
-    if form != "rosbag2":
-        return {}
-    settings: dict[str, Any] = {"storage": storage or "mcap"}
-    if file_size is not None:
-        settings["max_file"] = output.parse_size(file_size)
-        if not settings["max_file"]:
-            raise UsageError("--file-size must be more than 0.")
-    return settings
-
-
-def check_tags(tags: str | None, form: str) -> None:
-    """Refuse --tags where the format has no columns.
-
-    Raises:
-        UsageError: It has none.
-    """
-    if tags is not None and form in formats_of("log", "payloads", "pictures", "video"):
-        raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
 
 
 def parse_tags(pairs: Iterable[str]) -> dict[str, str]:

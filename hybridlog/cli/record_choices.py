@@ -19,7 +19,6 @@ from hybridlog.cli.options import (
     Latched,
     Quiet,
     cache_size,
-    check_latched,
 )
 from hybridlog_storage.errors import UsageError
 
@@ -188,9 +187,7 @@ def check_choices(choices: RecordChoices) -> None:
     if not choices.is_live:
         if choices.name is not None and len(choices.paths) > 1:
             raise UsageError("--name names one recording: give one path, or leave it out.")
-        check_latched(
-            no_latched=choices.no_latched, original_times=choices.original_times, form=None
-        )
+        choices.check_latched(None)
         _check_watch(choices)
         return
     if choices.watch:

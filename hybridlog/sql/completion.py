@@ -12,38 +12,10 @@ if TYPE_CHECKING:
 DELIMITERS: Final = " \t\n,;()[]<>=!+-*/'"
 """Characters between words."""
 _WORDS: Final = (
-    "as",
-    "asof",
-    "avg",
-    "between",
-    "by",
-    "count",
-    "describe",
-    "distinct",
-    "from",
-    "group",
-    "having",
-    "in",
-    "is",
-    "join",
-    "like",
-    "limit",
-    "max",
-    "min",
-    "not",
-    "null",
-    "on",
-    "or",
-    "order",
-    "select",
-    "show",
-    "sum",
-    "tables",
-    "union",
-    "using",
-    "where",
-    "with",
-)
+    "as", "asof", "avg", "between", "by", "count", "describe", "distinct", "from", "group",
+    "having", "in", "is", "join", "like", "limit", "max", "min", "not", "null", "on", "or",
+    "order", "select", "show", "sum", "tables", "union", "using", "where", "with",
+)  # fmt: skip
 
 
 def word_before(text: str) -> str:

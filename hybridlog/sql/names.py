@@ -14,19 +14,10 @@ TABLES: Final = ("recordings", "topics", "losses", "marks")
 """Tables about the store itself; their names are reserved."""
 _WORD: Final = re.compile(r'"((?:[^"]|"")*)"|([^\W\d][\w$]*)')
 PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_LISTING: Final = frozenset(
-    {
-        "database",
-        "duckdb_columns",
-        "duckdb_tables",
-        "duckdb_views",
-        "information_schema",
-        "pg_catalog",
-        "pragma_show",
-        "pragma_table_info",
-        "show",
-    }
-)
+_LISTING: Final = frozenset({
+    "database", "duckdb_columns", "duckdb_tables", "duckdb_views", "information_schema",
+    "pg_catalog", "pragma_show", "pragma_table_info", "show",
+})  # fmt: skip
 """Words of statements that list views."""
 
 

@@ -18,7 +18,7 @@ import pyarrow.parquet
 import pytest
 
 from hybridlog.cli.answers import print_cost
-from hybridlog.cli.options import VERBOSE, check_latched
+from hybridlog.cli.options import VERBOSE, Latched
 from hybridlog.query.counters import Counters
 from hybridlog_storage.errors import UsageError
 from tests.independent import Seen, read_bag, read_mcap
@@ -272,14 +272,14 @@ def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path
 def test_options_about_latched_messages_without_any() -> None:
     def refused(form: str | None, *, no_latched: bool, original_times: bool) -> str:
         with pytest.raises(UsageError) as error:
-            check_latched(no_latched=no_latched, original_times=original_times, form=form)
+            Latched(no_latched=no_latched, original_times=original_times).check_latched(form)
         return str(error.value)
 
     assert "give one of them" in refused(None, no_latched=True, original_times=True)
     assert "not in csv" in refused("csv", no_latched=False, original_times=True)
     for form in ("mcap", "bag", None):
-        check_latched(no_latched=False, original_times=True, form=form)
-    check_latched(no_latched=True, original_times=False, form="csv")
+        Latched(no_latched=False, original_times=True).check_latched(form)
+    Latched(no_latched=True, original_times=False).check_latched("csv")
 
 
 def test_nothing_is_overwritten_without_force(store: Path, tmp_path: Path) -> None:
