@@ -166,11 +166,7 @@ class ReplaySource(LiveSource):
         self._put(_Step(number, None, [], [], end=True, error=error))
 
     def _read_once(self, source: Source, number: int) -> bool:
-        """Read a log to its end.
-
-        Returns:
-            True if it had a message and the source is not stopped.
-        """
+        """Read a log to its end; True if it had a message and the source is not stopped."""
         lookahead = Lookahead()
         known = count = 0
         with source:

@@ -74,11 +74,7 @@ class Lookahead:
         self._rows = 0
 
     def add(self, batch: Batch) -> Rows | None:
-        """Take a batch.
-
-        Returns:
-            The oldest messages, if the lookahead is full.
-        """
+        """Take a batch; return the oldest messages, if the lookahead is full."""
         buffer = batch.buffer if isinstance(batch.buffer, bytes) else memoryview(batch.buffer)
         table = replace(batch, buffer=b"")
         self._waiting.append(Rows([buffer], np.zeros(len(batch), np.int64), table))

@@ -106,11 +106,7 @@ class Connection:
             data = data[at:] + more if at < len(data) else more
 
     def _take(self, data: bytes, receiver: Receiver) -> int:
-        """Take all whole frames.
-
-        Returns:
-            Offset of the first unused byte.
-        """
+        """Take all whole frames; return the offset of the first unused byte."""
         take = receiver.data
         at, end = self._go_on(data, receiver), len(data)
         while end - at >= 2:
@@ -221,11 +217,7 @@ class Connection:
     # Frames for websockets.
 
     def _unusual(self, data: bytes, at: int, body: int, length: int, receiver: Receiver) -> int:
-        """Pass the available bytes of a frame to websockets.
-
-        Returns:
-            Offset of the next frame.
-        """
+        """Pass the available bytes of a frame to websockets; return where the next one begins."""
         opcode, is_last = data[at] & 0x0F, bool(data[at] & 0x80)
         if opcode < 8:
             if opcode:

@@ -173,11 +173,7 @@ class _Opening:
             raise
 
     def _shake_hands(self, made: socket.socket) -> bytes:
-        """Do the websocket handshake.
-
-        Returns:
-            Bytes that followed it.
-        """
+        """Do the websocket handshake; return the bytes that followed it."""
         protocol = self._protocol
         protocol.send_request(protocol.connect())
         made.sendall(b"".join(protocol.data_to_send()))

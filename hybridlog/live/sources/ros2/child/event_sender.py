@@ -46,11 +46,7 @@ class EventSender:
     def channel(
         self, topic: str, kind: str, definition: Definition, offered: str, type_hash: str
     ) -> int:
-        """Announces a channel for the messages of a topic.
-
-        Returns:
-            The number of the channel.
-        """
+        """Announces a channel for the messages of a topic; returns its number."""
         number = len(self._channels)
         self._channels.append(topic)
         self._outbox.event(
