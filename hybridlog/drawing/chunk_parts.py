@@ -49,11 +49,7 @@ class RecordedChunks:
         return sorted({channel.topic for channel in self._recording.channels})
 
     def follow(self, recording: RecordingEntry) -> bool:
-        """See what was flushed since.
-
-        Returns:
-            False if what was read before does not hold any more.
-        """
+        """See what was flushed since; False if what was read before does not hold any more."""
         before, self._recording = self._recording, recording
         return (
             recording.status == before.status

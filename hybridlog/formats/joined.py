@@ -319,11 +319,7 @@ class JoinedSource(Source):
 
 
 def _is_frame(batch: Batch) -> NDArray[np.bool_]:
-    """Test which payloads begin like a zstd frame.
-
-    Returns:
-        bool[n].
-    """
+    """Test which payloads begin like a zstd frame; return bool[n]."""
     found = batch.length >= len(ZSTD_MAGIC)
     if found.any():
         size = len(batch.buffer) - len(ZSTD_MAGIC) + 1

@@ -47,9 +47,6 @@ class FairSemaphore:
     """Admits a limited number of threads, in the order in which they arrive.
 
     Python's own locks let later threads overtake a waiting one any number of times.
-
-    Args:
-        limit: Threads that are admitted at the same time.
     """
 
     def __init__(self, limit: int) -> None:

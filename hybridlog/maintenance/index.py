@@ -495,13 +495,7 @@ def decode_again(
     entry: RecordingEntry,
     progress: Progress | None = None,
 ) -> RecordingEntry:
-    """Decode all segments without decoding results in the catalog.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        entry: The recording, locked by this process for writing.
-        progress: Called after each chunk.
+    """Decode all segments of a locked recording without decoding results in the catalog.
 
     Returns:
         The recording's complete entry.

@@ -230,9 +230,6 @@ class StoreFiles:
     def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
         """The entry of a recording, compared with its files.
 
-        Args:
-            summary: Its summary at the opening of the store.
-
         Returns:
             The entry, None if the recording is gone; and whether the files were read again.
 

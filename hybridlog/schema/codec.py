@@ -142,11 +142,7 @@ class Codec(Protocol):
 
 
 class OpaqueCodec:
-    """Codec of payloads that are stored and fetched, but not decoded.
-
-    Args:
-        reason: The reason.
-    """
+    """Codec of payloads that are stored and fetched, but not decoded."""
 
     indexed = False
 
@@ -244,10 +240,6 @@ def plain_message(
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Decode the header stamps of messages of one channel.
-
-    Args:
-        codec: The codec of the channel.
-        batch: The messages.
 
     Returns:
         Rows of the messages that have a stamp, and the stamps, ns.

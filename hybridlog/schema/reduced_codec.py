@@ -70,12 +70,7 @@ def reduced_channel(channel: Channel) -> Channel:
 
 
 def reduce(codec: Codec, payload: bytes) -> bytes:
-    """Reduce a message. An unreadable payload is reduced to size and hash.
-
-    Args:
-        codec: The codec of its channel.
-        payload: The serialized message.
-    """
+    """Reduce a message. An unreadable payload is reduced to size and hash."""
     head = _HEAD.pack(len(payload), hashlib.sha256(payload).digest())
     one = np.zeros(1, np.int64)
     group = next(index_bodies(codec, payload, one, one + len(payload)))
@@ -196,12 +191,7 @@ def without_lossy(decoded: Decoded) -> tuple[Decoded, int]:
 
 
 class ExpiredCodec(ReducedCodec):
-    """Codec of what is left of expired messages.
-
-    Args:
-        original: The codec of their payloads.
-        state: Their state.
-    """
+    """Codec of what is left of expired messages."""
 
     def __init__(self, original: Codec, state: State) -> None:
         self._original = original

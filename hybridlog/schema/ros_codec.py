@@ -47,10 +47,6 @@ _REGISTERING = taken_by_forks(threading.Lock())
 class RosCodec:
     """Messages of one ROS type.
 
-    Args:
-        schema: Their definition.
-        wire: Their format.
-
     Raises:
         DefinitionError: The definition cannot be used.
     """
@@ -112,10 +108,6 @@ class RosObjects:
 
     rosbags runs code generated from type and field names. So it gets the checked type and
     never the text of the definition.
-
-    Args:
-        message_type: Type of the payloads.
-        wire: Their format.
 
     Raises:
         DefinitionError: rosbags cannot make a class from it.

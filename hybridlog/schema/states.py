@@ -54,12 +54,7 @@ def state_of(encoding: str) -> State:
 
 
 def encoding_of(encoding: str, metadata: Mapping[str, str]) -> str:
-    """The encoding of the payloads of a channel, which may be gone.
-
-    Args:
-        encoding: The channel's encoding.
-        metadata: The channel's metadata.
-    """
+    """The encoding of the payloads of a channel, which may be gone."""
     return encoding if state_of(encoding) is State.WHOLE else metadata.get(ORIGINAL_ENCODING, "")
 
 

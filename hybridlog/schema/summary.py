@@ -44,11 +44,7 @@ class Summary:
 
 
 class Totals:
-    """Sums of finite doubles at some places. They do not overflow, so each has a mean.
-
-    Args:
-        size: Number of places.
-    """
+    """Sums of finite doubles at some places. They do not overflow, so each has a mean."""
 
     def __init__(self, size: int) -> None:
         self._sums, self._large = np.zeros((2, size), np.float64)

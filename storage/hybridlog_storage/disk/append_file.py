@@ -133,10 +133,6 @@ class AppendFile:
     def room_before(self, content: Buffer, position: int) -> int:
         """Bytes of padding that let large content be written without a copy.
 
-        Args:
-            content: The content to append.
-            position: Byte of the file where it would begin.
-
         Returns:
             0 where padding does not help.
         """

@@ -575,10 +575,6 @@ class SegmentReader:
     def read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
         """Arrival numbers of a chunk's messages, without reading the chunk.
 
-        Args:
-            place: Its position, with the checksum of the trailer.
-            count: Number of its messages.
-
         Returns:
                 int64[count].
 

@@ -39,14 +39,7 @@ class State(NamedTuple):
 
 
 class Master:
-    """Calls the master. Every call may raise `PeerError`.
-
-    Args:
-        network: Makes connections.
-        uri: The master's address.
-        caller: Name of this node.
-        api: Address of this node, where the master announces publishers.
-    """
+    """Calls the master. Every call may raise `PeerError`."""
 
     def __init__(self, network: Network, uri: str, caller: str, api: str) -> None:
         self._network = network
