@@ -184,6 +184,9 @@ def test_somebody_outside_of_the_group_changes_nothing(place: Path) -> None:
     expected = ann.run(*COUNT, *where).out
     before = {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)}
     assert eve.run(*COUNT, *where).out == expected, "who can read asks by topic and time"
+    typed = {"_HYBRIDLOG_COMPLETE": "bash_complete", "COMP_CWORD": "4"}
+    offered = eve.run(**typed, COMP_WORDS=f"hybridlog fetch --store {store} /imu/d").out
+    assert offered == "plain,/imu/data\n"
     for command in (("rm", "-y", "small"), ("record", place / "small.bag"), ("index", "rebuild")):
         assert eve.run(*command, *where, code=None).code in {5, 6}
     assert {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)} == before
