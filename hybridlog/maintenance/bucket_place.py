@@ -206,8 +206,8 @@ class BucketPlace:
                 is_whole = known is not None and not (known.lacks_payloads or known.is_damaged)
                 if is_whole:  # another process was faster
                     # Of large files the last one to come replaced what the other one had sent.
-                    newer = {path: o for path, o in found.items() if _replaces(o, there.get(path))}
-                    listed = {**there, **newer}
+                    names = {one.name for one in there.values()}
+                    listed = {**there, **{p: o for p, o in found.items() if o.name in names}}
                 else:
                     bucket, name = target.source.bucket, f"{RECORDINGS}/{recording}/{JOURNAL}"
                     edits, marks = self._added(there, state)
@@ -431,7 +431,3 @@ def _is_lines(path: str) -> bool:
 
 def _digests(entry: RecordingEntry) -> dict[int, str]:
     return {int(number): digest for number, digest in entry.digests.items()}
-
-
-def _replaces(one: Object, other: Object | None) -> bool:
-    return other is not None and other.name == one.name and other.version != one.version

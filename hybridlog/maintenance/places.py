@@ -68,20 +68,9 @@ class RefusedError(StoreError):
 
 
 @dataclass(frozen=True, slots=True)
-class CopiedFile:
-    """A file of a recording: a segment, or a file of payloads or fields.
+class CopiedFile(journal.PayloadFile):
+    """A file of payloads or fields; or a segment, whose `file` is its name."""
 
-    Attributes:
-        file: Name of the segment, or path below the recording's `payloads`.
-        bytes: Its size.
-        digest: Digest of its summary or footer.
-        topic: The topic of a file of payloads.
-        messages: Number of messages in a file of payloads.
-    """
-
-    file: str
-    bytes: int
-    digest: str
     topic: str = ""
     messages: int = 0
 
@@ -93,12 +82,11 @@ class CopiedFile:
             KeyError, TypeError, ValueError: It is malformed.
         """
         name = value["file"]
-        if isinstance(name, str) and _SEGMENT.fullmatch(name):
-            # Another valid name in its place: the journal has the rules for all other values.
-            (found,) = journal.payload_files([{**value, "file": f"segment/{name}"}])
-            return cls(**{**asdict(found), "file": name})
-        (found,) = journal.payload_files([value])
-        return cls(**asdict(found))
+        is_segment = isinstance(name, str) and _SEGMENT.fullmatch(name)
+        # Another valid name in its place: the journal has the rules for all other values.
+        file = f"segment/{name}" if is_segment else name
+        (found,) = journal.payload_files([{**value, "file": file}])
+        return cls(**{**asdict(found), "file": name})
 
     @property
     def is_segment(self) -> bool:
@@ -118,8 +106,7 @@ class CopiedFile:
         """True if the file is there, byte for byte."""
         try:
             if not self.is_segment:
-                listed = journal.PayloadFile(**asdict(self))
-                open_file(recording / PAYLOADS, listed).check()
+                open_file(recording / PAYLOADS, self).check()
                 return True
             with SegmentCheck(recording / self.file) as check:
                 found = check.summary

@@ -152,14 +152,10 @@ def not_indexed(messages: int) -> str:
 
 def _gone(counted: Completeness | Counters) -> dict[State, int]:
     """Number of messages without their payloads, by state; none is 0."""
-    from hybridlog.schema.states import State
+    from hybridlog.schema.states import GONE, State
 
-    reduced = counted.reduced - counted.expired - counted.not_copied
-    found = {
-        State.REDUCED: reduced,
-        State.EXPIRED: counted.expired,
-        State.NOT_COPIED: counted.not_copied,
-    }
+    found = {State.REDUCED: counted.reduced - counted.expired - counted.not_copied}
+    found |= {state: getattr(counted, state) for state in GONE}
     return {state: number for state, number in found.items() if number}
 
 
