@@ -39,7 +39,7 @@ class MessageAnswers(Steps):
         Raises:
             UsageError: it has `in_frame`, which is for tables and arrays.
         """
-        self._as_they_came("Messages")
+        self._as_they_came("Loops and `at`")
         from hybridlog.message import messages_in
         from hybridlog.query.answers.video import picture_of
 
@@ -78,7 +78,7 @@ class MessageAnswers(Steps):
             UsageError: the question has a time range, `in_frame`, or another clock than log
                 time.
         """
-        self._as_they_came("Messages")
+        self._as_they_came("Loops and `at`")
         return self._at(moment)
 
     def _at(self, moment: TimeLike) -> Message:

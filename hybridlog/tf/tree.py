@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -409,7 +410,8 @@ def _nanoseconds(times: ArrayLike) -> Times:
     """Times as integers, ns."""
     found = np.asarray(times)
     if found.dtype == object or found.dtype.kind == "M":  # pandas keeps zones in objects
-        found = np.asarray(times, "datetime64[ns]")
-    elif found.size and found.dtype.kind not in "iu":
+        with suppress(TypeError, ValueError):
+            found = np.asarray(times, "datetime64[ns]")
+    if found.size and found.dtype.kind not in "iuM":
         raise UsageError("Times are whole nanoseconds since 1970, or datetimes.")
     return np.ascontiguousarray(found.reshape(-1), np.int64)

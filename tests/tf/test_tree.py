@@ -143,7 +143,7 @@ def test_there_is_no_transform_outside(log: Log) -> None:
         tree.transform("odom", "base", int(times[-1]))
     with pytest.raises(TransformError, match=r"1700000001\.0 is seconds"):
         tree.transform("odom", "base", 1_700_000_001)
-    for odd in ([1_700_000_001.5], ["+1s"]):
+    for odd in ([1_700_000_001.5], ["+1s"], [object()]):
         with pytest.raises(UsageError, match="whole nanoseconds"):
             tree.lookup("odom", "base", odd)
     held = tree.lookup("odom", "base", at(-1.1, 0, 5, 5.1), extrapolate="2s")
