@@ -633,8 +633,8 @@ MAINTENANCE = [
         "hybridlog/maintenance/places.py",
         (
             "copied-columns-are-not-checked",
-            "open_file(recording / PAYLOADS, listed).check()\n",
-            "open_file(recording / PAYLOADS, listed)\n",
+            "open_file(recording / PAYLOADS, self).check()\n",
+            "open_file(recording / PAYLOADS, self)\n",
             IMPORT,
         ),
         (
