@@ -219,7 +219,7 @@ def test_a_plan_promises_what_goes(store: Path) -> None:
     segments = sorted(journal.read(store / "recordings" / "run").sealed)  # type: ignore[union-attr]
     assert step["segments"] == segments[:-1]
     gone = sum(raw is None for raw in payloads(store).values())
-    assert f"{gone} payloads deleted to make room" in answer("ls", store=store).out
+    assert f"{gone} payloads deleted" in answer("ls", store=store).out
     assert answer("ls", "--json", store=store).json[0]["expired"] == gone
     with hl.open(store, mongo="none") as opened:
         told = str(opened.topic("camera").completeness())

@@ -65,11 +65,9 @@ def _with_short_notes(
 def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     span = entry.span
     notes = [] if entry.status == "complete" else [status_text(entry)]
-    for state, number in {"expired": entry.expired, "not_copied": entry.not_copied}.items():
+    for number, what in ((entry.expired, "deleted"), (entry.not_copied, "not copied yet")):
         if number:
-            from hybridlog.schema.states import CAUSES, State
-
-            notes.append(f"{output.counted(number, 'payload')} {CAUSES[State(state)]}")
+            notes.append(f"{number if narrow else output.counted(number, 'payload')} {what}")
     if entry.name != entry.label:
         notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
