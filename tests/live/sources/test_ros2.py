@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.live.sources.base import Cause, one_line
+from hybridlog.live.sources.base import Cause, Loss, one_line
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.live.sources.ros2.process import PYTHON_VARIABLE, candidates, environment_for
 from hybridlog.live.sources.ros2.source import Ros2Source
@@ -83,7 +83,7 @@ def test_messages_and_events_reach_the_sink(tmp_path: Path) -> None:
         "topic_type_hash": "RIHS01_x",
     }
     assert memory.came == [("/a", "std_msgs/msg/String", 2)]
-    assert memory.losses == [("/a", Cause.TRANSPORT, 3, 1, 2, "from ?[31m/n")]
+    assert memory.losses == [Loss("/a", Cause.TRANSPORT, 3, 1, 2, "from ?[31m/n")]
     assert memory.said == ["ROS 2: a b"]
     assert memory.ends == []
 
