@@ -910,7 +910,7 @@ def test_verify_and_reindex_as_commands(store: hl.Store) -> None:
         (b"\xff\xfe\x00garbage", "damaged"),
         (b"format = [", "damaged"),
         (b"", "format"),
-        (b'format = 4\nstore_id = "x"\n', "newer"),
+        (b'format = 4\nstore_id = "x"\n', "knows format 3"),
         (b"format = 3\n", "store_id"),
         (b'format = 3\nstore_id = "x"\nmongo = 3\n', "mongo"),
     ],

@@ -326,7 +326,7 @@ COMMANDS: dict[str, list[Asked]] = {
         asked(
             "stats said arm --rate -F jsonl",
             lines("begin_ns", "end_ns", "topic", "messages", "rate"),
-            lambda k: [*reversed(rates(k, "/said", "/arm"))],
+            lambda k: rates(k, "/arm", "/said"),
         ),
     ],
     "check": [
