@@ -277,11 +277,12 @@ def test_who_is_asked_sees_what_goes(store: hl.Store, monkeypatch: pytest.Monkey
     monkeypatch.setattr(edit.click, "confirm", lambda text, err: shown.append(text) or False)
     many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
     with pytest.raises(edit.click.exceptions.Exit):
-        edit._confirm(["twin"], many)
+        edit._confirm(["twin"], many, ["a talk"])
     assert shown[0] == "  twin: a copy"
     assert shown[1] == "  r0: 2025-06-03T00:00:00Z, 1 message, 1 B"
-    assert shown[-3:] == [
+    assert shown[-4:] == [
         "  and 5 more",
+        "1 pin would go, too (a talk).",
         "Delete these 26 recordings for good?",
         "Nothing is deleted.",
     ]

@@ -201,7 +201,8 @@ def rm_command(given: _Remove) -> None:
             chosen = recordings_of(store, rest).summaries
         targets = {copy: copy for copy in copies} | {one.id: one.label for one in chosen}
         if not given.yes:
-            _confirm(store, copies, chosen)
+            pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
+            _confirm(copies, chosen, pins)
         for recording, label in targets.items():
             with if_stopped(
                 "A recording whose removal began is gone; the next command that opens the "
@@ -212,10 +213,17 @@ def rm_command(given: _Remove) -> None:
                 output.say(f"deleted {label}")
 
 
-def _confirm(store: Store, copies: Sequence[str], chosen: Sequence[RecordingSummary]) -> None:
-    """Ask for consent; several recordings are shown with what would be lost."""
+def _confirm(
+    copies: Sequence[str], chosen: Sequence[RecordingSummary], pins: Sequence[str]
+) -> None:
+    """Ask for consent; several recordings are shown with what would be lost.
+
+    Args:
+        copies: Labels of copies of recordings.
+        chosen: Other recordings.
+        pins: Reasons of their pins.
+    """
     labels = [*copies, *(one.label for one in chosen)]
-    pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
     why = f" ({listed([one for one in dict.fromkeys(pins) if one])})" if any(pins) else ""
     pinned = f" {output.counted(len(pins), 'pin')} would go, too{why}." if pins else ""
     several = len(labels) > 1
