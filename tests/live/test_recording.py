@@ -867,7 +867,9 @@ from pathlib import Path
 from rosbags.rosbag1 import Reader
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
+small = SegmentSettings(chunk_size=64 << 10, segment_size=1 << 20)  # tables are made meanwhile
 with Reader(Path(sys.argv[1])) as reader:
     said = [(c, when, bytes(payload)) for c, when, payload in reader.messages()]
 channels = {
@@ -879,7 +881,7 @@ def speak():
     for connection, when, payload in said:
         recording.write(channels[connection.id], payload, log_time=when)
 
-with hl.open(sys.argv[2], create=True) as store, store.start("live") as recording:
+with hl.open(sys.argv[2], create=True) as store, store.start("live", settings=small) as recording:
     recording.expect(*channels.values())
     before = set(sys.modules)
     speaker = threading.Thread(target=speak)
