@@ -497,7 +497,8 @@ def readme(journal: Journal) -> str:
             two = {name: values[name].median for name in (OURS, "bagfile")}
             if shown(OURS) != bag and best(two, key=two.__getitem__) == "bagfile":
                 bags.append(short)
-    ahead = f"A ROS bag is ahead in {' and '.join(bags)}. " if bags else ""
+    names = " and ".join(", ".join(bags).rsplit(", ", 1))
+    ahead = f"A ROS bag is ahead in {names}. " if bags else ""
     option = "" if results.scale == "full" else f" --{results.scale}"
     offered = "≥: no more could be offered, so two such figures rank nothing. " if at_least else ""
     short = "It was a short run, in which loads are only doubled. " if option else ""
