@@ -70,6 +70,17 @@ _OPEN_FILES = 128  # maximum number of unfinished files
 _log = logging.getLogger(__name__)
 
 
+def load() -> None:
+    """Load what tables need; later it would keep the interpreter from all who bring messages."""
+    import pyarrow as pa
+
+    import hybridlog.columns.fields
+    import hybridlog.columns.parquet_file
+    import hybridlog.schema.arrow_objects  # noqa: F401
+
+    pa.array([0]).to_numpy(zero_copy_only=False)  # loads pandas, if it is installed
+
+
 class _Topic:
     """Messages of one topic and definition."""
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from hybridlog.columns.table_writer import load
 from hybridlog.index.index_writer import INTERVAL_S
 from hybridlog.live.memory import MIN_USER_BUDGET, MemoryReservation, default_budget, frozen_objects
 from hybridlog.live.policy import SMALL_BYTES
@@ -178,7 +179,7 @@ class LiveRecording:
         *,
         on_close: Callable[[RecordReport], None],
     ) -> None:
-        _load()
+        load()
         self._options = options
         self._small_bound = options.budget_bytes * 5 // 4
         self._on_close = on_close
@@ -651,17 +652,6 @@ def _pinned(payload: object) -> memoryview:
             return view
     kind = type(payload).__name__
     raise UsageError(f"the payload of a message must be bytes, not {kind}")
-
-
-def _load() -> None:
-    """Load what tables need; later it would keep the interpreter from all who bring messages."""
-    import pyarrow as pa
-
-    import hybridlog.columns.fields
-    import hybridlog.columns.parquet_file
-    import hybridlog.schema.arrow_objects  # noqa: F401
-
-    pa.array([0]).to_numpy(zero_copy_only=False)  # loads pandas, if it is installed
 
 
 def _check_channel(channel: object) -> None:
