@@ -25,8 +25,8 @@ class _Given(Choosing, InStore, AsJson):
 def ls_command(given: _Given) -> None:
     """List the recordings."""
     with given.opened() as store:
-        store.directory.look_closely()
-        store.refresh()
+        if store.directory.look_closely():
+            store.refresh()
         recordings = given.recordings_in(store).summaries
     if given.as_json:
         output.print_json([recording_dict(entry) for entry in recordings])

@@ -71,7 +71,7 @@ _log = logging.getLogger(__name__)
 
 
 def load() -> None:
-    """Load what tables need; later it would keep the interpreter from all who bring messages."""
+    """Import what tables need: amid a recording, that would hold up all threads for a while."""
     import pyarrow as pa
 
     import hybridlog.columns.fields

@@ -222,7 +222,7 @@ class BucketPlace:
                 break
         else:
             raise StoreError(f"{self.name} changes all the time. Copy again.")
-        if is_whole and has_lost(self.segments(recording), state):
+        if is_whole and has_lost(self.segments(recording), segments_of(state)):
             raise HeldError(
                 f"another process has copied it into {self.name} at this moment, with fewer "
                 "payloads.",

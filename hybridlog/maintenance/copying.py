@@ -206,10 +206,10 @@ class _Copying:
         for recording, sent in self._proven.items():
             now, found = there.get(recording), self._place.segments(recording)
             is_whole = now is not None and not (now.lacks_payloads or now.is_damaged)
-            if not is_whole or has_lost(found, sent):
+            here = segments_of(sent)
+            if not is_whole or has_lost(found, here):
                 problems.append(f"Payloads of {sent.name} stay: its copy in {name} has lost some.")
                 continue
-            here = segments_of(sent)
             # Where payloads of a topic have expired on both sides, others may be gone there.
             same = [n for n in found.keys() & here.keys() if found[n].holds(here[n])]
             proved(recording, {n: here[n].digest for n in same})
@@ -261,19 +261,16 @@ class _Copying:
         return self._place.have([*there])
 
     def _cure(self, recording: str, there: str) -> str:
-        """What to do about a copy: to be removed, it must have nothing that is not here."""
+        """Advice about a damaged copy: it is only to be removed if all of it is here."""
         segments = self._place.segments(recording)
         with suppress(StoreError):
             for label in self._source.labels_of(recording):
                 inventory = take_inventory(self._source, label)
                 state = inventory.state or JournalState()
-                gone = (
-                    topics - {*segments[n].expired} if n in segments else topics
-                    for n, topics in state.expired.items()
-                )
+                is_less = state.lacks_payloads or has_lost(segments_of(state), segments)
                 if (
                     inventory.is_proven
-                    and not (inventory.misfits or state.lacks_payloads or any(gone))
+                    and not (inventory.misfits or is_less)
                     and segments.keys() <= state.sealed.keys()
                 ):
                     return (
@@ -305,7 +302,7 @@ class _Copying:
                 "--only-fields mends it."
             )
         may_lack = known.expired and not known.lacks_payloads
-        if may_lack and has_lost(self._place.segments(one.id), state):
+        if may_lack and has_lost(self._place.segments(one.id), segments_of(state)):
             self._report.lacking.append(known.label)
         self._check_there(one, known, state)
 
@@ -315,7 +312,7 @@ class _Copying:
         """Read a copy that is there before payloads expire here."""
         if self._options.then_expire:
             problems = self._place.problems(one.id)
-            if known.lacks_payloads or has_lost(self._place.segments(one.id), state):
+            if known.lacks_payloads or has_lost(self._place.segments(one.id), segments_of(state)):
                 problems.append("payloads of it have expired there")
             if problems:
                 self._report.problems.append(

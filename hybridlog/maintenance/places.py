@@ -537,9 +537,10 @@ def segments_of(state: JournalState | None) -> dict[int, CopiedSegment]:
     }
 
 
-def has_lost(there: Mapping[int, CopiedSegment], state: JournalState) -> bool:
-    """True if payloads expired in a copy that a journal still has; `there` as of `segments`."""
-    return any({*one.expired} - state.expired.get(n, set()) for n, one in there.items())
+def has_lost(one: Mapping[int, CopiedSegment], other: Mapping[int, CopiedSegment]) -> bool:
+    """True if payloads expired in one copy that another one still has; both as of `segments`."""
+    left = {number: {*segment.expired} for number, segment in other.items()}
+    return any({*segment.expired} - left.get(n, set()) for n, segment in one.items())
 
 
 def copied_of(directory: StoreDirectory, label: str) -> Copied:

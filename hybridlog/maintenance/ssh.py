@@ -306,7 +306,7 @@ def serve(place: DirectoryPlace, requests: IO[bytes], answers: IO[bytes]) -> Non
 
 
 class _Heard:
-    """What the other side says, unless it is silent for too long."""
+    """A stream from the other side; reading fails when that is silent for too long."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream

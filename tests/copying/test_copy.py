@@ -42,6 +42,12 @@ ROUNDS = 10
 SEED = 20_261_128
 
 
+def _flip_a_bit(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 1
+    path.write_bytes(data)
+
+
 def _frame(request: dict[str, object]) -> bytes:
     stream = io.BytesIO()
     ssh._write(stream, request)
@@ -260,10 +266,7 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
     right = {label: answers(robot, label) for label in STATES}
     with hl.open(robot, mongo="none") as store:
         store.copy(lab, ["compacted"])
-        path = lab / "recordings" / "compacted" / "000000.mcap"
-        data = bytearray(path.read_bytes())
-        data[len(data) // 3] ^= 1
-        path.write_bytes(data)
+        _flip_a_bit(lab / "recordings" / "compacted" / "000000.mcap")
         report = store.copy(lab, None, CopyOptions(then_expire=True))
         assert len(report.problems) == 1
         assert "compacted stay" in report.problems[0]
@@ -513,10 +516,7 @@ def test_a_cure_deletes_nothing_that_is_not_here(robots: Path, tmp_path: Path) -
     shutil.copytree(robots, robot)
     with hl.open(robot, mongo="none") as store:
         store.copy(lab, ["recorded"])
-        path = lab / "recordings" / "recorded" / "000001.mcap"
-        data = bytearray(path.read_bytes())
-        data[len(data) // 3] ^= 1
-        path.write_bytes(data)
+        _flip_a_bit(lab / "recordings" / "recorded" / "000001.mcap")
         (said,) = store.copy(lab, ["recorded"], CopyOptions(check=True)).problems
         assert "`hybridlog rm recorded`" in said
         expire(store, "recorded", [0])

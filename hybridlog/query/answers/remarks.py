@@ -126,7 +126,7 @@ def _missing_columns(session: Session, question: Question) -> Iterator[str]:
 
 
 def _missing(topic: str, path: str, known: Collection[str]) -> Iterator[str]:
-    """That no message of a topic has a field, if it is none of the known ones."""
+    """A sentence that no message of a topic has a field, if it is none of the known ones."""
     plain = path.replace("[]", "")
     if not any(_is_near(plain, name.replace("[]", "")) for name in known):
         near = difflib.get_close_matches(path, known, n=_MAX_NAMES, cutoff=0.5)

@@ -343,8 +343,9 @@ class StoreDirectory:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
 
-    def look_closely(self) -> None:
-        """Find out which files are there that a list only says to be there; here none is."""
+    def look_closely(self) -> bool:
+        """Compare a list of files with the files; True if some are missing. Here is no list."""
+        return False
 
     def lost_of(self, label: str) -> Collection[str]:
         """Files that a list says to be there, and are not; here nothing says so."""

@@ -456,9 +456,10 @@ class RemoteDirectory(StoreDirectory):
     def _look_of(self, label: str) -> str:
         return self.looks([label]).get(label, "")
 
-    def look_closely(self) -> None:
-        """Compare all files with their objects."""
+    def look_closely(self) -> bool:
+        """Compare all files with their objects; True if some were lost."""
         self.source.compare()
+        return bool(self.source.bucket.lost)
 
     def listing(self, label: str) -> Listing:
         """As of a directory; files count whose objects are there."""
