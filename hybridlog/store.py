@@ -80,7 +80,6 @@ if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotReport
-    from hybridlog.training.windows import Windows
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
@@ -776,54 +775,6 @@ class Store:
 
         options = LerobotOptions(fps, episodes_by, task, task_topic, codec, on_gap)
         return write_lerobot(query, FeatureMap.given(features), path, options, progress=progress)
-
-    @of_one_moment
-    def windows(
-        self,
-        topics: str | Sequence[str] | Query,
-        *,
-        fps: int,
-        length: int,
-        horizon: int = 0,
-        features: str | Path | Mapping[str, Any] | None = None,
-        episodes_by: str = "recording",
-        on_gap: Literal["refuse", "drop", "hold"] = "drop",
-    ) -> Windows:
-        """Make a data set of windows of states and pictures, without an export.
-
-        Frames are those of `to_lerobot`. A window is `length` of them, with `horizon` further
-        ones of the numbers alone, such as actions to come.
-
-        Args:
-            topics: Topics by names, or a query: recordings, range and topics.
-            fps: Frames per second.
-            length: Frames of a window, with pictures.
-            horizon: Frames behind them, without pictures.
-            features: Which fields and images, as for `to_lerobot`; None for what the topics'
-                types propose.
-            episodes_by: As for `to_lerobot`; a window is in one episode.
-            on_gap: With a gap in a topic, refuse all, have no window there, or keep the last
-                value.
-
-        Raises:
-            UsageError: A recording is running, a gap is refused, or there are no such fields.
-            TopicError: A recording lacks a topic.
-        """
-        from hybridlog.training.feature_map import FeatureMap, proposed
-        from hybridlog.training.windows import Windows
-
-        names = (topics,) if isinstance(topics, str) else topics
-        query = names if isinstance(names, Query) else self.topic(*names)
-        return Windows(
-            query,
-            self._opener(),
-            proposed(query) if features is None else FeatureMap.given(features),
-            fps=fps,
-            length=length,
-            horizon=horizon,
-            episodes_by=episodes_by,
-            on_gap=on_gap,
-        )
 
     @of_one_moment
     def sync(

@@ -645,14 +645,13 @@ def documented_classes() -> list[type]:
     from hybridlog.record.recorder import RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.training.lerobot import LerobotReport
-    from hybridlog.training.windows import Windows
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
     answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
-    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, Windows, *answers]
+    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, CopyOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 
@@ -675,8 +674,6 @@ def test_every_public_name_is_described(thing: type) -> None:
         members |= {"rows": None}
     if thing.__name__ == "Synced":
         members |= dict.fromkeys(("topics", "recordings", "times", "counters", "left_out"))
-    if thing.__name__ == "Windows":
-        members |= dict.fromkeys(("names", "episodes", "left_out", "counters"))
     if thing.__name__ == "Recordings":
         conditions = inspect.signature(hl.Store.recordings).parameters
         members |= dict.fromkeys(("summaries", *(name for name in conditions if name != "self")))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
@@ -18,7 +17,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.maintenance.bucket_place import BucketPlace
-from hybridlog.training.windows import Windows
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     BucketError,
@@ -40,11 +38,6 @@ from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy
 
 
-def windows_of(store: hl.Store) -> Windows:
-    arm = {"features": {"action": {"/arm": "x"}}}
-    return store.windows("/arm", fps=10, length=4, features=arm)
-
-
 def everything(store: hl.Store) -> dict[str, Any]:
     """Answers of all kinds."""
     return {
@@ -61,10 +54,6 @@ def everything(store: hl.Store) -> dict[str, Any]:
             for message in store.topic("/arm", "/scan")
         ],
         "fields": store.topic("/arm").where("n == 7").to_pandas().to_dict("list"),
-        "windows": [
-            window["action"].tolist()
-            for window in pickle.loads(pickle.dumps(windows_of(store)))[:5]
-        ],
         "sql": store.sql("select count(*), sum(x) from arm where n < 10").to_arrow().to_pylist(),
     }
 
