@@ -11,7 +11,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, ParamSpec, Self, TypeAlias, TypeVar, cast
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+    ParamSpec,
+    Self,
+    TypeAlias,
+    TypeVar,
+    cast,
+    overload,
+)
 
 from hybridlog.entries import text
 from hybridlog.index import consent, field_indexes
@@ -388,7 +399,7 @@ class Store:
         Questions repair nothing: they answer from what is whole. `close` calls this.
 
         Args:
-            seconds: What takes longer is left; `repairs` names it. `repair` does all.
+            seconds: What takes longer is left; `repairs` names it. `verify(repair=True)` does all.
         """
         with suppress(StoreError, ResourceError):
             self.session.mend(seconds)
@@ -1129,18 +1140,46 @@ class Store:
         (name, *_) = self.topic(topic).topics
         return self.session.places("The place of a topic").of([name])[name]
 
+    @overload
+    def verify(
+        self,
+        recordings: Names | None = None,
+        progress: Progress | None = None,
+        *,
+        repair: Literal[False] = False,
+    ) -> Verification: ...
+
+    @overload
+    def verify(
+        self,
+        recordings: Names | None = None,
+        progress: Progress | None = None,
+        *,
+        repair: Literal[True],
+    ) -> list[Repaired]: ...
+
     @_again_if_lost
     def verify(
-        self, recordings: Names | None = None, progress: Progress | None = None
-    ) -> Verification:
+        self,
+        recordings: Names | None = None,
+        progress: Progress | None = None,
+        *,
+        repair: bool = False,
+    ) -> Verification | list[Repaired]:
         """Check all checksums, and compare catalog and index with the segments.
 
         Args:
             recordings: The recordings; None for all.
             progress: Called after each chunk.
+            repair: Apply all repairs that lose no data; read the rest.
+
+        Returns:
+            What was found; with `repair`, what was mended, and what only a copy can restore.
         """
         from hybridlog.maintenance.verify import verify
 
+        if repair:
+            return self._repair(recordings, progress)
         self.refresh()
         labels = None if recordings is None else [r.label for r in self.select(recordings)]
         return verify(
@@ -1151,6 +1190,28 @@ class Store:
             labels=labels,
             progress=progress,
         )
+
+    def _repair(self, recordings: Names | None, progress: Progress | None) -> list[Repaired]:
+        self._check_on_disk()
+        from hybridlog.maintenance.repair import repair, repair_index
+
+        self.session.mend()
+        self.refresh()
+        chosen = [] if recordings is None else self.select(recordings)
+        entries = None if recordings is None else chosen
+        done = repair(self.directory, self.catalog, self.repairs, entries)
+        self.refresh()
+        database = self.session.writable_database
+        if database is not None:
+            done += repair_index(
+                self.directory,
+                self.catalog,
+                database,
+                self.session.recordings() if recordings is None else self._now(chosen),
+                progress=progress,
+            )
+            self.refresh()
+        return done
 
     def compact(
         self,
@@ -1545,31 +1606,6 @@ class Store:
         report.freed_bytes += expired.freed_bytes
         report.problems += expired.problems
 
-    def import_from(
-        self,
-        other: str | Path,
-        recordings: Choice | Names | None = None,
-        progress: Progress | None = None,
-    ) -> CopyReport:
-        """Copy recordings in from another store; see `copy`.
-
-        Args:
-            other: The other store's directory.
-            recordings: The recordings, or what they must satisfy; None for all.
-            progress: Called with the bytes copied of all that are to be copied.
-
-        Raises:
-            StoreError: It is not a store, or this one cannot be written.
-        """
-        from hybridlog.maintenance.copying import run
-
-        there = directory_of(other)
-        with (
-            Store(there, mongo=NONE if there.is_remote else EMBEDDED) as source,
-            self.receiving() as place,
-        ):
-            return run(source.directory, place, source._chosen(recordings), progress=progress)
-
     @contextmanager
     def receiving(self) -> Iterator[DirectoryPlace]:
         """This store as a place that recordings are copied to."""
@@ -1597,36 +1633,6 @@ class Store:
         ids = {entry.id for entry in self.select(names)}
         return [one for one in self.summaries() if one.id in ids]
 
-    def repair(
-        self, recordings: Names | None = None, progress: Progress | None = None
-    ) -> list[Repaired]:
-        """Apply all repairs that lose no data; return them.
-
-        Args:
-            recordings: The recordings; None for all.
-            progress: Called after each chunk.
-        """
-        self._check_on_disk()
-        from hybridlog.maintenance.repair import repair, repair_index
-
-        self.session.mend()
-        self.refresh()
-        chosen = [] if recordings is None else self.select(recordings)
-        entries = None if recordings is None else chosen
-        done = repair(self.directory, self.catalog, self.repairs, entries)
-        self.refresh()
-        database = self.session.writable_database
-        if database is not None:
-            done += repair_index(
-                self.directory,
-                self.catalog,
-                database,
-                self.session.recordings() if recordings is None else self._now(chosen),
-                progress=progress,
-            )
-            self.refresh()
-        return done
-
     def _check_on_disk(self) -> None:
         if self.directory.is_remote:
             self.directory.check_writable()
@@ -1636,12 +1642,3 @@ class Store:
         snapshot = self.session.snapshot()
         places = sorted(snapshot.by_id.get(entry.id, -1) for entry in entries)
         return [self.session.entry_of(snapshot.summaries[n]) for n in places if n >= 0]
-
-    def take_over(self) -> None:
-        """Record in the index that this store was moved to this location.
-
-        Raises:
-            DatabaseError: MongoDB does not answer.
-            StoreError: The database holds the index of another store.
-        """
-        self.session.take_over()

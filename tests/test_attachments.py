@@ -26,6 +26,7 @@ from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.running import run
+from tests.copies import bring
 
 SECOND = 10**9
 TIMES = [100 * SECOND + n * SECOND for n in range(10)]
@@ -210,7 +211,7 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         (entry,) = store.recordings()
         assert (entry.attachments, entry.metadata_records) == (5, 3)
     with hl.open(tmp_path / "t", create=True) as other:
-        other.import_from(tmp_path / "s")
+        bring(other, tmp_path / "s")
         assert listed(other.attachments("other-name")) == ATTACHMENTS
         assert other.metadata("other-name") == METADATA
         query = other.all_topics()

@@ -149,7 +149,7 @@ def test_a_line_that_was_lost_is_made_again(store: Path, kept: Path, want: Told)
             # No question has needed it; who reads everything is told, and of the cure.
             with hl.open(store) as opened:
                 assert [f.place for f in opened.verify().findings if f.place == "catalog"]
-                opened.repair()
+                opened.verify(repair=True)
             assert found(store) == findings, number
 
 

@@ -687,7 +687,7 @@ def test_a_summary_is_made_again(store: hl.Store, said: Counter[Message]) -> Non
         check_what_is_missing(opened, said, {place.segment})
     run("index", "rebuild", store=store.directory.path, code=0)
     run("verify", store=store.directory.path, code=1)
-    done = run("repair", store=store.directory.path, code=0)
+    done = run("verify", "--repair", store=store.directory.path, code=0)
     assert place.path.name in done.stdout
     run("verify", store=store.directory.path, code=0)
     with reopened(store) as opened:
@@ -771,7 +771,7 @@ def test_a_chunk_that_is_listed_otherwise_than_it_is(
         check_what_is_missing(opened, said, {number})
         findings = [f for f in opened.verify().findings if path.name in f.place]
         assert 0 < len(findings) < 10
-        opened.repair()
+        opened.verify(repair=True)
         (entry,) = opened.recordings()
         assert entry.status == "complete"
         assert content(fetched(opened, "short")) == said
@@ -793,7 +793,7 @@ def test_segments_that_changed_places_are_found_and_put_back(
             other.name,
         }
         assert any("segment 1 of this recording" in f.problem for f in findings)
-    run("repair", store=store.directory.path, code=0)
+    run("verify", "--repair", store=store.directory.path, code=0)
     run("verify", store=store.directory.path, code=0)
     assert (one.read_bytes(), other.read_bytes()) == (first, second)
     with reopened(store) as opened:

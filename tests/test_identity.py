@@ -44,6 +44,7 @@ from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
+from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
 
@@ -138,7 +139,7 @@ def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, co
             assert (finding.recording, "copy of one" in finding.problem) == (copy, True)
             store.rebuild_index()
             assert answers(store) == right()
-            done = store.repair()
+            done = store.verify(repair=True)
             assert [one.is_cured for one in done if one.recording == copy] == [False]
     with hl.open(place, mongo=uri) as store:
         store.remove(copy)
@@ -181,10 +182,10 @@ def test_import(place: Path, uri: str, tmp_path: Path) -> None:
         store.record(make_log(tmp_path / "second.mcap", 500), name="second")
     with hl.open(tmp_path / "mine", create=True) as mine:
         mine.record(make_log(tmp_path / "third.mcap", 900), name="one")
-        report = mine.import_from(place, ["one"])
+        report = bring(mine, place, ["one"])
         assert (report.copied, report.known) == (["one-2"], [])
         assert answers(mine, "one-2") == right()
-        again = mine.import_from(place)
+        again = bring(mine, place)
         assert (again.copied, again.known) == (["second"], ["one-2"])
         assert mine.topic("/n").count() == 3 * COUNT
         assert not mine.repairs.adopted  # that stands in the journals already
@@ -205,7 +206,7 @@ def test_an_import_goes_on_where_it_was_stopped(place: Path, uri: str, tmp_path:
         half = (source / "000001.mcap").read_bytes()
         (begun / "000001.mcap").write_bytes(half[: len(half) // 2])
         assert not mine.recordings()
-        report = mine.import_from(place)
+        report = bring(mine, place)
         left = entry.stored_bytes - (source / "000000.mcap").stat().st_size - len(half) // 2
         assert (report.copied, report.bytes_copied) == (["one"], left)
         assert answers(mine) == right()
@@ -218,10 +219,10 @@ def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
     data[data.index(b"xxxx")] ^= 1  # in a payload: nothing but the copy is checked for that
     path.write_bytes(data)
     with hl.open(tmp_path / "mine", create=True) as mine:
-        assert "does not match its checksums" in mine.import_from(place).refused["one"]
+        assert "does not match its checksums" in bring(mine, place).refused["one"]
         assert not mine.recordings()
         path.unlink()
-        assert "is incomplete" in mine.import_from(place).refused["one"]
+        assert "is incomplete" in bring(mine, place).refused["one"]
         assert not mine.recordings()
 
 
@@ -297,7 +298,7 @@ def test_a_store_from_another_host_asks_first(place: Path, uri: str) -> None:
         with pytest.raises(DatabaseError, match="/data/store on another"):
             store.database_for("This")
         assert store.topic("/n").count() == COUNT  # by topic and time it goes on
-        store.take_over()
+        store.session.take_over()
         assert answers(store) == right()
 
 
@@ -332,7 +333,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             (110 * SECOND + SECOND // 2, "after"),
         ]
         assert marks.where("text == 'slip'").count() == 1
-        near = store.topic("/n").around(marks.where("tags.kind == 'odd'"), before="1s", after="1s")
+        near = store.topic("/n").during(marks.where("tags.kind == 'odd'").windows("1s", "1s"))
         assert [m.fields["n"] for m in near] == [109, 110]
         assert answers(store, "second-floor") == right()
         assert not store.verify().findings
@@ -483,7 +484,7 @@ CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
     "rename": lambda store, one: store.rename(one, "new"),
     "mark": lambda store, one: store.mark(one, "start", "seen"),
     "compact": lambda store, one: store.compact([one], ["/scan"], drop_mcap=True),
-    "repair": lambda store, one: store.repair([one]),
+    "repair": lambda store, one: store.verify([one], repair=True),
 }
 
 
@@ -648,9 +649,9 @@ def test_an_import_takes_the_recording_that_was_chosen(
 
             with monkeypatch.context() as patch:
                 patch.setattr(copying, "run", armed)
-                done = store.import_from(place, [one])
+                done = bring(store, place, [one])
                 if change is remove and done.refused:
-                    done = store.import_from(base, [one])
+                    done = bring(store, base, [one])
         assert len(done.copied) == 1, step
         with hl.open(target, mongo=NOWHERE) as store:
             assert [entry.id for entry in store.recordings()] == [one], step

@@ -525,7 +525,7 @@ class Machine(RuleBasedStateMachine):
         places = {f.place for f in self.store.verify().findings} - self.places()
         assert places <= {"catalog"}
         if places:
-            self.store.repair()
+            self.store.verify(repair=True)
         self.open_again()  # what only decoding tells is found out now, if a question missed it
         self.changed = True
 

@@ -18,6 +18,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.collection_names import collection_of
 from tests.calls import Calls
 from tests.cli.running import run
+from tests.copies import bring
 from tests.limits import Limit
 from tests.many_topics import topic, write_log
 
@@ -121,7 +122,7 @@ def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
     marked = {c.topic for c in channels if c.metadata.get("hybridlog.no_index") == "1"}
     assert marked == set(LEFT_OUT)
     with hl.open(tmp_path / "other", create=True, require_database=True) as other:
-        other.import_from(store.directory.path)
+        bring(other, store.directory.path)
         assert documents(other) == INDEXED
         # A slice is a new log.
         run("fetch", "-t", "**", "-o", tmp_path / "slice.mcap", store=store.directory.path)

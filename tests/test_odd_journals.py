@@ -49,7 +49,7 @@ READING: Sequence[Sequence[str]] = (
     ("verify",),
 )
 CHANGING: Sequence[Sequence[str]] = (
-    ("repair",),
+    ("verify", "--repair"),
     ("tag", "odd", "k=v"),
     ("edit", "odd", "--note", "x"),
     ("mark", "odd", "--at", "+1s", "m"),

@@ -1,11 +1,11 @@
-"""`hybridlog copy` and `import`."""
+"""`hybridlog copy`."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,6 +19,7 @@ from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
+from hybridlog_storage.settings import NONE
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
@@ -31,7 +32,12 @@ _RUNNING: Final = frozenset({"open", "unfinished"})
 @dataclass(frozen=True, kw_only=True)
 class _Copy(Choosing, InStore, AsJson, Quiet):
     names: tuple[str, ...] = options.names_argument()  # type: ignore[misc]
-    to: str = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "TO")
+    to: str | None = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "[TO]")
+    source: Path | None = option(
+        "Instead of TO: copy from this store, a directory or s3://bucket/path, into the one here.",
+        "STORE",
+        name="--from",
+    )
     only_fields: bool = option("Fields first; a later copy adds the payloads.")
     then_expire: bool = option(
         "Delete payloads here once their copy is proved there; pinned ones stay."
@@ -51,13 +57,17 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
 
 @command(_Copy, "copy")
 def copy_command(given: _Copy) -> None:
-    """Copy recordings to a directory, a server over ssh, or a bucket.
+    """Copy recordings to a directory, a server over ssh, or a bucket, or from another store.
 
     Every byte is proved there before a recording gets its name. After a cut, run it again: it
     goes on where it stopped. A recording that is there already is not copied again.
     """
     from hybridlog.maintenance.copying import CopyOptions
 
+    if given.source is not None:
+        given = _from_elsewhere(given, given.source)
+    if given.to is None:
+        raise UsageError("Name the place to copy to, or with --from STORE the one to copy from.")
     if given.receive:
         _receive(Path(given.to))
         return
@@ -77,8 +87,16 @@ def copy_command(given: _Copy) -> None:
     _check(report)
 
 
-def _bar(what: str, given: _Copy | _Import) -> closing[LateBar]:
-    return closing(LateBar(what, quiet=given.quiet or given.as_json))
+def _from_elsewhere(given: _Copy, source: Path) -> _Copy:
+    """The same as a copy by the other store, to the one here."""
+    from hybridlog.store import store_path
+
+    if given.mongo is not None:
+        with given.opened(create=True):
+            pass
+    names = given.names if given.to is None else (*given.names, given.to)
+    to = str(store_path(given.store))
+    return replace(given, names=names, to=to, store=source, mongo=NONE)
 
 
 def _copied(
@@ -92,9 +110,10 @@ def _copied(
     """Copy recordings and print what was copied, also if an error ends it."""
     from hybridlog.maintenance.copying import CopyReport
 
+    assert given.to is not None
     report = CopyReport()
     try:
-        with _bar("copy", given) as bar:
+        with closing(LateBar("copy", quiet=given.quiet or given.as_json)) as bar:
             store.copy(given.to, chosen, how, bar, report)
     except BaseException:
         if report != CopyReport():
@@ -136,8 +155,7 @@ def _receive(path: Path) -> None:
 
 def _print(
     report: CopyReport,
-    given: _Copy | _Import,
-    words: tuple[str, str] = ("copied", "there"),
+    given: _Copy,
     *,
     is_short: bool = False,
 ) -> None:
@@ -146,18 +164,18 @@ def _print(
     Args:
         report: The result.
         given: The options.
-        words: What was done with the recordings, and where they are.
         is_short: Leave out what is there already; JSON is one line.
     """
+    there = "there" if given.source is None else "here"
     if given.as_json:
         (output.print_json_line if is_short else output.print_json)(asdict(report))
     elif not given.quiet:
         for label in report.copied:
-            output.say(f"{words[0]} {label}")
+            output.say(f"copied {label}")
         for label in () if is_short else report.known:
             lacks = label in report.lacking
-            more = f"; payloads that were deleted {words[1]} were not copied" if lacks else ""
-            output.say(f"{label} is {words[1]} already{more}")
+            more = f"; payloads that were deleted {there} were not copied" if lacks else ""
+            output.say(f"{label} is {there} already{more}")
         if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
             output.say(f"{output.size(report.freed_bytes)} freed")
 
@@ -184,24 +202,3 @@ def _rate(text: str | None) -> float | None:
     if rate == 0:
         raise UsageError("--limit-rate must be more than 0.")
     return rate
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Import(Choosing, InStore, AsJson, Quiet):
-    other: Path = argument("Directory of the other store.", "STORE")
-
-
-@command(_Import, "import")
-def import_command(given: _Import) -> None:
-    """Copy recordings in from another store.
-
-    Every byte is checked. After an interruption, run it again: it goes on where it stopped.
-    """
-    with (
-        given.opened(create=True) as store,
-        if_stopped("What arrived stays here: run the command again."),
-        _bar("import", given) as bar,
-    ):
-        report = store.import_from(given.other, given.choice, bar)
-    _print(report, given, ("imported", "here"))
-    _check(report)

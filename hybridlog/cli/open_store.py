@@ -208,7 +208,7 @@ def _print_left(store: Store) -> None:
     found = {"recording": len(repairs.noted), "table": len(repairs.noted_tables)}
     left = " and ".join(counted(number, what) for what, number in found.items() if number)
     if left and store.directory.is_writable:
-        note(f"Left to repair: {left}. `hybridlog repair` does it.")
+        note(f"Left to repair: {left}. `hybridlog verify --repair` does it.")
 
 
 def _print_recovered(recording: str, segments: list[Recovered]) -> None:

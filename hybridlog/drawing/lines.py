@@ -15,8 +15,8 @@ from hybridlog_storage.errors import TopicError, UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.fields import SeriesQuery
     from hybridlog.drawing.series import Numbers
+    from hybridlog.query.query import Query
 
 MAX_LINES: Final = 50
 """Lines that can be told apart, with good will."""
@@ -41,7 +41,7 @@ class Line:
     series: Series
 
 
-def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Line]:
+def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
     """The fields of a query over time, by topic and recording; the query's counters are set.
 
     Args:
@@ -87,7 +87,7 @@ def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Lin
 
 
 def _groups(
-    query: SeriesQuery, fields: Sequence[str], missing: dict[str, TopicError]
+    query: Query, fields: Sequence[str], missing: dict[str, TopicError]
 ) -> Iterator[list[str]]:
     """The fields that a topic has, together; one by one where only messages tell.
 
@@ -111,7 +111,7 @@ def _groups(
         yield own
 
 
-def _by_topic(query: SeriesQuery) -> Iterator[SeriesQuery]:
+def _by_topic(query: Query) -> Iterator[Query]:
     return (query.with_topic(topic) for topic in query.topics)
 
 

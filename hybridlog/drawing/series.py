@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.fields import SeriesQuery
+    from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
@@ -92,7 +92,7 @@ class Series:
 
 
 def series(
-    query: SeriesQuery, fields: Sequence[str], *, pixels: int, span: Span | None = None
+    query: Query, fields: Sequence[str], *, pixels: int, span: Span | None = None
 ) -> list[Series]:
     """Fields of the messages of a query over log time.
 
@@ -125,9 +125,7 @@ def series(
     return found
 
 
-def _narrowed(
-    query: SeriesQuery, wanted: Sequence[_Wanted], span: Span | None
-) -> tuple[SeriesQuery, Span]:
+def _narrowed(query: Query, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Query, Span]:
     """The query for the wanted fields, and the part of the span that it covers.
 
     Raises:
@@ -153,7 +151,7 @@ def _narrowed(
     return narrowed, (begin, end)
 
 
-def numbers_of(query: SeriesQuery) -> list[str]:
+def numbers_of(query: Query) -> list[str]:
     """Paths of the fields that are single numbers; none where no definition fixes them."""
     known = query.field_types() or {}
     return [p for p, kind in known.items() if kind in NUMERIC and "[" not in p]

@@ -65,10 +65,6 @@ class MessageAnswers(Steps):
         self.counters.reset()
         return Following(self.session, self.question, self.counters, names)
 
-    def first(self) -> Message | None:
-        """The first message; None if the answer is empty."""
-        return next(iter(self.limit(1)), None)
-
     @of_one_moment
     def at(self, moment: TimeLike) -> Message:
         """The message of `at_time`. Its arrays are read-only: copy to change them.

@@ -253,10 +253,6 @@ class Steps:
         """
         return self._with(frame=frame)
 
-    def __getitem__(self, fields: str | tuple[str, ...]) -> Self:
-        """`query["header.stamp", "ranges.min"]` is `query.fields("header.stamp", "ranges.min")`."""
-        return self.fields(*(fields if isinstance(fields, tuple) else (fields,)))
-
     @of_one_moment
     def tags(self, *keys: str) -> Self:
         """Tags of the recordings as columns of tables, behind `topic` and `recording`.

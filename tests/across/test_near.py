@@ -193,8 +193,8 @@ def test_before_and_after(logs: Logs) -> None:
     text = "right/pose: state == 'stop'"
     events = logs.store.topic("right/pose").where("state == 'stop'")
     base = logs.store.topic("base")
-    assert base.where(text, within=("5ms", "9ms")) == base.around(events, "5ms", "9ms")
-    assert base.where(text, within=("5ms", 0)) == base.around(events, before="5ms")
+    assert base.where(text, within=("5ms", "9ms")) == base.during(events.windows("5ms", "9ms"))
+    assert base.where(text, within=("5ms", 0)) == base.during(events.windows("5ms"))
 
 
 def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
@@ -219,7 +219,7 @@ def test_what_is_refused(logs: Logs) -> None:
     with pytest.raises(UsageError, match="Topics are names"):
         logs.store.topic(["base"])  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="Fields are names"):
-        base[0]  # type: ignore[index]
+        base.fields(0)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="time within which"):
         base.where("left/pose: x > 1")
     with pytest.raises(UsageError, match="on other topics"):

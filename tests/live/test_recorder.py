@@ -478,7 +478,7 @@ def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
     robot.recorder.stop()
     marks = store.topic(MARKS).where("tags.trial = '7'")
     assert [m.fields["text"] for m in marks] == ["gripper slipped"]
-    around = store.topic("/chatter").around(marks, "2s", "1500ms")
+    around = store.topic("/chatter").during(marks.windows("2s", "1500ms"))
     assert {m.decode().data for m in around} <= {"3", "4", "5", "6", "7"}
     assert around.count() >= 3
 

@@ -17,6 +17,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import BucketError, StoreError, UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
+from tests.copies import bring
 from tests.copying.conftest import (
     STATES,
     Disturbed,
@@ -79,7 +80,7 @@ def test_from_the_robot_to_the_bucket(
         with pytest.raises(UsageError, match="this very store"):
             store.copy(f"{address}/")
         with hl.open(tmp_path / "back", mongo="none", create=True) as back:
-            assert sorted(back.import_from(address).copied) == sorted(STATES)
+            assert sorted(bring(back, address).copied) == sorted(STATES)
             assert not back.verify().findings
     objects = {one.name for one in Bucket(address).objects("recordings")}
     with hl.open(here) as store:

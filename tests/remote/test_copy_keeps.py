@@ -275,7 +275,7 @@ def test_only_fields_name_a_damaged_copy(robot: hl.Store, address: str) -> None:
     assert robot.copy(address).known == ["run"]  # messages answer, too
     expire(robot, "run", [0])
     shutil.rmtree(robot.directory.path / "tables")
-    robot.repair()  # now its tables say so, and those that are sent
+    robot.verify(repair=True)  # now its tables say so, and those that are sent
     assert robot.copy(address, options=CopyOptions(check=True)).copied == ["run"]
     files.mounted.clear()
     with hl.open(address) as there:

@@ -33,6 +33,7 @@ from hybridlog_storage.remote.lists import StoreList, list_name
 from hybridlog_storage.remote.store import RemoteDirectory
 from tests.cli import running as commands
 from tests.cli.within import Answer, answer
+from tests.copies import bring
 from tests.limits import Limit
 from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy
@@ -359,7 +360,7 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, changes: bool) -
         assert "hybridlog copy" in found.findings[0].cure
         assert found.recordings == 2
     with hl.open(tmp_path / "back", mongo="none", create=True) as store:
-        report = store.import_from(address)
+        report = bring(store, address)
         assert (report.copied, [*report.refused]) == (["short-0"], ["run"])
         assert f"--store {address} run" in report.refused["run"]
     with hl.open(here, mongo="none") as source:
@@ -504,7 +505,7 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
         refused: list[Callable[[], Any]] = [
             store.compact,
             store.repair,
-            lambda: store.import_from(published),
+            lambda: bring(store, published),
             lambda: store.start("new"),
         ]
         for change in refused:

@@ -257,25 +257,6 @@ def _table(table: Any, *names: str) -> list[tuple[Any, ...]]:
     return [*zip(*columns, strict=True)]
 
 
-def _plotted(store: hl.Store) -> list[list[tuple[int, float]]]:
-    from matplotlib.figure import Figure
-
-    axes = store.topic("/said").plot("x", ax=Figure(figsize=(60, 4)).subplots())
-    found = []
-    for line in axes.get_lines():
-        points = np.asarray(line.get_xydata())
-        kept = points[~np.isnan(points[:, 1])]
-        found.append(sorted({(round(1e3 * x), float(y)) for x, y in kept}))
-    return [points for points in found if points]
-
-
-def _points(known: Known) -> Any:
-    first = known.span[0]
-    return [
-        sorted({(round((m.log_time - first) / MS), m.fields["x"]) for m in known.of("/said")})  # type: ignore[index]
-    ]
-
-
 def _clocks(store: hl.Store) -> Any:
     said, arm = store.topic("said"), store.topic("arm")
     return {
@@ -329,10 +310,6 @@ def _is_high(fields: dict[str, Any]) -> bool:
     return bool(fields["x"] > 50)
 
 
-def _marks(known: Known) -> list[int]:
-    return [one.log_time for one in known.of("/hybridlog/marks")]
-
-
 def _second(known: Known, *topics: str) -> list[Sent]:
     return known.of(*topics, between=(FIRST_S, LAST_S))
 
@@ -346,26 +323,12 @@ def _lost(store: hl.Store) -> Any:
 
 METHODS: dict[str, Rule] = {
     "__iter__": Rule(lambda s: rows(s.all_topics()), lambda k: sent(k.of())),
-    "__getitem__": Rule(
-        lambda s: s.topic("arm")["n", "position"].to_arrow().column_names[-2:],
-        lambda _: ["n", "position"],
-    ),
     "__eq__": Rule(lambda s: s.topic("arm") == s["/arm"], lambda _: True),
     "__hash__": Rule(lambda s: len({s.topic("arm"), s["/arm"]}), lambda _: 1),
     "__repr__": Rule(
         lambda s: repr(s.topic("said")), lambda _: f"<Query /said; recording {LABEL}>"
     ),
     "_repr_html_": Rule(lambda s: LABEL in s.topic("said")._repr_html_(), lambda _: True),
-    "_ipython_key_completions_": Rule(
-        lambda s: (
-            {"n", "header.stamp", "position"} <= set(s.topic("arm")._ipython_key_completions_())
-        ),
-        lambda _: True,
-    ),
-    "around": Rule(
-        lambda s: seqs(s.topic("arm").around(s.topic("marks"), "0.3s", "0.1s")),
-        lambda k: seqs(around(k, _marks(k), 300 * MS, 100 * MS, "/arm")),
-    ),
     "at": Rule(
         lambda s: [s.topic("said").at(t).seq for t in (FIRST_S, LAST_S + 1, "-0.3s", "end")],
         lambda k: [
@@ -483,10 +446,6 @@ METHODS: dict[str, Rule] = {
             for m in k.of("/arm")
         ],
     ),
-    "first": Rule(
-        lambda s: (s.topic("arm").first().seq, s.topic("arm").reverse().first().seq),  # type: ignore[union-attr]
-        lambda k: (k.of("/arm")[0].seq, k.of("/arm")[-1].seq),
-    ),
     "gaps": Rule(
         lambda s: (
             between_messages(spans(s.topic("said").gaps(longer_than="25ms"))),
@@ -519,7 +478,6 @@ METHODS: dict[str, Rule] = {
         lambda k: [in_force(k, FIRST_S), in_force(k, k.span[1] + 1 - 200 * MS)],
     ),
     "limit": Rule(lambda s: seqs(s.all_topics().limit(23)), lambda k: seqs(k.of()[:23])),
-    "plot": Rule(_plotted, _points),
     "rate": Rule(
         lambda s: (
             _table(

@@ -198,7 +198,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
         done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]
-        image = found.before.topic("cam").first()
+        image = next(iter(found.before.topic("cam")))
         assert image is not None
         assert "<img" in image._repr_html_()
         assert LABEL in found.before.recordings()._repr_html_()

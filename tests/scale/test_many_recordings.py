@@ -17,6 +17,7 @@ import hybridlog as hl
 from hybridlog.sql import topic_view
 from hybridlog_storage.catalog_parts import MAX_PART_BYTES
 from tests.calls import Calls
+from tests.copies import bring
 from tests.imports import ROOT
 from tests.scale.cost import Cost, cost_of
 
@@ -86,8 +87,8 @@ ASKED: dict[str, Work] = {
     "align of a day": lambda store: store.align(
         store.topic("pose").between(*day(4)), ["imu"]
     ).to_arrow(),
-    "first of all": lambda store: store.topic("pose").first(),
-    "last of all": lambda store: store.topic("pose").reverse().first(),
+    "first of all": lambda store: [*store.topic("pose").limit(1)],
+    "last of all": lambda store: [*store.topic("pose").reverse().limit(1)],
     "one recording": lambda store: store.query(["/pose"], ["day00004"]).count(),
     "topics": lambda store: store.topics(),
     "chosen ones": lambda store: [
@@ -151,7 +152,7 @@ CHANGES: dict[str, Work] = {
     "rename back": lambda store: store.rename("fourth", "day00004"),
     "verify of one": lambda store: store.verify(["day00004"]),
     "reindex of one": lambda store: store.rebuild_index(["day00004"]),
-    "repair of one": lambda store: store.repair(["day00004"]),
+    "repair of one": lambda store: store.verify(["day00004"], repair=True),
 }
 
 
@@ -188,10 +189,10 @@ def test_a_recording_is_imported_without_a_look_at_the_others(
     imports, answers, removals = {}, {}, {}
     for count, path in stores.items():
         with hl.open(path, mongo="none") as store:
-            store.import_from(tmp_path / "from-before")
+            bring(store, tmp_path / "from-before")
             asked = store.topic("pose").where("data > 4.5").between(*day(5_001))
             imports[count] = cost_of(
-                store, lambda store=store: store.import_from(tmp_path / "from-more")
+                store, lambda store=store: bring(store, tmp_path / "from-more")
             )
             answers[count] = cost_of(store, lambda asked=asked: asked.count())
             assert asked.count() == MESSAGES - 5

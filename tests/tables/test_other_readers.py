@@ -392,7 +392,7 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
     """A statement for each type of the topic; together they have all of its rows."""
 
     def shown(*arguments: str) -> str:
-        return answer("tables", *arguments, store=many.directory.path).out
+        return answer("info", "--tables", "-t", *arguments, store=many.directory.path).out
 
     for topic in ("/large", "/small", "/changed", "/two"):
         items = json.loads(shown(topic, "--json"))
@@ -417,7 +417,7 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
 def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) -> None:
     place = tmp_path / "it's [1]*?"
     copytree(many.directory.path, place)
-    (item,) = json.loads(answer("tables", "/small", "--json", store=place).out)
+    (item,) = json.loads(answer("info", "--tables", "-t", "/small", "--json", store=place).out)
     assert len(duckdb.sql(item["statement"])) == 160
 
 
@@ -475,7 +475,7 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
     assert listed(place) == listed_by_command(place)
     assert listed(place).keys() == {"first", "live"}
     for work in (
-        lambda: answer("tables", "/a", store=place),
+        lambda: answer("info", "--tables", "-t", "/a", store=place),
         lambda: answer("sql", "select count(*) from a", store=place),
     ):
         path.unlink()
