@@ -25,9 +25,9 @@ from typing import (
 )
 
 from hybridlog.entries import text
-from hybridlog.index import consent, field_indexes
-from hybridlog.index.connection import IndexAddress
-from hybridlog.index.field_indexes import FieldIndex
+from hybridlog.index import consent
+from hybridlog.index.connection import again_if_lost
+from hybridlog.index.of_store import Index
 from hybridlog.maintenance.report import (
     CompactedTopic,
     Progress,
@@ -92,14 +92,11 @@ if TYPE_CHECKING:
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotReport
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
 MENDING_S: Final = 2.0
 """Longest time that a command repairs what it met, after its answer."""
-_CLIENTS_WAIT_S = 600.0
-"""Seconds for which a published MongoDB waits for clients."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by label, name or id, or their entries."""
 _ELSEWHERE: Final = re.compile(r"(?P<host>[^/:]+):(?P<path>.*)")
@@ -236,22 +233,6 @@ def _local(to: str | Path) -> Path:
         raise UsageError(f"{to}: there is no such home directory.") from error
 
 
-def _again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Do something once more if the connection to MongoDB was lost.
-
-    The new connection has started a MongoDB that had ended, and replaced damaged data files.
-    """
-
-    @wraps(work)
-    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
-        try:
-            return work(*args, **options)
-        except ConnectionLostError:
-            return work(*args, **options)
-
-    return tried
-
-
 def _again_if_overtaken(work: Callable[_P, _T]) -> Callable[_P, _T]:
     """Do something again if another process changed the store in the bucket at the same time."""
 
@@ -355,9 +336,9 @@ class Store:
         return self.session.unavailable
 
     @property
-    def index_place(self) -> str:
-        """Description of the index's place; does not connect to MongoDB."""
-        return self.session.connection.place
+    def index(self) -> Index:
+        """Makes and describes the index."""
+        return Index(self.session)
 
     def connect(self) -> Database:
         """Connect to the index and bring it up to date.
@@ -997,111 +978,7 @@ class Store:
             report.entry = self.entry(report.entry.id)
             report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
-    @_again_if_lost
-    def rebuild_index(
-        self,
-        recordings: Names | None = None,
-        progress: Progress | None = None,
-    ) -> list[RecordingEntry]:
-        """Rebuild the index from the segments, recording by recording.
-
-        Args:
-            recordings: The recordings; None for all, which also removes unknown documents.
-            progress: Called after each chunk.
-
-        Returns:
-            The indexed recordings.
-
-        Raises:
-            StoreError: A named recording is being written.
-        """
-        from hybridlog.maintenance.index import StoreIndex
-
-        database = self.database_for("Rebuilding the index", writes=True)
-        if recordings is None:
-            self.catalog.mend()
-        self.refresh()
-        chosen = self.select(recordings)
-        index = StoreIndex(self.directory, self.catalog, database, progress)
-        left = index.rebuild(chosen)
-        if recordings is None:
-            index.remove_rest(self.session.recordings())
-        elif left:
-            raise next(iter(left.values()))
-        self.refresh()
-        return self._now([entry for entry in chosen if entry.id not in left])
-
-    @_again_if_lost
-    def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
-        """Add a MongoDB index on fields of a topic.
-
-        Args:
-            topic: Full name, short name, glob, or `re:` and a regular expression.
-            fields: Fields of the messages, or `_meta.inserted_at` and the like. Questions
-                should give a value or a range of the first one; the others narrow it down.
-
-        Returns:
-            All indexes of the topics.
-
-        Raises:
-            TopicError: A topic or field does not exist.
-            DatabaseError: MongoDB refuses, for example because two fields are arrays.
-        """
-        query = self.topic(topic)
-        database = self.database_for("An index", writes=True)
-        query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
-        field_indexes.add(database, query.topics, fields)
-        self.session.field_indexes = field_indexes.listed(database)
-        return field_indexes.of_topics(database, query.topics)
-
-    @_again_if_lost
-    def remove_index(self, topic: str, *fields: str) -> int:
-        """Drop the index on exactly these fields; return the number of topics.
-
-        Raises:
-            TopicError: A topic does not exist.
-        """
-        query = self.topic(topic)
-        database = self.database_for("An index", writes=True)
-        found = field_indexes.remove(database, query.topics, fields)
-        self.session.field_indexes = field_indexes.listed(database)
-        return found
-
-    @_again_if_lost
-    def indexes(self, *topics: str) -> list[FieldIndex]:
-        """The indexes on fields, of these topics or of all."""
-        database = self.database_for("Indexes")
-        names = self.topic(*topics).topics if topics else self.topics()
-        return field_indexes.of_topics(database, names)
-
-    @_again_if_lost
-    def index_address(self) -> IndexAddress:
-        """The address of the index for other programs, after it was brought up to date.
-
-        The embedded MongoDB keeps its address, waits ten minutes for the first client, and runs
-        as long as one is connected.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-        """
-        database = self.connect()
-        return IndexAddress(self.session.connection.address(_CLIENTS_WAIT_S), database.name)
-
-    @_again_if_lost
-    def index_contents(self) -> list[tuple[str, str, int]]:
-        """Each topic with the MongoDB collection of its documents, and their number there."""
-        database = self.database_for("The contents of the index")
-        places = self.session.places("The contents of the index").of(self.topics())
-        known = [place for place in places.values() if place.is_listed]
-        filters = [(place.collection, place.documents()) for place in known]
-        counts = database.count_each([one for one in filters if one[1]])
-        shared = iter(counts)
-        return [
-            (place.topic, collection, next(shared) if own else database.count(collection))
-            for place, (collection, own) in zip(known, filters, strict=True)
-        ]
-
-    @_again_if_lost
+    @again_if_lost
     @of_one_moment
     def sizes(self, recordings: Names | None = None) -> Sizes:
         """Bytes of recordings and topics in segments, tables and MongoDB.
@@ -1123,23 +1000,6 @@ class Store:
         places = None if database is None else self.session.places("Sizes")
         return sizes_of(self.directory, self.catalog, entries, database, places)
 
-    @_again_if_lost
-    def topic_place(self, topic: str) -> TopicPlace:
-        """The place of a topic's index documents in MongoDB.
-
-        Args:
-            topic: Full name, or an unambiguous short one.
-
-        Returns:
-            Has `collection`, its name, and `documents(begin, end)`, a filter for the
-            documents of the topic with log times in `[begin, end)`, ns.
-
-        Raises:
-            TopicError: The topic does not exist.
-        """
-        (name, *_) = self.topic(topic).topics
-        return self.session.places("The place of a topic").of([name])[name]
-
     @overload
     def verify(
         self,
@@ -1158,7 +1018,7 @@ class Store:
         repair: Literal[True],
     ) -> list[Repaired]: ...
 
-    @_again_if_lost
+    @again_if_lost
     def verify(
         self,
         recordings: Names | None = None,
@@ -1207,7 +1067,7 @@ class Store:
                 self.directory,
                 self.catalog,
                 database,
-                self.session.recordings() if recordings is None else self._now(chosen),
+                self.session.recordings() if recordings is None else self.session.as_now(chosen),
                 progress=progress,
             )
             self.refresh()
@@ -1417,38 +1277,44 @@ class Store:
         finally:
             self.session.catch_up()
 
-    def rename(self, recording: str, name: str) -> RecordingEntry:
-        """Rename a recording; its directory gets a label made from the name."""
-        return self._edit(recording, journal.event(journal.RENAMED, name=text(name)))
+    @_again_if_overtaken
+    def edit(
+        self,
+        recording: str | RecordingEntry,
+        *,
+        name: str | None = None,
+        note: str | None = None,
+        tag: Mapping[str, str] | None = None,
+        untag: Iterable[str] = (),
+    ) -> RecordingEntry:
+        """Change what is said about a recording.
 
-    def tag(self, recording: str, **tags: str) -> RecordingEntry:
-        """Set tags of a recording; existing keys get the new values."""
-        lines = [journal.event(journal.TAGGED, key=text(k), value=text(v)) for k, v in tags.items()]
-        return self._edit(recording, *lines)
-
-    def untag(self, recording: str, *keys: str) -> RecordingEntry:
-        """Remove tags of a recording.
+        Args:
+            recording: Its label, name or id, or its entry.
+            name: Another name; its directory gets a label made from it.
+            note: A note, which `info` shows.
+            tag: Tags to set; keys that exist get the new values.
+            untag: Keys of tags to remove.
 
         Raises:
-            UsageError: A tag does not exist.
+            UsageError: A tag to remove does not exist.
         """
-        (entry,) = self.select([recording])
-        for key in keys:
-            if key not in entry.tags:
-                known = ", ".join(sorted(entry.tags)) or "none"
-                raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
-        return self._edit(entry, *[journal.event(journal.UNTAGGED, key=key) for key in keys])
-
-    def note(self, recording: str, note: str) -> RecordingEntry:
-        """Write a note about a recording; `info` shows it."""
-        return self._edit(recording, journal.event(journal.NOTED, text=text(note)))
-
-    @_again_if_overtaken
-    def _edit(self, recording: str | RecordingEntry, *lines: journal.Event) -> RecordingEntry:
         from hybridlog.maintenance import edit, index
 
         self.session.catch_up()
         (entry,) = self.select([recording])
+        lines = []
+        for key in [untag] if isinstance(untag, str) else untag:
+            if key not in entry.tags:
+                known = ", ".join(sorted(entry.tags)) or "none"
+                raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
+            lines.append(journal.event(journal.UNTAGGED, key=key))
+        for key, value in (tag or {}).items():
+            lines.append(journal.event(journal.TAGGED, key=text(key), value=text(value)))
+        if note is not None:
+            lines.append(journal.event(journal.NOTED, text=text(note)))
+        if name is not None:
+            lines.append(journal.event(journal.RENAMED, name=text(name)))
         edit.append(self.directory, self.catalog, entry, lines)
         connected = self.session.connected
         if connected is not None and self.session.connection.may_write:
@@ -1636,9 +1502,3 @@ class Store:
     def _check_on_disk(self) -> None:
         if self.directory.is_remote:
             self.directory.check_writable()
-
-    def _now(self, entries: Sequence[RecordingEntry]) -> list[RecordingEntry]:
-        """Recordings as they are now, oldest first; those that are gone are left out."""
-        snapshot = self.session.snapshot()
-        places = sorted(snapshot.by_id.get(entry.id, -1) for entry in entries)
-        return [self.session.entry_of(snapshot.summaries[n]) for n in places if n >= 0]

@@ -200,13 +200,13 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
     with hl.open(tmp_path / "s", create=True) as store:
         report = store.record(packed, settings=SegmentSettings(segment_size=100))
         assert report.entry.segments > 3
-        store.rename("drive", "other name")
+        store.edit("drive", name="other name")
         assert listed(store.attachments("other-name")) == ATTACHMENTS
     for derived in ("catalog", "mongod", "tables"):
         shutil.rmtree(tmp_path / "s" / derived, ignore_errors=True)
         (tmp_path / "s" / derived).unlink(missing_ok=True)
     with hl.open(tmp_path / "s") as store:
-        store.rebuild_index()
+        store.index.rebuild()
         assert store.verify().findings == []
         (entry,) = store.recordings()
         assert (entry.attachments, entry.metadata_records) == (5, 3)

@@ -59,7 +59,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         content = bytearray(segment.read_bytes())
         content[chunk.offset + chunk.length - 1] ^= 1
         segment.write_bytes(content)
-        opened.rebuild_index()
+        opened.index.rebuild()
         opened.close()
         yield path
 

@@ -1049,10 +1049,10 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
 def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path: Path) -> None:
     copied(recorded, tmp_path / "store")
     with hl.open(tmp_path / "store") as store:
-        store.rename("robot", "Tuesday")
-        store.tag("Tuesday", place="lab", weather="rain")
-        store.untag("Tuesday", "weather")
-        store.note("Tuesday", "the left wheel squeaks")
+        store.edit("robot", name="Tuesday")
+        store.edit("Tuesday", tag={"place": "lab", "weather": "rain"})
+        store.edit("Tuesday", untag=["weather"])
+        store.edit("Tuesday", note="the left wheel squeaks")
         entry = store.mark("Tuesday", "+2s", "bump", {"how": "hard"})
     second = FormatReader(tmp_path / "store")
     recording = second.recording(entry.label)

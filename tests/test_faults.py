@@ -568,7 +568,7 @@ def test_a_segment_that_is_lost(
         assert {f.recording for f in findings} == {"short"}
         assert any(path.name in f.place + f.problem for f in findings)
         # And it does not become right by making the index again.
-        opened.rebuild_index()
+        opened.index.rebuild()
         check_what_is_missing(opened, said, {number})
         assert opened.verify().findings
     run("verify", store=store.directory.path, code=1)
@@ -589,7 +589,7 @@ def test_a_recording_without_any_segment_is_told(store: hl.Store, said: Counter[
         (entry,) = opened.recordings()
         assert (entry.status, entry.messages) == ("damaged", 0)
         assert lost(entry) == topics_of(said)
-        opened.rebuild_index()
+        opened.index.rebuild()
         (entry,) = opened.recordings()
         assert (entry.status, lost(entry)) == ("damaged", topics_of(said))
 
@@ -841,7 +841,7 @@ def test_an_altered_index_is_found_and_mended(
     with pymongo.MongoClient[dict[str, Any]](uri) as client:
         alter(client[store.database.name])
     assert store.verify().findings
-    store.rebuild_index()
+    store.index.rebuild()
     assert store.verify().findings == []
 
 
@@ -1018,8 +1018,8 @@ def test_reindex_does_not_cost_a_running_recording_its_index(
         store.record(short)
     with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
         with pytest.raises(StoreError, match="being written"):
-            store.rebuild_index(["robot"])
-        assert [entry.label for entry in store.rebuild_index()] == ["short"]
+            store.index.rebuild(["robot"])
+        assert [entry.label for entry in store.index.rebuild()] == ["short"]
         assert content(fetched(store, "short")) == said
     (report,) = writing.result
     assert not isinstance(report, Exception), report
@@ -1050,7 +1050,7 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
                     else:
                         assert query.count() == said.total(), (label, name)
 
-        store.rebuild_index(progress=ask)
+        store.index.rebuild(progress=ask)
         assert asked > 14
     assert store.verify().findings == []
 

@@ -194,7 +194,7 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
         store.record(bag, name="again", again=True)
 
     attempt(False, look, fetch, ask)
-    attempt(False, lambda store: store.verify(), lambda store: store.rebuild_index())
+    attempt(False, lambda store: store.verify(), lambda store: store.index.rebuild())
     attempt(True, record_live, record, look, fetch)
     attempt(False, lambda store: store.remove("small"))
     attempt(False, look)

@@ -115,7 +115,7 @@ def test_a_renamed_directory_changes_the_label_alone(place: Path, uri: str) -> N
         assert not store.repairs.indexed
         assert answers(store) == answers(store, "other") == answers(store, before.id) == right()
         assert not store.verify().findings
-        store.rebuild_index()
+        store.index.rebuild()
         assert answers(store) == right()
 
 
@@ -137,7 +137,7 @@ def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, co
             assert answers(store) == answers(store, copy) == right()
             (finding,) = store.verify().findings
             assert (finding.recording, "copy of one" in finding.problem) == (copy, True)
-            store.rebuild_index()
+            store.index.rebuild()
             assert answers(store) == right()
             done = store.verify(repair=True)
             assert [one.is_cured for one in done if one.recording == copy] == [False]
@@ -304,19 +304,19 @@ def test_a_store_from_another_host_asks_first(place: Path, uri: str) -> None:
 
 def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
     with hl.open(place, mongo=uri) as store:
-        entry = store.rename("one", "second floor")
+        entry = store.edit("one", name="second floor")
         assert (entry.label, entry.name) == ("second-floor", "second floor")
-        store.tag("second-floor", b="2", a="3")
-        store.untag("second-floor", "b")
-        store.note("second-floor", "the wheel slipped")
+        store.edit("second-floor", tag={"b": "2", "a": "3"})
+        store.edit("second-floor", untag=["b"])
+        store.edit("second-floor", note="the wheel slipped")
         with pytest.raises(UsageError, match="no tag 'x'"):
-            store.untag("second-floor", "x")
+            store.edit("second-floor", untag=["x"])
         store.mark("second-floor", "+10s", "slip", {"kind": "odd"})
         store.mark("second-floor", "110.5", "after")
         with pytest.raises(TimeError):
             store.mark("second-floor", "never", "x")
         with pytest.raises(TopicError):
-            store.tag("one", a="1")
+            store.edit("one", tag={"a": "1"})
 
     def check(store: hl.Store) -> None:
         (found,) = store.recordings()
@@ -344,7 +344,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             mirror = database.find_one("hybridlog.recordings", {})
             assert mirror is not None
             assert (mirror["name"], mirror["tags"]) == ("second floor", {"a": "3"})
-        store.rebuild_index()
+        store.index.rebuild()
         check(store)
     shutil.rmtree(place / "catalog")
     with hl.open(place, mongo=uri) as store:
@@ -366,7 +366,7 @@ def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="without --at"):
             store.mark(recording.id, "100", "x")
         with pytest.raises(StoreError, match="being written"):
-            store.tag(recording.id, a="1")
+            store.edit(recording.id, tag={"a": "1"})
         with pytest.raises(StoreError, match="being written"):
             store.remove(recording.id)
 
@@ -478,10 +478,10 @@ def content_of(store: Path, recording: str) -> dict[str, bytes]:
 FOLDER = files.folder
 CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
     "rm": lambda store, one: store.remove(one),
-    "tag": lambda store, one: store.tag(one, b="2"),
-    "untag": lambda store, one: store.untag(one, "a"),
-    "note": lambda store, one: store.note(one, "seen"),
-    "rename": lambda store, one: store.rename(one, "new"),
+    "tag": lambda store, one: store.edit(one, tag={"b": "2"}),
+    "untag": lambda store, one: store.edit(one, untag=["a"]),
+    "note": lambda store, one: store.edit(one, note="seen"),
+    "rename": lambda store, one: store.edit(one, name="new"),
     "mark": lambda store, one: store.mark(one, "start", "seen"),
     "compact": lambda store, one: store.compact([one], ["/scan"], drop_mcap=True),
     "repair": lambda store, one: store.verify([one], repair=True),
@@ -572,7 +572,7 @@ def test_a_command_finds_a_recording_whose_label_goes_around(
                 exchange.steps |= {again}
                 with monkeypatch.context() as patch:
                     patch.setattr(files, "folder", exchange.folder)
-                    assert store.tag(one, b="2").id == one
+                    assert store.edit(one, tag={"b": "2"}).id == one
             assert content_of(place, other) == others, (step, again)
             assert content_of(place, one) != before, (step, again)
             if max(exchange.steps) >= 0:
@@ -667,13 +667,13 @@ def test_an_index_is_made_of_the_recording_that_was_chosen(
     with hl.open(place, mongo=uri) as store:
         one = store.entry("one").id
         other = store.record(make_log(tmp_path / "b.mcap", 500), name="b").entry
-        store.rename("one", "a")
+        store.edit("one", name="a")
         for step in range(12):
             exchange = Exchange(place, swap, 40 * step, after=False)
             turns = IndexState(store.connect()).of([one[:16], other.key])
             with monkeypatch.context() as patch:
                 patch.setattr(files, "folder", exchange.folder)
-                assert [entry.id for entry in store.rebuild_index([one])] == [one]
+                assert [entry.id for entry in store.index.rebuild([one])] == [one]
             found = IndexState(store.connect()).of([one[:16], other.key])
             assert found[other.key].turn == turns[other.key].turn, step
             assert found[one[:16]].turn > turns[one[:16]].turn, step

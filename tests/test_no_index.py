@@ -72,9 +72,9 @@ def test_index_documents_that_are_not_there_are_no_empty_answer(store: hl.Store)
 
 def test_every_rebuild_keeps_it(store: hl.Store) -> None:
     assert store.verify().findings == []
-    store.rebuild_index()
+    store.index.rebuild()
     assert documents(store) == INDEXED
-    store.rebuild_index(["log"])
+    store.index.rebuild(["log"])
     assert documents(store) == INDEXED
     store.database_for("this test").drop_all()
     path = store.directory.path
@@ -97,7 +97,7 @@ def test_what_has_no_documents_is_not_missing_among_those_of_others(
         store.record(log, name="whole")
         store.record(log, name="part", again=True, no_index=matcher(["re:.*signal[23]"]))
         indexed = calls(StoreIndex, "catch_up")
-        store.rebuild_index()
+        store.index.rebuild()
         assert sorted(label for _, label in indexed) == ["part", "whole"]
         assert store.verify().findings == []
 
@@ -110,7 +110,7 @@ def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
     database.replace(collection_of(LEFT_OUT[0]), {"_id": stray["_id"]}, stray)
     (finding,) = store.verify().findings
     assert "1 index documents, 0 messages" in finding.problem
-    store.rebuild_index()
+    store.index.rebuild()
     assert documents(store) == INDEXED
     assert store.verify().findings == []
 

@@ -184,7 +184,7 @@ def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> No
     assert store.verify().findings == []
     before = dump(store)
     assert sum(map(len, before.values())) > 150_000
-    store.rebuild_index()
+    store.index.rebuild()
     assert dump(store) == before
 
 

@@ -228,7 +228,7 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
     data[600] ^= 4
     file(store, 1).write_bytes(data)
     with hl.open(store) as opened:
-        opened.rebuild_index()
+        opened.index.rebuild()
         entry = opened.entry("one")
         lost = sum(row["count"] for row in entry.end["losses"])
         assert (entry.status, lost > 0) == ("damaged", True)

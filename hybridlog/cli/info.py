@@ -168,7 +168,7 @@ def _show(store: Store, given: _Given) -> None:
             output.say()
         _print_recording(
             entry,
-            store.index_place,
+            store.session.connection.place,
             *extras[entry.id],
             videos=videos.get(entry.id, {}),
             drawn=drawn.get(entry.id),

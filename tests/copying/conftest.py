@@ -39,8 +39,8 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.compact(["compacted"])
         store.compact(["dropped"], drop_mcap=True)
         expire(store, "expired")
-        store.tag("noted", place="field")
-        store.note("noted", "it rained")
+        store.edit("noted", tag={"place": "field"})
+        store.edit("noted", note="it rained")
         store.mark("noted", "start", "here")
         store.pin("noted", reason="to keep")
     return path / "store"

@@ -109,7 +109,7 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     assert robot.speaker.stopped == 1
     # The index is disposable, and so is the catalog's ledger.
     before = [r.end for r in store.recordings()]
-    store.rebuild_index()
+    store.index.rebuild()
     assert [r.end for r in store.recordings()] == before
     assert [m.decode().data for m in store.topic("/chatter")] == [str(n) for n in range(100)]
 
@@ -147,7 +147,7 @@ def test_payloads_step_down_and_fields_stay(store: hl.Store, limit: Limit) -> No
     assert [d["id"] for d in documents] == list(range(1, 61))
     assert {d["data"]["n"] for d in documents} == {9000}
     assert store.topic("/cam").where("near > 5 and near <= 10").count() == 10
-    store.rebuild_index()
+    store.index.rebuild()
     assert list(store.topic("/cam").documents()) == documents
     store.verify()
 

@@ -173,7 +173,7 @@ def test_columns_follow_a_recording(compacted: hl.Store, tmp_path: Path) -> None
             for p in compacted.directory.path.rglob("*.parquet")
             if "payloads" in p.parts
         }
-        store.rename("log", "new")
+        store.edit("log", name="new")
         assert store.recordings()[0].payloads == compacted.recordings()[0].payloads
         assert store.verify().findings == []
         store.remove("new")

@@ -102,7 +102,7 @@ def test_index_and_tables_are_made_again_from_columns(plain: Path, copy: Path) -
     with hl.open(copy) as store:
         store.compact(drop_mcap=True)
         shutil.rmtree(copy / "tables")
-        store.rebuild_index()
+        store.index.rebuild()
         assert store.verify().findings == []
         documents = [d["ranges"]["max"] for d in store.topic("/scan").documents()]
         with hl.open(plain) as other:
@@ -399,7 +399,7 @@ def edited(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl
         store.compact(topics=["scan"], drop_mcap=True)
         store.compact(topics=["cloud"])
         store.compact(drop_mcap=True)
-        store.tag("log", place="lab")
+        store.edit("log", tag={"place": "lab"})
         store.mark("log", BASE + STEP, "here")
         yield store
 

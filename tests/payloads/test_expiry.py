@@ -198,8 +198,8 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
     with hl.open(other, create=True, mongo="none") as store:
         bring(store, copy)
         assert store.verify().findings == []
-        store.rename("log", "new")
-        store.rename("new", "log")
+        store.edit("log", name="new")
+        store.edit("new", name="log")
     assert answers(other) == right
     (copy / "recordings" / "log" / journal.JOURNAL).unlink()
     with hl.open(copy, mongo="none") as store:

@@ -141,8 +141,8 @@ def test_fields_come_first_and_payloads_go_here(
         assert len(fields) < len(right["recorded"])
         assert fields.items() <= right["recorded"].items()
         with hl.open(address) as there:
-            there.tag("recorded", seen="yes")
-            there.rename("noted", "known")
+            there.edit("recorded", tag={"seen": "yes"})
+            there.edit("noted", name="known")
             assert not there.verify().findings
         size = sum(path.stat().st_size for path in (here / "recordings").glob("*/**/*.*"))
         report = store.copy(address, options=CopyOptions(then_expire=True, limit_rate=2 * size))

@@ -105,9 +105,9 @@ def test_requests(published: str, proxy: Proxy) -> None:
 def test_edits(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "short-0"))
     with hl.open(address) as store:
-        store.tag("run", who="me")
-        store.note("run", "good")
-        assert store.rename("run", "A new run").label == "A-new-run"
+        store.edit("run", tag={"who": "me"})
+        store.edit("run", note="good")
+        assert store.edit("run", name="A new run").label == "A-new-run"
         store.remove("short-0")
         assert [one.label for one in store.recordings()] == ["A-new-run"]
     files.mounted.clear()
@@ -127,9 +127,9 @@ def test_changes_keep_their_order(here: Path, address: str, proxy: Proxy) -> Non
     with hl.open(address) as store:
         bucket, name = Bucket(address), f"recordings/{store.entry('run').id}/journal.1"
         bucket.create(name, b"?")
-        store.tag("run", x="1")
+        store.edit("run", tag={"x": "1"})
         bucket.delete([name])
-        store.tag("run", x="2")
+        store.edit("run", tag={"x": "2"})
     files.mounted.clear()
     with hl.open(address) as store:
         assert store.entry("run").tags["x"] == "2"
@@ -164,13 +164,13 @@ def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
         return ""
 
     proxy.spoil = meanwhile
-    one.tag("run", a="1")
+    one.edit("run", tag={"a": "1"})
     assert not is_first
     proxy.reset()
     proxy.old_lists = {}
     assert one.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
     other("tag", "short-0", "c=3")
-    one.tag("short-0", d="4")  # the list that it sees is from before
+    one.edit("short-0", tag={"d": "4"})  # the list that it sees is from before
     proxy.reset()
     files.mounted.clear()
     with hl.open(address) as last:
@@ -240,7 +240,7 @@ def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Prox
         assert isinstance(directory, RemoteDirectory)
         gone = store.entry("short-0").id
         store.remove("short-0")
-        store.tag("run", a="b")
+        store.edit("run", tag={"a": "b"})
         directory.source.bucket.create("recordings/x/000000.mcap", b"of a copy")
         now = directory.source.bucket.now()
         assert store.tidy() == (0, 0)

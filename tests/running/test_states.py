@@ -234,7 +234,7 @@ def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
     steps = iter(store.all_topics())
     first = next(steps)
     with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
-        other.rename(LABEL, "other")
+        other.edit(LABEL, name="other")
     assert rows([first, *steps]) == sent(known.of())
     assert store.topic("arm").in_recording("other").count() == len(known.of("/arm"))
     assert [r.label for r in store.summaries()] == ["other"]

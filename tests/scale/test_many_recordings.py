@@ -146,12 +146,12 @@ def test_opening_asks_once(stores: dict[int, Path]) -> None:
 
 
 CHANGES: dict[str, Work] = {
-    "tag": lambda store: store.tag("day00004", place="hall"),
-    "note": lambda store: store.note("day00004", "all quiet"),
-    "rename": lambda store: store.rename("day00004", "fourth"),
-    "rename back": lambda store: store.rename("fourth", "day00004"),
+    "tag": lambda store: store.edit("day00004", tag={"place": "hall"}),
+    "note": lambda store: store.edit("day00004", note="all quiet"),
+    "rename": lambda store: store.edit("day00004", name="fourth"),
+    "rename back": lambda store: store.edit("fourth", name="day00004"),
     "verify of one": lambda store: store.verify(["day00004"]),
-    "reindex of one": lambda store: store.rebuild_index(["day00004"]),
+    "reindex of one": lambda store: store.index.rebuild(["day00004"]),
     "repair of one": lambda store: store.verify(["day00004"], repair=True),
 }
 
@@ -226,7 +226,7 @@ def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) 
     with hl.open(stores[MANY], mongo="none") as store:
         asked = store.topic("pose").where("data > 4.5")
         assert asked.count() == MANY * (MESSAGES - 5)
-        store.tag("day00004", place="roof")
+        store.edit("day00004", tag={"place": "roof"})
         cost = cost_of(store, asked.count)
     assert cost.looks < 20
     assert not [path for path in cost.opened if path.endswith(".parquet")]
@@ -282,7 +282,7 @@ def test_bounds_leave_out_recordings_that_cannot_match(stores: dict[int, Path]) 
         assert asked[:3] == [{f"day{MANY - 1:05d}"}, {"day00012"}, {"day00001"}]
         for cost in costs[-3:]:
             assert {*cost.opened} <= {str(store.directory.path)}
-        store.tag("day00012", place="hall")
+        store.edit("day00012", tag={"place": "hall"})
         assert imu.where("data in [1205, 3]").count() == 2
 
 
@@ -319,7 +319,7 @@ import hybridlog as hl
 with hl.open(sys.argv[1]) as store:
     pose = store.topic("pose")
     print(pose.count(), pose.where("data > 4.5").count(), sum(1 for _ in pose))
-    print(len(pose.to_pandas()), len(store.rebuild_index()), len(store.verify().findings))
+    print(len(pose.to_pandas()), len(store.index.rebuild()), len(store.verify().findings))
 """
 
 

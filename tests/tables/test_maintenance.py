@@ -145,10 +145,10 @@ def test_what_is_gone_has_no_tables_without_mongodb(few: hl.Store, tmp_path: Pat
 
 def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
     before = contents(few)
-    few.rebuild_index()
+    few.index.rebuild()
     assert contents(few) == before
     shutil.rmtree(few.directory.path / TABLES)
-    few.rebuild_index()
+    few.index.rebuild()
     assert contents(few) == before
 
 

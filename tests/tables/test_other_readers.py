@@ -452,8 +452,8 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
     other = write_log(tmp_path / "other.mcap", [(BASE, "/a", payload(0))])
     changes: list[Callable[[hl.Store], object]] = [
         lambda store: store.record(other, name="other"),
-        lambda store: store.tag("log", robot="7", place="hall"),
-        lambda store: store.rename("log", "first"),
+        lambda store: store.edit("log", tag={"robot": "7", "place": "hall"}),
+        lambda store: store.edit("log", name="first"),
         lambda store: store.mark("first", BASE, "here"),
         lambda store: store.remove("other"),
         lambda store: store.catalog.rebuild() or store.refresh(),

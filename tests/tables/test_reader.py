@@ -279,7 +279,7 @@ def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables, mongo
     assert recorded.verify().findings == []
     assert count(recorded, tables, "/large") == want
     with hl.open(recorded.directory.path, mongo=mongo) as indexed:
-        indexed.rebuild_index()
+        indexed.index.rebuild()
         assert compare(indexed) == 1800
 
 
