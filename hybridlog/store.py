@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import secrets
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial, wraps
@@ -95,7 +93,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
-MENDING_S: Final = 2.0
+_MENDING_S: Final = 2.0
 """Longest time that a command repairs what it met, after its answer."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by label, name or id, or their entries."""
@@ -185,6 +183,23 @@ def open_store(
 
 
 @contextmanager
+def receiving(store: Store) -> Iterator[DirectoryPlace]:
+    """A store as a place that recordings are copied to."""
+    from hybridlog.maintenance import tables
+    from hybridlog.maintenance.places import DirectoryPlace
+
+    def known() -> dict[str, str]:
+        return {one.id: one.label for one in store.session.snapshot().summaries}
+
+    store.session.catch_up()
+    place = DirectoryPlace(store.directory, known)
+    yield place
+    store.session.catch_up()
+    for entry in store.select(place.published):  # so that other readers find them
+        tables.make(store.directory, entry, is_new=True)
+
+
+@contextmanager
 def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place]:
     """The place that recordings of a store are copied to."""
     from hybridlog.maintenance.ssh import is_ssh, ssh_place
@@ -206,7 +221,7 @@ def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place
     path = _local(to)
     if not source.is_remote and source.path.resolve() in path.resolve().parents:
         raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
-    with open_store(path, create=True) as other, other.receiving() as place:
+    with open_store(path, create=True) as other, receiving(other) as place:
         yield place
 
 
@@ -331,11 +346,6 @@ class Store:
         return self.session.database
 
     @property
-    def without_database(self) -> HybridlogError | None:
-        """The reason why MongoDB is unavailable; None while that is unknown."""
-        return self.session.unavailable
-
-    @property
     def index(self) -> Index:
         """Makes and describes the index."""
         return Index(self.session)
@@ -349,19 +359,6 @@ class Store:
         """
         return self.session.connect()
 
-    def database_for(self, purpose: str, *, writes: bool = False) -> Database:
-        """The index.
-
-        Args:
-            purpose: The activity, for messages.
-            writes: True if it changes the index.
-
-        Raises:
-            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
-                reason.
-        """
-        return self.session.database_for(purpose, writes=writes)
-
     def refresh(self) -> None:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
         self.session.invalidate()
@@ -374,7 +371,7 @@ class Store:
         """
         return self.session.at_one_moment()
 
-    def mend(self, seconds: float = MENDING_S) -> None:
+    def mend(self, seconds: float = _MENDING_S) -> None:
         """Repair what questions met: recordings after a crash, missing and damaged tables.
 
         Questions repair nothing: they answer from what is whole. `close` calls this.
@@ -394,27 +391,6 @@ class Store:
         if self._sql is not None:
             self._sql.close()
         self.session.close()
-
-    @contextmanager
-    def mended_meanwhile(self, every: float = MENDING_S) -> Iterator[None]:
-        """A block during which another thread calls `mend` again and again.
-
-        Args:
-            every: Seconds between two calls.
-        """
-        ended = threading.Event()
-
-        def mend() -> None:
-            while not ended.wait(every):
-                self.mend(math.inf)
-
-        thread = threading.Thread(target=mend, name="hybridlog-mend", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
 
     # Recordings and topics.
 
@@ -474,13 +450,6 @@ class Store:
     def summaries(self) -> list[RecordingSummary]:
         """All recordings in short, oldest first; much faster than `recordings`."""
         return list(self.session.look().summaries)
-
-    @of_one_moment
-    def is_one(self, names: Sequence[str]) -> bool:
-        """True if a choice by these names is of one recording, whatever the store holds."""
-        from hybridlog.query.choosing import is_exact
-
-        return len(names) == 1 and is_exact(self.session, names[0])
 
     @of_one_moment
     def entry(self, recording: str) -> RecordingEntry:
@@ -844,7 +813,8 @@ class Store:
         """A query about a topic, with its share of the fields, which is taken out of them."""
         query = self.topic(name) if isinstance(name, str) else name
         if query.session is not self.session:
-            raise UsageError(f"A query of {query.directory} cannot be joined with another store's.")
+            place = query.session.directory.place
+            raise UsageError(f"A query of {place} cannot be joined with another store's.")
         for key in [*fields]:
             if key == name or self.topic(key).topics == query.topics:
                 query = query.fields(*fields.pop(key))
@@ -1168,30 +1138,6 @@ class Store:
         finally:
             self.refresh()
 
-    def tidy(self, *, dry_run: bool = False) -> tuple[int, int]:
-        """Delete what a store in a bucket does not need any more.
-
-        That is what no list of the last hour names, such as files of removed recordings, if it
-        is a week old: what is younger may belong to a copy that is under way.
-
-        Args:
-            dry_run: True to delete nothing.
-
-        Returns:
-            Number and bytes of the objects.
-
-        Raises:
-            UsageError: The store is a directory, which has nothing of the kind.
-        """
-        from hybridlog_storage.remote.store import RemoteDirectory
-
-        if not isinstance(self.directory, RemoteDirectory):
-            raise UsageError("A store on a disk is tidy: `tidy` is for stores in buckets.")
-        found = self.directory.unneeded()
-        if not dry_run:
-            self.directory.source.bucket.delete([one.name for one in found])
-        return len(found), sum(one.size for one in found)
-
     @_again_if_overtaken
     def pin(
         self,
@@ -1471,22 +1417,6 @@ class Store:
             self.session.catch_up(recording)
         report.freed_bytes += expired.freed_bytes
         report.problems += expired.problems
-
-    @contextmanager
-    def receiving(self) -> Iterator[DirectoryPlace]:
-        """This store as a place that recordings are copied to."""
-        from hybridlog.maintenance import tables
-        from hybridlog.maintenance.places import DirectoryPlace
-
-        def known() -> dict[str, str]:
-            return {one.id: one.label for one in self.session.snapshot().summaries}
-
-        self.session.catch_up()
-        place = DirectoryPlace(self.directory, known)
-        yield place
-        self.session.catch_up()
-        for entry in self.select(place.published):  # so that other readers find them
-            tables.make(self.directory, entry, is_new=True)
 
     def _chosen(self, recordings: Choice | Names | None) -> Sequence[RecordingSummary]:
         """Recordings that are to be copied."""

@@ -160,7 +160,7 @@ def test_without_mongodb_the_same_are_chosen(store: hl.Store) -> None:
     asked = {"where": "scan: n > 3", "tag": "robot"}
     with hl.open(store.directory.path, mongo="mongodb://localhost:1/?timeoutMS=20") as away:
         assert list(away.recordings(**asked).labels) == ["monday-2", "tuesday"]
-        assert away.without_database is None, "it was not even asked"
+        assert away.session.unavailable is None, "it was not even asked"
 
 
 @pytest.mark.parametrize(

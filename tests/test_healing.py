@@ -331,7 +331,7 @@ def test_a_connection_about_some_recordings_is_made_again(store: Path) -> None:
         opened.session.connect([opened.select(["one"])[0]])
         kill_mongod(store)
         assert opened.verify().index
-        assert opened.without_database is None
+        assert opened.session.unavailable is None
 
 
 @pytest.mark.parametrize("waits", [False, True])

@@ -241,10 +241,10 @@ def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
     for _ in range(2):
         with hl.open(copy, mongo=uri) as store:
             assert store.database is None
-            assert "copy" in str(store.without_database)
-            assert "--new-id" in str(store.without_database)
+            assert "copy" in str(store.session.unavailable)
+            assert "--new-id" in str(store.session.unavailable)
             with pytest.raises(DatabaseError, match="--moved"):
-                store.topic("/n") if store.topics() else store.database_for("This")
+                store.topic("/n") if store.topics() else store.session.database_for("This")
         with pytest.raises(StoreError, match="copy"):
             hl.open(copy, mongo=uri, require_database=True)
     assert documents(uri) == before
@@ -296,7 +296,7 @@ def test_a_store_from_another_host_asks_first(place: Path, uri: str) -> None:
         state.claim({"id": mark["id"], "host": "another", "path": "/data/store"})
     with hl.open(place, mongo=uri) as store:
         with pytest.raises(DatabaseError, match="/data/store on another"):
-            store.database_for("This")
+            store.session.database_for("This")
         assert store.topic("/n").count() == COUNT  # by topic and time it goes on
         store.session.take_over()
         assert answers(store) == right()
@@ -387,7 +387,7 @@ def test_a_removal_that_was_announced_is_finished(place: Path, uri: str) -> None
         assert store.repairs.removed == ["one"]
         assert not store.recordings()
         assert list((place / "recordings").iterdir()) == []
-        database = store.database_for("This")
+        database = store.session.database_for("This")
         assert database.count("n", {}) == 0
         assert IndexState(database).of() == {}
 

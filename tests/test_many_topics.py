@@ -57,7 +57,7 @@ def least(value: int) -> dict[str, object]:
 
 
 def database_of(store: hl.Store) -> Database:
-    return store.database_for("this test")
+    return store.session.database_for("this test")
 
 
 def documents(store: hl.Store) -> Counter[str]:

@@ -175,7 +175,7 @@ def test_an_index_that_others_change_is_not_believed(path: Path, tmp_path: Path)
             other.index.rebuild(["log 38"])
             assert query.count() == 10
             key = other.select(["log 39"])[0].key
-            database = other.database_for("the test")
+            database = other.session.database_for("the test")
             state = {"$set": {"index.state": "clearing"}}
             database.update("hybridlog.recordings", {"_id": key}, state)
             database.update("hybridlog.store", {"_id": "turn"}, {"$inc": {"turn": 1}})
@@ -188,7 +188,7 @@ def test_an_index_that_others_change_is_not_believed(path: Path, tmp_path: Path)
 
 def test_an_index_that_was_dropped_is_not_missed(path: Path) -> None:
     with hl.open(path, require_database=True) as store:
-        store.database_for("the test").drop_index("t", [("x", 1)])
+        store.session.database_for("the test").drop_index("t", [("x", 1)])
         assert store.topic("/t").where("x >= 38").count() == 10
         store.index.add("/t", "x")
         assert store.index.remove("/t", "s") == 1

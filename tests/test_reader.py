@@ -770,7 +770,7 @@ def test_a_topic_without_a_definition_makes_no_table(tmp_path: Path) -> None:
 def test_by_time_without_mongodb(base: Path, store: hl.Store, robot: Truth) -> None:
     with hl.open(base / "store", mongo=NOWHERE) as away:
         assert away.database is None
-        assert isinstance(away.without_database, DatabaseError)
+        assert isinstance(away.session.unavailable, DatabaseError)
         assert [r.id for r in away.recordings()] == [r.id for r in store.recordings()]
         assert [r.messages for r in away.recordings()] == [r.messages for r in store.recordings()]
         assert [r.span for r in away.recordings()] == [r.span for r in store.recordings()]

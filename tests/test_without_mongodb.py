@@ -99,7 +99,7 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
     ):
         with pytest.raises(DatabaseError, match=r"without MongoDB.*--mongo embedded"):
             ask()
-    assert isinstance(store.without_database, WithoutMongoError)
+    assert isinstance(store.session.unavailable, WithoutMongoError)
     assert (store.verify().index, store.verify().findings) == (False, [])
     assert store.session.connection.place == "none"
 

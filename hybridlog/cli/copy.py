@@ -144,10 +144,11 @@ def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Itera
 def _receive(path: Path) -> None:
     """Do what the copy on the other side of standard input asks."""
     from hybridlog.maintenance.ssh import serve
+    from hybridlog.store import receiving
 
     with (
         opened_store(path, None, create=True, quiet=True) as opened,
-        opened.receiving() as place,
+        receiving(opened) as place,
         open(0, "rb", buffering=0, closefd=False) as requests,
     ):
         serve(place, requests, sys.stdout.buffer)

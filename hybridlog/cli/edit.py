@@ -103,13 +103,15 @@ def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[st
         UsageError: There is neither a word nor an option.
         TopicError: No recording satisfies the choice.
     """
+    from hybridlog.query.choosing import is_one
+
     choice, words = given.choice, given.words
     if not choice.is_everything:
         return recordings_of(store, choice), words, False
     if not words:
         raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
     named = Choice.of(words[0])
-    return recordings_of(store, named), words[1:], store.is_one(named.name)
+    return recordings_of(store, named), words[1:], is_one(store.session, named.name)
 
 
 @dataclass(frozen=True, kw_only=True)

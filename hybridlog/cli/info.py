@@ -149,14 +149,16 @@ def _show_part(store: Store, given: _Given) -> bool:
 
 
 def _show(store: Store, given: _Given) -> None:
+    from hybridlog.query.choosing import is_one
+
     choice = given.choice
     chosen = [with_misfits(store, entry) for entry in given.recordings_in(store)]
     extras = {entry.id: _extras(store, entry) for entry in chosen}
     videos = {entry.id: _videos(store, entry) for entry in chosen[:_MAX_DRAWN]}
     if given.as_json:
         full = [_as_dict(entry, *extras[entry.id], videos.get(entry.id, {})) for entry in chosen]
-        is_one = choice == Choice.of(choice.name[:1]) and store.is_one(choice.name)
-        output.print_json(full[0] if is_one else full)
+        is_single = choice == Choice.of(choice.name[:1]) and is_one(store.session, choice.name)
+        output.print_json(full[0] if is_single else full)
         return
     drawn = {}
     if sys.stdout.isatty() and len(chosen) <= _MAX_DRAWN:

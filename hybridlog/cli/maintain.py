@@ -49,7 +49,7 @@ def verify_command(given: _Verify) -> None:
         total = sum(entry.stored_bytes for entry in chosen.summaries)
         with progress_bar("verify", total, quiet=given.quiet) as bar:
             result = store.verify(None if given.choice.is_everything else chosen, Stages(bar))
-        why = store.without_database
+        why = store.session.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})

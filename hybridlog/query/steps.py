@@ -22,8 +22,6 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
@@ -72,22 +70,9 @@ class Steps:
         return self.question.topics
 
     @property
-    def directory(self) -> Path:
-        """The store's directory."""
-        return self.session.directory.path
-
-    @property
     def recordings(self) -> tuple[str, ...]:
         """Ids of the recordings, oldest first."""
         return tuple(summary.id for summary in self.summaries())
-
-    @property
-    def spent(self) -> Counters:
-        """The cost of its conditions on other topics, which were answered before."""
-        found = Counters()
-        for condition in self.conditions:
-            found.add(condition.counters)
-        return found
 
     def __copy__(self) -> Self:
         """The same question with separate counters."""

@@ -202,12 +202,13 @@ def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
     whole = copy(base)
     list(whole)
     few = base.where("right/pose: header.seq < 440", within="2ms")
-    assert few.spent.bytes_read > 0
-    assert few.spent.chunks_read == 0  # columns of the table
+    (condition,) = few.conditions
+    assert condition.counters.bytes_read > 0
+    assert condition.counters.chunks_read == 0  # columns of the table
     messages = list(few)
     assert 0 < len(messages) < 20
     assert few.counters.bytes_read < whole.counters.bytes_read / 3
-    assert few.limit(1).spent.bytes_read == few.spent.bytes_read
+    assert few.limit(1).conditions == few.conditions
     # A range bounds what is asked about the other topic.
     assert few.between("+0ms", "+100ms").count() <= len(messages)
     none = base.where("right/pose: header.seq < 0", within="2ms")
@@ -249,7 +250,7 @@ def test_a_slice_of_another_topic(logs: Logs, tmp_path: Path) -> None:
     done = run(*asked, "--within", "4ms", "-o", path, "-v", store=store)
     query = logs.store.topic("base").where(asked[-1], within="4ms")
     assert [m.payload for m in read_mcap(path)] == [m.raw for m in query]
-    cost = query.counters.bytes_read + query.spent.bytes_read
+    cost = sum(one.counters.bytes_read for one in (query, *query.conditions))
     assert 0 < cost < 200_000
     assert f"{cost / 1000:.1f} kB read from disk" in done.err
     for code, arguments in (

@@ -17,6 +17,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.maintenance.bucket_place import BucketPlace
+from hybridlog.maintenance.keep import tidy
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     BucketError,
@@ -243,7 +244,7 @@ def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Prox
         store.edit("run", tag={"a": "b"})
         directory.source.bucket.create("recordings/x/000000.mcap", b"of a copy")
         now = directory.source.bucket.now()
-        assert store.tidy() == (0, 0)
+        assert tidy(store.directory) == (0, 0)
         later = [one.name for one in directory.unneeded(now + 2 * hour)]
         assert later == [list_name(number) for number in (3, 2, 1)]
         names = {one.name for one in directory.unneeded(now + week + hour)}

@@ -417,7 +417,6 @@ METHODS: dict[str, Rule] = {
             ),
         ),
     ),
-    "directory": Rule(lambda s: s.topic("arm").directory == s.directory.path, lambda _: True),
     "in_frame": Rule(  # the recording has no transforms
         lambda s: refusal(lambda: s.topic("said").in_frame("map").to_arrow()),
         lambda k: "UsageError",
@@ -510,7 +509,6 @@ METHODS: dict[str, Rule] = {
         lambda s: [*s.topic("arm").spans().values()],
         lambda k: [k.clock_span("log", ["/arm"])],
     ),
-    "spent": Rule(lambda s: s.topic("arm").spent.messages, lambda _: 0),
     "stats": Rule(
         lambda s: [
             (f.topic, f.field, f.count, f.nan, f.infinite, f.min, f.max, f.mean, f.std)
@@ -635,7 +633,6 @@ STORE: dict[str, Rule] = {
         lambda s: {t: n for t, n in s.entry(LABEL).messages_by_topic().items() if n},
         lambda k: {t: n for t, n in k.counts.items() if n},
     ),
-    "is_one": Rule(lambda s: s.is_one([LABEL]), lambda _: True),
     "query": Rule(lambda s: s.query(["/arm"], [LABEL]).count(), lambda k: len(k.of("/arm"))),
     "recordings": Rule(
         lambda s: (

@@ -156,7 +156,7 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     few: hl.Store, server: str, tmp_path: Path
 ) -> None:
     before = contents(few)
-    path, database = few.directory.path, few.database_for("This")
+    path, database = few.directory.path, few.session.database_for("This")
     # As if the recorder had been killed while it wrote.
     (entry,) = few.recordings()
     IndexState(database).put(entry, "open", turn=1)
