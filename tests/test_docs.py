@@ -632,6 +632,7 @@ def documented_classes() -> list[type]:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.attachments import StoredAttachment
+    from hybridlog.index.of_store import Index
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
@@ -649,7 +650,7 @@ def documented_classes() -> list[type]:
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
-    checks = [Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
+    checks = [Index, Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
     answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, CopyOptions, LiveOptions, LiveRecording, SegmentSettings]
