@@ -94,7 +94,9 @@ def export_command(given: _Given) -> None:
         for path, one in parts:
             to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
             if form in _LOGS:
-                extras = one.extras()
+                from hybridlog.attachments import extras_of
+
+                extras = extras_of(one)
                 if given.no_attachments:
                     extras = extras._replace(attachments=[], left_out=0)
                 _write_file(one, to, path, front, extras)

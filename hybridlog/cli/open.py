@@ -136,9 +136,10 @@ def _check(given: _Given) -> None:
 
 def _written(store: Store, query: Query, given: _Given) -> Path:
     """The slice as an MCAP file."""
+    from hybridlog.attachments import extras_of
 
     def write(query: Query, path: Path) -> None:
-        write_answer(query, "mcap", path, extras=query.extras(), quiet=given.quiet)
+        write_answer(query, "mcap", path, extras=extras_of(query), quiet=given.quiet)
 
     if given.path is None:
         ids = query.recordings

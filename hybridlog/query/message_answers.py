@@ -22,7 +22,6 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.attachments import Extras
     from hybridlog.message import Message
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.question import RecordedChannel
@@ -139,17 +138,6 @@ class MessageAnswers(Steps):
 
         self.counters.reset()
         return in_force(self.session, self.question, self.counters, original_times=original_times)
-
-    @of_one_moment
-    def extras(self) -> Extras:
-        """Attachments and metadata records that belong to the answer as a slice.
-
-        Raises:
-            SegmentError: A segment is damaged.
-        """
-        from hybridlog.attachments import extras_of
-
-        return extras_of(self.session, self.question)
 
     @of_one_moment
     def count(self) -> int:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog.attachments import extras_of
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
@@ -426,13 +427,6 @@ METHODS: dict[str, Rule] = {
         lambda k: _right_thrice(_second(k, "/said", "/cam")),
     ),
     "every": Rule(lambda s: seqs(s.topic("said").every(7)), lambda k: seqs(k.of("/said")[::7])),
-    "extras": Rule(
-        lambda s: (
-            sorted(c.topic for c in s.all_topics().extras().channels),
-            len(s.all_topics().extras().problems),
-        ),
-        lambda _: (sorted(CHANNELS), 0),
-    ),
     "field_types": Rule(
         lambda s: (s.topic("arm").field_types() or {}).get("position"), lambda _: "float64[]"
     ),
@@ -617,6 +611,13 @@ def _aligned(found: Any) -> Any:
 
 
 STORE: dict[str, Rule] = {
+    "extras": Rule(
+        lambda s: (
+            sorted(c.topic for c in extras_of(s.all_topics()).channels),
+            len(extras_of(s.all_topics()).problems),
+        ),
+        lambda _: (sorted(CHANNELS), 0),
+    ),
     "__repr__": Rule(lambda s: "<Store " in repr(s), lambda _: True),
     "_repr_html_": Rule(lambda s: LABEL in s._repr_html_(), lambda _: True),
     "_ipython_key_completions_": Rule(

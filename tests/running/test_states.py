@@ -13,6 +13,7 @@ import pytest
 from mcap.records import Metadata
 
 import hybridlog as hl
+from hybridlog.attachments import extras_of
 from hybridlog.maintenance.expiry import expire
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.segments.attachments import Attachment
@@ -194,7 +195,7 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             (attachment,) = store.attachments(LABEL)
             assert (attachment.name, b"".join(attachment.pieces())) == (record.name, b"fx: 500")
             assert [one.values for one in store.metadata(LABEL)] == [{"name": "seven"}]
-            extras = store.topic("arm").extras()
+            extras = extras_of(store.topic("arm"))
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
         done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]
