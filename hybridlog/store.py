@@ -31,6 +31,7 @@ from hybridlog.maintenance.report import (
     Progress,
     RepairReport,
 )
+from hybridlog.query.asked import narrowed
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
@@ -765,9 +766,7 @@ class Store:
         if isinstance(topics, str):
             raise UsageError("Topics are a list: sync(['scan', 'odom']).")
         queries = [self._query_of(one, {}) for one in topics]
-        questions = [
-            query.with_topic(topic).question for query in queries for topic in query.topics
-        ]
+        questions = [narrowed(query, topic).question for query in queries for topic in query.topics]
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         return Synced(self.session, self._opener(), questions, tolerance, cast("Clock", clock))

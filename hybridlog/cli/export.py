@@ -26,6 +26,7 @@ from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import Front
+from hybridlog.query.asked import narrowed
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -172,7 +173,7 @@ def _write_files(query: Query, to: Destination, directory: Path, front: Front) -
         check_room(path, force=to.force)
     left_out: list[HybridlogError] = []
     for topic, path in paths.items():
-        one = query.with_topic(topic)
+        one = narrowed(query, topic)
         try:
             with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
                 missing = write_answer(one, to.form, path, front=front, quiet=to.quiet)

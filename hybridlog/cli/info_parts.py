@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written
 from hybridlog.cli.signals import if_stopped
+from hybridlog.query.asked import channels_of
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
@@ -37,7 +38,7 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
         TopicError: No recording of the query has any of them.
     """
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
-    for recorded in query.channels():
+    for recorded in channels_of(query):
         schema = recorded.channel.schema
         key = (
             recorded.channel.topic,
@@ -359,7 +360,7 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     from hybridlog.snapshot import UNFINISHED
 
     (topic,) = query.topics
-    channels = query.channels()
+    channels = channels_of(query)
     recordings = {one.recording.id: one.recording for one in channels}.values()
     ended = [one for one in recordings if one.status not in UNFINISHED]
     found = _tables_of(store, [one for one in channels if one.recording in ended])

@@ -14,6 +14,7 @@ from hybridlog.cli.binder import option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.signals import if_stopped
+from hybridlog.query.asked import narrowed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def _proposed(query: Query) -> str:
     """A map for the topics that are there; those with few messages are in comments."""
     from hybridlog.training.feature_map import nearly_empty, proposed
 
-    empty = nearly_empty(query.with_topic(*proposed(query).topics))
+    empty = nearly_empty(narrowed(query, *proposed(query).topics))
     return proposed(query, empty).to_yaml() + "".join(
         f"# left out: {topic} has {output.counted(count, 'message')}\n"
         for topic, count in empty.items()

@@ -18,6 +18,7 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal, if_stopped
 from hybridlog.formats.slices import SliceCache
+from hybridlog.query.asked import channels_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
 
@@ -233,7 +234,7 @@ def _print_address(port: int, *, quiet: bool) -> None:
 
 def print_unplayed(query: Query) -> None:
     """Print the topics with messages that are left out, since their payload is gone."""
-    topics = {each.channel.topic for each in query.channels() if each.is_reduced}
+    topics = {each.channel.topic for each in channels_of(query) if each.is_reduced}
     if topics:
         found = listed(sorted(topics), _MAX_SHOWN)
         output.note(f"Messages without their payload are not played; there are some of {found}.")

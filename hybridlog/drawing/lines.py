@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.drawing.series import Series, numbers_of, series
+from hybridlog.query.asked import field_types, narrowed, spans_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -63,7 +64,7 @@ def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
         missing: dict[str, TopicError] = {}
         had: set[str] = set()
         for one in _by_topic(query):
-            for recording in one.spans():
+            for recording in spans_of(one):
                 part = one.in_recording(recording)
                 about = summaries[recording]
                 for group in _groups(part, fields, missing):
@@ -96,7 +97,7 @@ def _groups(
         fields: Paths.
         missing: Gets the fields that it does not have.
     """
-    if query.field_types() is None:
+    if field_types(query) is None:
         yield from ([field] for field in fields)
         return
     own = []
@@ -112,7 +113,7 @@ def _groups(
 
 
 def _by_topic(query: Query) -> Iterator[Query]:
-    return (query.with_topic(topic) for topic in query.topics)
+    return (narrowed(query, topic) for topic in query.topics)
 
 
 def drawable(values: Numbers) -> NDArray[np.float64]:

@@ -204,7 +204,7 @@ class MessageAnswers(Steps):
         """Laser scans of one length as an array, from columns; None for everything else."""
         from hybridlog.frames.answer import FIELDS, are_scans, scans_in
 
-        if not are_scans(self.channels()):
+        if not are_scans(self._planner().channels()):
             return None
         self.counters.reset()
         question = replace(self.question, fields=FIELDS, tags=())

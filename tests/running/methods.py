@@ -16,6 +16,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.attachments import extras_of
+from hybridlog.query.asked import channels_of, field_types, narrowed, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
@@ -375,10 +376,6 @@ METHODS: dict[str, Rule] = {
             changed(k, "/arm", "name", SECOND // 10),
         ),
     ),
-    "channels": Rule(
-        lambda s: sorted(c.channel.topic for c in s.all_topics().channels()),
-        lambda _: sorted(CHANNELS),
-    ),
     "clock": Rule(_clocks, _right_clocks),
     "check": Rule(
         lambda s: [
@@ -427,9 +424,6 @@ METHODS: dict[str, Rule] = {
         lambda k: _right_thrice(_second(k, "/said", "/cam")),
     ),
     "every": Rule(lambda s: seqs(s.topic("said").every(7)), lambda k: seqs(k.of("/said")[::7])),
-    "field_types": Rule(
-        lambda s: (s.topic("arm").field_types() or {}).get("position"), lambda _: "float64[]"
-    ),
     "fields": Rule(
         lambda s: _table(
             s.topic("arm").fields("n", "name", "ranges.max").to_arrow(), "n", "name", "ranges.max"
@@ -499,10 +493,6 @@ METHODS: dict[str, Rule] = {
         lambda k: regular(k, "/said", SECOND // 10),
     ),
     "reverse": Rule(lambda s: rows(s.all_topics().reverse()), lambda k: sent(reversed(k.of()))),
-    "spans": Rule(
-        lambda s: [*s.topic("arm").spans().values()],
-        lambda k: [k.clock_span("log", ["/arm"])],
-    ),
     "stats": Rule(
         lambda s: [
             (f.topic, f.field, f.count, f.nan, f.infinite, f.min, f.max, f.mean, f.std)
@@ -584,9 +574,6 @@ METHODS: dict[str, Rule] = {
             for m in k.of("/cam")
         ],
     ),
-    "with_topic": Rule(
-        lambda s: _thrice(s.all_topics().with_topic("/arm")), lambda k: _right_thrice(k.of("/arm"))
-    ),
 }
 """By name of the method."""
 
@@ -611,6 +598,20 @@ def _aligned(found: Any) -> Any:
 
 
 STORE: dict[str, Rule] = {
+    "channels": Rule(
+        lambda s: sorted(c.channel.topic for c in channels_of(s.all_topics())),
+        lambda _: sorted(CHANNELS),
+    ),
+    "field_types": Rule(
+        lambda s: (field_types(s.topic("arm")) or {}).get("position"), lambda _: "float64[]"
+    ),
+    "spans": Rule(
+        lambda s: [*spans_of(s.topic("arm")).values()],
+        lambda k: [k.clock_span("log", ["/arm"])],
+    ),
+    "with_topic": Rule(
+        lambda s: _thrice(narrowed(s.all_topics(), "/arm")), lambda k: _right_thrice(k.of("/arm"))
+    ),
     "extras": Rule(
         lambda s: (
             sorted(c.topic for c in extras_of(s.all_topics()).channels),
