@@ -26,7 +26,6 @@ from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import Front
-from hybridlog.query.asked import narrowed
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -163,6 +162,7 @@ def _remove_empty(directory: Path) -> None:
 
 
 def _write_files(query: Query, to: Destination, directory: Path, front: Front) -> None:
+    from hybridlog.query.asked import narrowed
     from hybridlog_storage.mongo.collection_names import collection_of
 
     suffix, topics = OUTPUTS[to.form].suffixes[0], [*query.topics]

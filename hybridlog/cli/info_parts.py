@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written
 from hybridlog.cli.signals import if_stopped
-from hybridlog.query.asked import channels_of
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
@@ -37,6 +36,8 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
     Raises:
         TopicError: No recording of the query has any of them.
     """
+    from hybridlog.query.asked import channels_of
+
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
     for recorded in channels_of(query):
         schema = recorded.channel.schema
@@ -357,13 +358,14 @@ def _write(attachment: StoredAttachment, path: Path) -> None:
 def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
     from hybridlog.maintenance.tables import missing
+    from hybridlog.query.asked import channels_of
     from hybridlog.snapshot import UNFINISHED
 
     (topic,) = query.topics
     channels = channels_of(query)
     recordings = {one.recording.id: one.recording for one in channels}.values()
     ended = [one for one in recordings if one.status not in UNFINISHED]
-    found = _tables_of(store, [one for one in channels if one.recording in ended])
+    found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
     tables = store.session.tables
     lacking = [one.label for one in ended if missing(store.directory, one, tables, [topic])]
     if as_json:

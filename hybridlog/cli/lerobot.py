@@ -14,7 +14,6 @@ from hybridlog.cli.binder import option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.signals import if_stopped
-from hybridlog.query.asked import narrowed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -106,6 +105,7 @@ def export_set(
 
 def _proposed(query: Query) -> str:
     """A map for the topics that are there; those with few messages are in comments."""
+    from hybridlog.query.asked import narrowed
     from hybridlog.training.feature_map import nearly_empty, proposed
 
     empty = nearly_empty(narrowed(query, *proposed(query).topics))

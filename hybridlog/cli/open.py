@@ -18,7 +18,6 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal, if_stopped
 from hybridlog.formats.slices import SliceCache
-from hybridlog.query.asked import channels_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
 
@@ -234,6 +233,8 @@ def _print_address(port: int, *, quiet: bool) -> None:
 
 def print_unplayed(query: Query) -> None:
     """Print the topics with messages that are left out, since their payload is gone."""
+    from hybridlog.query.asked import channels_of
+
     topics = {each.channel.topic for each in channels_of(query) if each.is_reduced}
     if topics:
         found = listed(sorted(topics), _MAX_SHOWN)
