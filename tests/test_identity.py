@@ -586,10 +586,10 @@ def test_twenty_commands_at_once_wait_for_each_other(
     path = tmp_path / "store"
     shutil.copytree(base, path)
     commands: list[Callable[[hl.Store], object]] = [
-        *(partial(hl.Store.tag, recording=one, **{f"key{n}": str(n)}) for n in range(8)),
-        *(partial(hl.Store.note, recording=one, note=f"note {n}") for n in range(4)),
+        *(partial(hl.Store.edit, recording=one, tag={f"key{n}": str(n)}) for n in range(8)),
+        *(partial(hl.Store.edit, recording=one, note=f"note {n}") for n in range(4)),
         *(partial(hl.Store.mark, recording=one, moment="+0s", note=f"mark {n}") for n in range(4)),
-        *(partial(hl.Store.rename, recording=one, name=f"name {n}") for n in range(3)),
+        *(partial(hl.Store.edit, recording=one, name=f"name {n}") for n in range(3)),
         partial(hl.Store.compact, recordings=[one], topics=["/scan"]),
     ]
     waiting: set[int] = set()

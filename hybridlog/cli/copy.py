@@ -19,7 +19,6 @@ from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
-from hybridlog_storage.settings import NONE
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
@@ -57,10 +56,11 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
 
 @command(_Copy, "copy")
 def copy_command(given: _Copy) -> None:
-    """Copy recordings to a directory, a server over ssh, or a bucket, or from another store.
+    """Copy recordings to or from another store.
 
-    Every byte is proved there before a recording gets its name. After a cut, run it again: it
-    goes on where it stopped. A recording that is there already is not copied again.
+    It is a directory, a server over ssh, or a bucket. Every byte is proved there before a
+    recording gets its name. After a cut, run it again: it goes on where it stopped. A recording
+    that is there already is not copied again.
     """
     from hybridlog.maintenance.copying import CopyOptions
 
@@ -90,6 +90,7 @@ def copy_command(given: _Copy) -> None:
 def _from_elsewhere(given: _Copy, source: Path) -> _Copy:
     """The same as a copy by the other store, to the one here."""
     from hybridlog.store import store_path
+    from hybridlog_storage.settings import NONE
 
     if given.mongo is not None:
         with given.opened(create=True):

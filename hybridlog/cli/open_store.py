@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import os
-import threading
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import chain, islice
@@ -236,6 +234,9 @@ def mended_meanwhile(store: Store, every: float = _EVERY_S) -> Iterator[None]:
         store: The store.
         every: Seconds between two calls.
     """
+    import math
+    import threading
+
     ended = threading.Event()
 
     def mend() -> None:

@@ -248,10 +248,6 @@ def test_paths_are_checked_by_the_library() -> None:
     ("words", "hint"),
     [
         ("fech", "Did you mean 'fetch'?"),
-        ("help fetch", ": use `hybridlog fetch --help`."),
-        ("bag info x", "There is no `bag info`: use `hybridlog info`."),
-        ("bag play x", ": use `hybridlog export DIRECTORY -F rosbag2`."),
-        ("bag", ": use `hybridlog --help`."),
         ("record /scan /lidar/points", ": `hybridlog record --ros2 -t /scan -t /lidar/points`."),
         ("fetch --betwee", "'--between'"),
         ("check robot", "robot is a recording: -r robot."),
