@@ -38,7 +38,7 @@ BUDGET: Mapping[Scale, float] = {"full": 55.0, "quick": 18.0, "tiny": 0.0}
 """Minutes; a search is repeated only where that fits."""
 _EPILOG = """\
 parts:
-  tasks    commands, SQL, many recordings, the page, training windows and a bucket
+  tasks    commands, SQL, many recordings, the page and a bucket
   queries  the paper's questions to every system
   reading  slices, messages at a time and whole tables from every system
   live     recording a running robot, beside `rosbag record` where that is installed

@@ -365,7 +365,7 @@ def _tasks(results: Results) -> list[str]:
             "process of its own.",
             _rows("command", commands["rows"]),
         ]
-    page_, sql, windows = (results.group(name) for name in ("page", "sql", "windows"))
+    page_, sql = (results.group(name) for name in ("page", "sql"))
     if sql:
         head = ["SQL in an open store", "ms", "DuckDB alone, ms"]
         rows = [[n, _ms(v), number(v["duckdb_ms"])] for n, v in sql["rows"].items()]
@@ -377,13 +377,6 @@ def _tasks(results: Results) -> list[str]:
         memory = f"page of `hybridlog view` ({number(page_['memory_mb'])} MB)"
         rows = [[name, _ms(values)] for name, values in page_["rows"].items()]
         parts.append(_table([memory, "ms"], rows))
-    if windows:
-        head = ["training windows, 640 x 480", "ms", "`preadv` of as many bytes, ms"]
-        rows = [
-            [name, number(values["ms"]), number(values["preadv_ms"])]
-            for name, values in windows["rows"].items()
-        ]
-        parts.append(_table(head, rows))
     if bucket := results.group("remote"):
         head = ["a store in a bucket", "requests", "bytes received", "bytes sent"]
         names = ("requests", "received", "sent")

@@ -803,6 +803,12 @@ class Session:
         snapshot = self.snapshot()
         return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
 
+    def as_now(self, entries: Iterable[RecordingEntry]) -> list[RecordingEntry]:
+        """Recordings as they are now, oldest first; those that are gone are left out."""
+        snapshot = self.snapshot()
+        places = sorted(snapshot.by_id.get(entry.id, -1) for entry in entries)
+        return [self.entry_of(snapshot.summaries[place]) for place in places if place >= 0]
+
     def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:
         """Positions of recordings in the snapshot, each once, in the order of the names.
 

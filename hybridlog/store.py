@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import secrets
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, ParamSpec, Self, TypeAlias, TypeVar, cast
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+    ParamSpec,
+    Self,
+    TypeAlias,
+    TypeVar,
+    cast,
+    overload,
+)
 
 from hybridlog.entries import text
-from hybridlog.index import consent, field_indexes
-from hybridlog.index.connection import IndexAddress
-from hybridlog.index.field_indexes import FieldIndex
+from hybridlog.index import consent
+from hybridlog.index.connection import again_if_lost
+from hybridlog.index.of_store import Index
 from hybridlog.maintenance.report import (
     CompactedTopic,
     Progress,
     RepairReport,
 )
+from hybridlog.query.asked import narrowed
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
@@ -80,16 +90,12 @@ if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotReport
-    from hybridlog.training.windows import Windows
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
 
 DEFAULT_STORE = "hybridlog-store"
-MENDING_S: Final = 2.0
+_MENDING_S: Final = 2.0
 """Longest time that a command repairs what it met, after its answer."""
-_CLIENTS_WAIT_S = 600.0
-"""Seconds for which a published MongoDB waits for clients."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by label, name or id, or their entries."""
 _ELSEWHERE: Final = re.compile(r"(?P<host>[^/:]+):(?P<path>.*)")
@@ -178,6 +184,23 @@ def open_store(
 
 
 @contextmanager
+def receiving(store: Store) -> Iterator[DirectoryPlace]:
+    """A store as a place that recordings are copied to."""
+    from hybridlog.maintenance import tables
+    from hybridlog.maintenance.places import DirectoryPlace
+
+    def known() -> dict[str, str]:
+        return {one.id: one.label for one in store.session.snapshot().summaries}
+
+    store.session.catch_up()
+    place = DirectoryPlace(store.directory, known)
+    yield place
+    store.session.catch_up()
+    for entry in store.select(place.published):  # so that other readers find them
+        tables.make(store.directory, entry, is_new=True)
+
+
+@contextmanager
 def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place]:
     """The place that recordings of a store are copied to."""
     from hybridlog.maintenance.ssh import is_ssh, ssh_place
@@ -199,7 +222,7 @@ def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place
     path = _local(to)
     if not source.is_remote and source.path.resolve() in path.resolve().parents:
         raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
-    with open_store(path, create=True) as other, other.receiving() as place:
+    with open_store(path, create=True) as other, receiving(other) as place:
         yield place
 
 
@@ -224,22 +247,6 @@ def _local(to: str | Path) -> Path:
         return Path(to).expanduser()
     except RuntimeError as error:
         raise UsageError(f"{to}: there is no such home directory.") from error
-
-
-def _again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Do something once more if the connection to MongoDB was lost.
-
-    The new connection has started a MongoDB that had ended, and replaced damaged data files.
-    """
-
-    @wraps(work)
-    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
-        try:
-            return work(*args, **options)
-        except ConnectionLostError:
-            return work(*args, **options)
-
-    return tried
 
 
 def _again_if_overtaken(work: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -340,14 +347,9 @@ class Store:
         return self.session.database
 
     @property
-    def without_database(self) -> HybridlogError | None:
-        """The reason why MongoDB is unavailable; None while that is unknown."""
-        return self.session.unavailable
-
-    @property
-    def index_place(self) -> str:
-        """Description of the index's place; does not connect to MongoDB."""
-        return self.session.connection.place
+    def index(self) -> Index:
+        """Makes and describes the index."""
+        return Index(self.session)
 
     def connect(self) -> Database:
         """Connect to the index and bring it up to date.
@@ -357,19 +359,6 @@ class Store:
             StoreError: It holds the index of another store, or this store is a copy.
         """
         return self.session.connect()
-
-    def database_for(self, purpose: str, *, writes: bool = False) -> Database:
-        """The index.
-
-        Args:
-            purpose: The activity, for messages.
-            writes: True if it changes the index.
-
-        Raises:
-            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
-                reason.
-        """
-        return self.session.database_for(purpose, writes=writes)
 
     def refresh(self) -> None:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
@@ -383,13 +372,13 @@ class Store:
         """
         return self.session.at_one_moment()
 
-    def mend(self, seconds: float = MENDING_S) -> None:
+    def mend(self, seconds: float = _MENDING_S) -> None:
         """Repair what questions met: recordings after a crash, missing and damaged tables.
 
         Questions repair nothing: they answer from what is whole. `close` calls this.
 
         Args:
-            seconds: What takes longer is left; `repairs` names it. `repair` does all.
+            seconds: What takes longer is left; `repairs` names it. `verify(repair=True)` does all.
         """
         with suppress(StoreError, ResourceError):
             self.session.mend(seconds)
@@ -403,27 +392,6 @@ class Store:
         if self._sql is not None:
             self._sql.close()
         self.session.close()
-
-    @contextmanager
-    def mended_meanwhile(self, every: float = MENDING_S) -> Iterator[None]:
-        """A block during which another thread calls `mend` again and again.
-
-        Args:
-            every: Seconds between two calls.
-        """
-        ended = threading.Event()
-
-        def mend() -> None:
-            while not ended.wait(every):
-                self.mend(math.inf)
-
-        thread = threading.Thread(target=mend, name="hybridlog-mend", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
 
     # Recordings and topics.
 
@@ -483,13 +451,6 @@ class Store:
     def summaries(self) -> list[RecordingSummary]:
         """All recordings in short, oldest first; much faster than `recordings`."""
         return list(self.session.look().summaries)
-
-    @of_one_moment
-    def is_one(self, names: Sequence[str]) -> bool:
-        """True if a choice by these names is of one recording, whatever the store holds."""
-        from hybridlog.query.choosing import is_exact
-
-        return len(names) == 1 and is_exact(self.session, names[0])
 
     @of_one_moment
     def entry(self, recording: str) -> RecordingEntry:
@@ -778,54 +739,6 @@ class Store:
         return write_lerobot(query, FeatureMap.given(features), path, options, progress=progress)
 
     @of_one_moment
-    def windows(
-        self,
-        topics: str | Sequence[str] | Query,
-        *,
-        fps: int,
-        length: int,
-        horizon: int = 0,
-        features: str | Path | Mapping[str, Any] | None = None,
-        episodes_by: str = "recording",
-        on_gap: Literal["refuse", "drop", "hold"] = "drop",
-    ) -> Windows:
-        """Make a data set of windows of states and pictures, without an export.
-
-        Frames are those of `to_lerobot`. A window is `length` of them, with `horizon` further
-        ones of the numbers alone, such as actions to come.
-
-        Args:
-            topics: Topics by names, or a query: recordings, range and topics.
-            fps: Frames per second.
-            length: Frames of a window, with pictures.
-            horizon: Frames behind them, without pictures.
-            features: Which fields and images, as for `to_lerobot`; None for what the topics'
-                types propose.
-            episodes_by: As for `to_lerobot`; a window is in one episode.
-            on_gap: With a gap in a topic, refuse all, have no window there, or keep the last
-                value.
-
-        Raises:
-            UsageError: A recording is running, a gap is refused, or there are no such fields.
-            TopicError: A recording lacks a topic.
-        """
-        from hybridlog.training.feature_map import FeatureMap, proposed
-        from hybridlog.training.windows import Windows
-
-        names = (topics,) if isinstance(topics, str) else topics
-        query = names if isinstance(names, Query) else self.topic(*names)
-        return Windows(
-            query,
-            self._opener(),
-            proposed(query) if features is None else FeatureMap.given(features),
-            fps=fps,
-            length=length,
-            horizon=horizon,
-            episodes_by=episodes_by,
-            on_gap=on_gap,
-        )
-
-    @of_one_moment
     def sync(
         self,
         topics: Sequence[str | Query],
@@ -853,9 +766,7 @@ class Store:
         if isinstance(topics, str):
             raise UsageError("Topics are a list: sync(['scan', 'odom']).")
         queries = [self._query_of(one, {}) for one in topics]
-        questions = [
-            query.with_topic(topic).question for query in queries for topic in query.topics
-        ]
+        questions = [narrowed(query, topic).question for query in queries for topic in query.topics]
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         return Synced(self.session, self._opener(), questions, tolerance, cast("Clock", clock))
@@ -901,7 +812,8 @@ class Store:
         """A query about a topic, with its share of the fields, which is taken out of them."""
         query = self.topic(name) if isinstance(name, str) else name
         if query.session is not self.session:
-            raise UsageError(f"A query of {query.directory} cannot be joined with another store's.")
+            place = query.session.directory.place
+            raise UsageError(f"A query of {place} cannot be joined with another store's.")
         for key in [*fields]:
             if key == name or self.topic(key).topics == query.topics:
                 query = query.fields(*fields.pop(key))
@@ -1035,111 +947,7 @@ class Store:
             report.entry = self.entry(report.entry.id)
             report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
-    @_again_if_lost
-    def rebuild_index(
-        self,
-        recordings: Names | None = None,
-        progress: Progress | None = None,
-    ) -> list[RecordingEntry]:
-        """Rebuild the index from the segments, recording by recording.
-
-        Args:
-            recordings: The recordings; None for all, which also removes unknown documents.
-            progress: Called after each chunk.
-
-        Returns:
-            The indexed recordings.
-
-        Raises:
-            StoreError: A named recording is being written.
-        """
-        from hybridlog.maintenance.index import StoreIndex
-
-        database = self.database_for("Rebuilding the index", writes=True)
-        if recordings is None:
-            self.catalog.mend()
-        self.refresh()
-        chosen = self.select(recordings)
-        index = StoreIndex(self.directory, self.catalog, database, progress)
-        left = index.rebuild(chosen)
-        if recordings is None:
-            index.remove_rest(self.session.recordings())
-        elif left:
-            raise next(iter(left.values()))
-        self.refresh()
-        return self._now([entry for entry in chosen if entry.id not in left])
-
-    @_again_if_lost
-    def add_index(self, topic: str, *fields: str) -> list[FieldIndex]:
-        """Add a MongoDB index on fields of a topic.
-
-        Args:
-            topic: Full name, short name, glob, or `re:` and a regular expression.
-            fields: Fields of the messages, or `_meta.inserted_at` and the like. Questions
-                should give a value or a range of the first one; the others narrow it down.
-
-        Returns:
-            All indexes of the topics.
-
-        Raises:
-            TopicError: A topic or field does not exist.
-            DatabaseError: MongoDB refuses, for example because two fields are arrays.
-        """
-        query = self.topic(topic)
-        database = self.database_for("An index", writes=True)
-        query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
-        field_indexes.add(database, query.topics, fields)
-        self.session.field_indexes = field_indexes.listed(database)
-        return field_indexes.of_topics(database, query.topics)
-
-    @_again_if_lost
-    def remove_index(self, topic: str, *fields: str) -> int:
-        """Drop the index on exactly these fields; return the number of topics.
-
-        Raises:
-            TopicError: A topic does not exist.
-        """
-        query = self.topic(topic)
-        database = self.database_for("An index", writes=True)
-        found = field_indexes.remove(database, query.topics, fields)
-        self.session.field_indexes = field_indexes.listed(database)
-        return found
-
-    @_again_if_lost
-    def indexes(self, *topics: str) -> list[FieldIndex]:
-        """The indexes on fields, of these topics or of all."""
-        database = self.database_for("Indexes")
-        names = self.topic(*topics).topics if topics else self.topics()
-        return field_indexes.of_topics(database, names)
-
-    @_again_if_lost
-    def index_address(self) -> IndexAddress:
-        """The address of the index for other programs, after it was brought up to date.
-
-        The embedded MongoDB keeps its address, waits ten minutes for the first client, and runs
-        as long as one is connected.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-        """
-        database = self.connect()
-        return IndexAddress(self.session.connection.address(_CLIENTS_WAIT_S), database.name)
-
-    @_again_if_lost
-    def index_contents(self) -> list[tuple[str, str, int]]:
-        """Each topic with the MongoDB collection of its documents, and their number there."""
-        database = self.database_for("The contents of the index")
-        places = self.session.places("The contents of the index").of(self.topics())
-        known = [place for place in places.values() if place.is_listed]
-        filters = [(place.collection, place.documents()) for place in known]
-        counts = database.count_each([one for one in filters if one[1]])
-        shared = iter(counts)
-        return [
-            (place.topic, collection, next(shared) if own else database.count(collection))
-            for place, (collection, own) in zip(known, filters, strict=True)
-        ]
-
-    @_again_if_lost
+    @again_if_lost
     @of_one_moment
     def sizes(self, recordings: Names | None = None) -> Sizes:
         """Bytes of recordings and topics in segments, tables and MongoDB.
@@ -1161,35 +969,46 @@ class Store:
         places = None if database is None else self.session.places("Sizes")
         return sizes_of(self.directory, self.catalog, entries, database, places)
 
-    @_again_if_lost
-    def topic_place(self, topic: str) -> TopicPlace:
-        """The place of a topic's index documents in MongoDB.
-
-        Args:
-            topic: Full name, or an unambiguous short one.
-
-        Returns:
-            Has `collection`, its name, and `documents(begin, end)`, a filter for the
-            documents of the topic with log times in `[begin, end)`, ns.
-
-        Raises:
-            TopicError: The topic does not exist.
-        """
-        (name, *_) = self.topic(topic).topics
-        return self.session.places("The place of a topic").of([name])[name]
-
-    @_again_if_lost
+    @overload
     def verify(
-        self, recordings: Names | None = None, progress: Progress | None = None
-    ) -> Verification:
+        self,
+        recordings: Names | None = None,
+        progress: Progress | None = None,
+        *,
+        repair: Literal[False] = False,
+    ) -> Verification: ...
+
+    @overload
+    def verify(
+        self,
+        recordings: Names | None = None,
+        progress: Progress | None = None,
+        *,
+        repair: Literal[True],
+    ) -> list[Repaired]: ...
+
+    @again_if_lost
+    def verify(
+        self,
+        recordings: Names | None = None,
+        progress: Progress | None = None,
+        *,
+        repair: bool = False,
+    ) -> Verification | list[Repaired]:
         """Check all checksums, and compare catalog and index with the segments.
 
         Args:
             recordings: The recordings; None for all.
             progress: Called after each chunk.
+            repair: Apply all repairs that lose no data; read the rest.
+
+        Returns:
+            What was found; with `repair`, what was mended, and what only a copy can restore.
         """
         from hybridlog.maintenance.verify import verify
 
+        if repair:
+            return self._repair(recordings, progress)
         self.refresh()
         labels = None if recordings is None else [r.label for r in self.select(recordings)]
         return verify(
@@ -1200,6 +1019,28 @@ class Store:
             labels=labels,
             progress=progress,
         )
+
+    def _repair(self, recordings: Names | None, progress: Progress | None) -> list[Repaired]:
+        self._check_on_disk()
+        from hybridlog.maintenance.repair import repair, repair_index
+
+        self.session.mend()
+        self.refresh()
+        chosen = [] if recordings is None else self.select(recordings)
+        entries = None if recordings is None else chosen
+        done = repair(self.directory, self.catalog, self.repairs, entries)
+        self.refresh()
+        database = self.session.writable_database
+        if database is not None:
+            done += repair_index(
+                self.directory,
+                self.catalog,
+                database,
+                self.session.recordings() if recordings is None else self.session.as_now(chosen),
+                progress=progress,
+            )
+            self.refresh()
+        return done
 
     def compact(
         self,
@@ -1296,30 +1137,6 @@ class Store:
         finally:
             self.refresh()
 
-    def tidy(self, *, dry_run: bool = False) -> tuple[int, int]:
-        """Delete what a store in a bucket does not need any more.
-
-        That is what no list of the last hour names, such as files of removed recordings, if it
-        is a week old: what is younger may belong to a copy that is under way.
-
-        Args:
-            dry_run: True to delete nothing.
-
-        Returns:
-            Number and bytes of the objects.
-
-        Raises:
-            UsageError: The store is a directory, which has nothing of the kind.
-        """
-        from hybridlog_storage.remote.store import RemoteDirectory
-
-        if not isinstance(self.directory, RemoteDirectory):
-            raise UsageError("A store on a disk is tidy: `tidy` is for stores in buckets.")
-        found = self.directory.unneeded()
-        if not dry_run:
-            self.directory.source.bucket.delete([one.name for one in found])
-        return len(found), sum(one.size for one in found)
-
     @_again_if_overtaken
     def pin(
         self,
@@ -1405,38 +1222,44 @@ class Store:
         finally:
             self.session.catch_up()
 
-    def rename(self, recording: str, name: str) -> RecordingEntry:
-        """Rename a recording; its directory gets a label made from the name."""
-        return self._edit(recording, journal.event(journal.RENAMED, name=text(name)))
+    @_again_if_overtaken
+    def edit(
+        self,
+        recording: str | RecordingEntry,
+        *,
+        name: str | None = None,
+        note: str | None = None,
+        tag: Mapping[str, str] | None = None,
+        untag: Iterable[str] = (),
+    ) -> RecordingEntry:
+        """Change what is said about a recording.
 
-    def tag(self, recording: str, **tags: str) -> RecordingEntry:
-        """Set tags of a recording; existing keys get the new values."""
-        lines = [journal.event(journal.TAGGED, key=text(k), value=text(v)) for k, v in tags.items()]
-        return self._edit(recording, *lines)
-
-    def untag(self, recording: str, *keys: str) -> RecordingEntry:
-        """Remove tags of a recording.
+        Args:
+            recording: Its label, name or id, or its entry.
+            name: Another name; its directory gets a label made from it.
+            note: A note, which `info` shows.
+            tag: Tags to set; keys that exist get the new values.
+            untag: Keys of tags to remove.
 
         Raises:
-            UsageError: A tag does not exist.
+            UsageError: A tag to remove does not exist.
         """
-        (entry,) = self.select([recording])
-        for key in keys:
-            if key not in entry.tags:
-                known = ", ".join(sorted(entry.tags)) or "none"
-                raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
-        return self._edit(entry, *[journal.event(journal.UNTAGGED, key=key) for key in keys])
-
-    def note(self, recording: str, note: str) -> RecordingEntry:
-        """Write a note about a recording; `info` shows it."""
-        return self._edit(recording, journal.event(journal.NOTED, text=text(note)))
-
-    @_again_if_overtaken
-    def _edit(self, recording: str | RecordingEntry, *lines: journal.Event) -> RecordingEntry:
         from hybridlog.maintenance import edit, index
 
         self.session.catch_up()
         (entry,) = self.select([recording])
+        lines = []
+        for key in [untag] if isinstance(untag, str) else untag:
+            if key not in entry.tags:
+                known = ", ".join(sorted(entry.tags)) or "none"
+                raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
+            lines.append(journal.event(journal.UNTAGGED, key=key))
+        for key, value in (tag or {}).items():
+            lines.append(journal.event(journal.TAGGED, key=text(key), value=text(value)))
+        if note is not None:
+            lines.append(journal.event(journal.NOTED, text=text(note)))
+        if name is not None:
+            lines.append(journal.event(journal.RENAMED, name=text(name)))
         edit.append(self.directory, self.catalog, entry, lines)
         connected = self.session.connected
         if connected is not None and self.session.connection.may_write:
@@ -1594,47 +1417,6 @@ class Store:
         report.freed_bytes += expired.freed_bytes
         report.problems += expired.problems
 
-    def import_from(
-        self,
-        other: str | Path,
-        recordings: Choice | Names | None = None,
-        progress: Progress | None = None,
-    ) -> CopyReport:
-        """Copy recordings in from another store; see `copy`.
-
-        Args:
-            other: The other store's directory.
-            recordings: The recordings, or what they must satisfy; None for all.
-            progress: Called with the bytes copied of all that are to be copied.
-
-        Raises:
-            StoreError: It is not a store, or this one cannot be written.
-        """
-        from hybridlog.maintenance.copying import run
-
-        there = directory_of(other)
-        with (
-            Store(there, mongo=NONE if there.is_remote else EMBEDDED) as source,
-            self.receiving() as place,
-        ):
-            return run(source.directory, place, source._chosen(recordings), progress=progress)
-
-    @contextmanager
-    def receiving(self) -> Iterator[DirectoryPlace]:
-        """This store as a place that recordings are copied to."""
-        from hybridlog.maintenance import tables
-        from hybridlog.maintenance.places import DirectoryPlace
-
-        def known() -> dict[str, str]:
-            return {one.id: one.label for one in self.session.snapshot().summaries}
-
-        self.session.catch_up()
-        place = DirectoryPlace(self.directory, known)
-        yield place
-        self.session.catch_up()
-        for entry in self.select(place.published):  # so that other readers find them
-            tables.make(self.directory, entry, is_new=True)
-
     def _chosen(self, recordings: Choice | Names | None) -> Sequence[RecordingSummary]:
         """Recordings that are to be copied."""
         if isinstance(recordings, Choice):
@@ -1646,51 +1428,6 @@ class Store:
         ids = {entry.id for entry in self.select(names)}
         return [one for one in self.summaries() if one.id in ids]
 
-    def repair(
-        self, recordings: Names | None = None, progress: Progress | None = None
-    ) -> list[Repaired]:
-        """Apply all repairs that lose no data; return them.
-
-        Args:
-            recordings: The recordings; None for all.
-            progress: Called after each chunk.
-        """
-        self._check_on_disk()
-        from hybridlog.maintenance.repair import repair, repair_index
-
-        self.session.mend()
-        self.refresh()
-        chosen = [] if recordings is None else self.select(recordings)
-        entries = None if recordings is None else chosen
-        done = repair(self.directory, self.catalog, self.repairs, entries)
-        self.refresh()
-        database = self.session.writable_database
-        if database is not None:
-            done += repair_index(
-                self.directory,
-                self.catalog,
-                database,
-                self.session.recordings() if recordings is None else self._now(chosen),
-                progress=progress,
-            )
-            self.refresh()
-        return done
-
     def _check_on_disk(self) -> None:
         if self.directory.is_remote:
             self.directory.check_writable()
-
-    def _now(self, entries: Sequence[RecordingEntry]) -> list[RecordingEntry]:
-        """Recordings as they are now, oldest first; those that are gone are left out."""
-        snapshot = self.session.snapshot()
-        places = sorted(snapshot.by_id.get(entry.id, -1) for entry in entries)
-        return [self.session.entry_of(snapshot.summaries[n]) for n in places if n >= 0]
-
-    def take_over(self) -> None:
-        """Record in the index that this store was moved to this location.
-
-        Raises:
-            DatabaseError: MongoDB does not answer.
-            StoreError: The database holds the index of another store.
-        """
-        self.session.take_over()

@@ -44,7 +44,7 @@ ALLOWED = {
     "google": ("hybridlog.schema.protobuf_codec",),
     "isal": ("hybridlog.drawing.pixels", "hybridlog_storage.checksum"),
     "lz4": ("hybridlog.formats.rosbag1.reader", "hybridlog_storage.segments.compression"),
-    "matplotlib": ("hybridlog.drawing.figure", "hybridlog.query.table_answers"),
+    "matplotlib": ("hybridlog.drawing.figure",),
     "mcap": (
         "hybridlog.formats.mcap",
         "hybridlog.formats.reading",

@@ -18,7 +18,7 @@ from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 
 import hybridlog as hl
-from hybridlog.attachments import StoredAttachment, file_names
+from hybridlog.attachments import StoredAttachment, extras_of, file_names
 from hybridlog.cli.answers import write_answer
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.recovery import recover_segment
@@ -26,6 +26,7 @@ from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.running import run
+from tests.copies import bring
 
 SECOND = 10**9
 TIMES = [100 * SECOND + n * SECOND for n in range(10)]
@@ -126,14 +127,14 @@ def test_a_channel_without_messages_changes_no_answer(store: hl.Store) -> None:
 
 def test_a_whole_recording_comes_back(log: Path, store: hl.Store, tmp_path: Path) -> None:
     write_answer(
-        store.all_topics(), "mcap", tmp_path / "out.mcap", extras=store.all_topics().extras()
+        store.all_topics(), "mcap", tmp_path / "out.mcap", extras=extras_of(store.all_topics())
     )
     assert contents(tmp_path / "out.mcap") == contents(log)
 
 
 def test_a_slice_has_the_attachments_from_before_its_end(store: hl.Store, tmp_path: Path) -> None:
     slice_ = store.topic("/n").between(TIMES[2], TIMES[5])
-    extras = slice_.extras()
+    extras = extras_of(slice_)
     assert [a.name for a in extras.attachments] == [a[1] for a in ATTACHMENTS[:3]]
     assert (extras.left_out, len(extras.metadata)) == (2, 3)
     assert {c.topic for c in extras.channels} == {"/n"}
@@ -199,22 +200,22 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
     with hl.open(tmp_path / "s", create=True) as store:
         report = store.record(packed, settings=SegmentSettings(segment_size=100))
         assert report.entry.segments > 3
-        store.rename("drive", "other name")
+        store.edit("drive", name="other name")
         assert listed(store.attachments("other-name")) == ATTACHMENTS
     for derived in ("catalog", "mongod", "tables"):
         shutil.rmtree(tmp_path / "s" / derived, ignore_errors=True)
         (tmp_path / "s" / derived).unlink(missing_ok=True)
     with hl.open(tmp_path / "s") as store:
-        store.rebuild_index()
+        store.index.rebuild()
         assert store.verify().findings == []
         (entry,) = store.recordings()
         assert (entry.attachments, entry.metadata_records) == (5, 3)
     with hl.open(tmp_path / "t", create=True) as other:
-        other.import_from(tmp_path / "s")
+        bring(other, tmp_path / "s")
         assert listed(other.attachments("other-name")) == ATTACHMENTS
         assert other.metadata("other-name") == METADATA
         query = other.all_topics()
-        write_answer(query, "mcap", tmp_path / "out.mcap", extras=query.extras())
+        write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_of(query))
     assert contents(tmp_path / "out.mcap") == contents(log)
 
 
@@ -347,7 +348,7 @@ def test_large_attachments_are_never_in_memory(tmp_path: Path) -> None:
             (large,) = store.attachments("a")
             large.save(tmp_path / "large")
             query = store.all_topics()
-            write_answer(query, "mcap", tmp_path / "out.mcap", extras=query.extras())
+            write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_of(query))
             _, peak = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()

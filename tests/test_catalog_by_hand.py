@@ -59,7 +59,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         content = bytearray(segment.read_bytes())
         content[chunk.offset + chunk.length - 1] ^= 1
         segment.write_bytes(content)
-        opened.rebuild_index()
+        opened.index.rebuild()
         opened.close()
         yield path
 
@@ -149,7 +149,7 @@ def test_a_line_that_was_lost_is_made_again(store: Path, kept: Path, want: Told)
             # No question has needed it; who reads everything is told, and of the cure.
             with hl.open(store) as opened:
                 assert [f.place for f in opened.verify().findings if f.place == "catalog"]
-                opened.repair()
+                opened.verify(repair=True)
             assert found(store) == findings, number
 
 

@@ -160,7 +160,7 @@ def test_without_mongodb_the_same_are_chosen(store: hl.Store) -> None:
     asked = {"where": "scan: n > 3", "tag": "robot"}
     with hl.open(store.directory.path, mongo="mongodb://localhost:1/?timeoutMS=20") as away:
         assert list(away.recordings(**asked).labels) == ["monday-2", "tuesday"]
-        assert away.without_database is None, "it was not even asked"
+        assert away.session.unavailable is None, "it was not even asked"
 
 
 @pytest.mark.parametrize(
@@ -223,11 +223,11 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
     assert [row["recording"] for row in rows] == ["tuesday"]
     assert call(store, "verify", *chosen).out.startswith("1 recording,")
     assert call(store, "index", "rebuild", *chosen).out.startswith("1 recording,")
-    assert call(store, "repair", *chosen).out == "nothing to mend\n"
-    for command in ("info", "verify", "index rebuild", "repair", "rm"):
+    assert call(store, "verify", "--repair", *chosen).out == "nothing to mend\n"
+    for command in ("info", "verify", "index rebuild", "verify --repair", "rm"):
         assert call(store, *command.split(), "--tag", "robot=9").code == 2
-    for command in ("fetch", "intervals", "tables"):
-        assert "robot=9" in call(store, command, "scan", "--tag", "robot=9").err
+    for command in ("fetch", "intervals", "info --tables -t"):
+        assert "robot=9" in call(store, *command.split(), "scan", "--tag", "robot=9").err
 
 
 def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
@@ -383,11 +383,11 @@ def test_columns_of_recordings_in_files(store: hl.Store, tmp_path: Path) -> None
     assert "mcap has none" in call(store, "export", "x.mcap", "--tags", "robot").err
 
 
-def test_import_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -> None:
+def test_copy_from_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -> None:
     path = tmp_path / "copy"
-    words = ["import", str(store.directory.path), "--store", str(path), "--tag", "robot=7"]
+    words = ["copy", "--from", str(store.directory.path), "--store", str(path), "--tag", "robot=7"]
     done = CliRunner().invoke(app, words)
-    assert done.stdout == "imported monday-1\nimported tuesday\n"
+    assert done.stdout == "copied monday-1\ncopied tuesday\n"
     nothing = CliRunner().invoke(app, [*words[:-1], "robot=9"])
     assert "robot=7" in str(nothing.exception)
 

@@ -632,6 +632,7 @@ def documented_classes() -> list[type]:
     from hybridlog.across.align import Aligned
     from hybridlog.across.sync import Synced
     from hybridlog.attachments import StoredAttachment
+    from hybridlog.index.of_store import Index
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
@@ -645,14 +646,13 @@ def documented_classes() -> list[type]:
     from hybridlog.record.recorder import RecordReport
     from hybridlog.recordings import Recordings
     from hybridlog.training.lerobot import LerobotReport
-    from hybridlog.training.windows import Windows
     from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
-    checks = [Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
+    checks = [Index, Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
     answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
-    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, Windows, *answers]
+    asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, CopyOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]
 
@@ -675,8 +675,6 @@ def test_every_public_name_is_described(thing: type) -> None:
         members |= {"rows": None}
     if thing.__name__ == "Synced":
         members |= dict.fromkeys(("topics", "recordings", "times", "counters", "left_out"))
-    if thing.__name__ == "Windows":
-        members |= dict.fromkeys(("names", "episodes", "left_out", "counters"))
     if thing.__name__ == "Recordings":
         conditions = inspect.signature(hl.Store.recordings).parameters
         members |= dict.fromkeys(("summaries", *(name for name in conditions if name != "self")))
@@ -1052,10 +1050,10 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
 def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path: Path) -> None:
     copied(recorded, tmp_path / "store")
     with hl.open(tmp_path / "store") as store:
-        store.rename("robot", "Tuesday")
-        store.tag("Tuesday", place="lab", weather="rain")
-        store.untag("Tuesday", "weather")
-        store.note("Tuesday", "the left wheel squeaks")
+        store.edit("robot", name="Tuesday")
+        store.edit("Tuesday", tag={"place": "lab", "weather": "rain"})
+        store.edit("Tuesday", untag=["weather"])
+        store.edit("Tuesday", note="the left wheel squeaks")
         entry = store.mark("Tuesday", "+2s", "bump", {"how": "hard"})
     second = FormatReader(tmp_path / "store")
     recording = second.recording(entry.label)

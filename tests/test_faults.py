@@ -568,7 +568,7 @@ def test_a_segment_that_is_lost(
         assert {f.recording for f in findings} == {"short"}
         assert any(path.name in f.place + f.problem for f in findings)
         # And it does not become right by making the index again.
-        opened.rebuild_index()
+        opened.index.rebuild()
         check_what_is_missing(opened, said, {number})
         assert opened.verify().findings
     run("verify", store=store.directory.path, code=1)
@@ -589,7 +589,7 @@ def test_a_recording_without_any_segment_is_told(store: hl.Store, said: Counter[
         (entry,) = opened.recordings()
         assert (entry.status, entry.messages) == ("damaged", 0)
         assert lost(entry) == topics_of(said)
-        opened.rebuild_index()
+        opened.index.rebuild()
         (entry,) = opened.recordings()
         assert (entry.status, lost(entry)) == ("damaged", topics_of(said))
 
@@ -687,7 +687,7 @@ def test_a_summary_is_made_again(store: hl.Store, said: Counter[Message]) -> Non
         check_what_is_missing(opened, said, {place.segment})
     run("index", "rebuild", store=store.directory.path, code=0)
     run("verify", store=store.directory.path, code=1)
-    done = run("repair", store=store.directory.path, code=0)
+    done = run("verify", "--repair", store=store.directory.path, code=0)
     assert place.path.name in done.stdout
     run("verify", store=store.directory.path, code=0)
     with reopened(store) as opened:
@@ -771,7 +771,7 @@ def test_a_chunk_that_is_listed_otherwise_than_it_is(
         check_what_is_missing(opened, said, {number})
         findings = [f for f in opened.verify().findings if path.name in f.place]
         assert 0 < len(findings) < 10
-        opened.repair()
+        opened.verify(repair=True)
         (entry,) = opened.recordings()
         assert entry.status == "complete"
         assert content(fetched(opened, "short")) == said
@@ -793,7 +793,7 @@ def test_segments_that_changed_places_are_found_and_put_back(
             other.name,
         }
         assert any("segment 1 of this recording" in f.problem for f in findings)
-    run("repair", store=store.directory.path, code=0)
+    run("verify", "--repair", store=store.directory.path, code=0)
     run("verify", store=store.directory.path, code=0)
     assert (one.read_bytes(), other.read_bytes()) == (first, second)
     with reopened(store) as opened:
@@ -841,7 +841,7 @@ def test_an_altered_index_is_found_and_mended(
     with pymongo.MongoClient[dict[str, Any]](uri) as client:
         alter(client[store.database.name])
     assert store.verify().findings
-    store.rebuild_index()
+    store.index.rebuild()
     assert store.verify().findings == []
 
 
@@ -1018,8 +1018,8 @@ def test_reindex_does_not_cost_a_running_recording_its_index(
         store.record(short)
     with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
         with pytest.raises(StoreError, match="being written"):
-            store.rebuild_index(["robot"])
-        assert [entry.label for entry in store.rebuild_index()] == ["short"]
+            store.index.rebuild(["robot"])
+        assert [entry.label for entry in store.index.rebuild()] == ["short"]
         assert content(fetched(store, "short")) == said
     (report,) = writing.result
     assert not isinstance(report, Exception), report
@@ -1050,7 +1050,7 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
                     else:
                         assert query.count() == said.total(), (label, name)
 
-        store.rebuild_index(progress=ask)
+        store.index.rebuild(progress=ask)
         assert asked > 14
     assert store.verify().findings == []
 

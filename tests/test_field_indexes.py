@@ -29,8 +29,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def store(path: Path) -> Iterator[hl.Store]:
     with hl.open(path, require_database=True) as opened:
-        for one in opened.indexes():
-            opened.remove_index(one.topic, *one.fields)
+        for one in opened.index.list():
+            opened.index.remove(one.topic, *one.fields)
         yield opened
 
 
@@ -57,42 +57,42 @@ def test_an_index_is_used_and_changes_no_answer(store: hl.Store) -> None:
     assert 0 < len(before) < store.topic("imu/data").count()
     where = {"angular_velocity.z": {"$gt": 0.05}}
     assert "IXSCAN" not in how(store, "imu__data", where)
-    assert store.add_index("imu/data", "angular_velocity.z") == [
+    assert store.index.add("imu/data", "angular_velocity.z") == [
         ("/imu/data", ("angular_velocity.z",))
     ]
     assert "IXSCAN" in how(store, "imu__data", where)
     assert [(m.log_time_ns, m.raw) for m in question] == before
     assert question.count() == len(before)
     # Once more is no error, and makes no second one.
-    assert len(store.add_index("imu/data", "angular_velocity.z")) == 1
+    assert len(store.index.add("imu/data", "angular_velocity.z")) == 1
 
 
 def test_reindex_makes_indexes_again(store: hl.Store) -> None:
-    store.add_index("imu/data", "orientation.x", "_meta.inserted_at")
-    store.add_index("/odom", "pose.pose.position.x")
-    known = store.indexes()
+    store.index.add("imu/data", "orientation.x", "_meta.inserted_at")
+    store.index.add("/odom", "pose.pose.position.x")
+    known = store.index.list()
     assert len(known) == 2
-    store.rebuild_index()
-    assert store.indexes() == known
+    store.index.rebuild()
+    assert store.index.list() == known
     assert "IXSCAN" in how(store, "odom", {"pose.pose.position.x": {"$gt": 0}})
     assert store.verify().findings == []
 
 
 def test_what_cannot_be_indexed(store: hl.Store) -> None:
     with pytest.raises(TopicError, match=r"no field 'angular_velocity.q'.*angular_velocity.z"):
-        store.add_index("imu/data", "angular_velocity.q")
+        store.index.add("imu/data", "angular_velocity.q")
     with pytest.raises(TopicError, match="no topic 'nothing'"):
-        store.add_index("nothing", "x")
+        store.index.add("nothing", "x")
     for fields in ((), ("orientation.x",) * 2, tuple(f"a{n}" for n in range(9))):
         with pytest.raises((UsageError, TopicError)):
-            store.add_index("imu/data", *fields)
+            store.index.add("imu/data", *fields)
     with pytest.raises(DatabaseError):
-        store.add_index("joint_states", "position", "velocity")
-    assert store.indexes() == []
+        store.index.add("joint_states", "position", "velocity")
+    assert store.index.list() == []
 
 
 def test_an_index_on_elements_of_an_array(store: hl.Store) -> None:
-    store.add_index("joint_states", "position")
+    store.index.add("joint_states", "position")
     assert "IXSCAN" in how(store, "joint_states", {"position": {"$gt": 100}})
 
 

@@ -331,7 +331,7 @@ def test_a_connection_about_some_recordings_is_made_again(store: Path) -> None:
         opened.session.connect([opened.select(["one"])[0]])
         kill_mongod(store)
         assert opened.verify().index
-        assert opened.without_database is None
+        assert opened.session.unavailable is None
 
 
 @pytest.mark.parametrize("waits", [False, True])
@@ -347,8 +347,8 @@ def test_a_recording_is_made_and_edited_though_its_mongod_ended(
         report = opened.record(log)
         assert report.indexed == report.entry.messages > 0
         kill_mongod(store)
-        assert opened.rename("one", "first").label == "first"
-        assert opened.tag("first", place="lab").tags == {"place": "lab"}
+        assert opened.edit("one", name="first").label == "first"
+        assert opened.edit("first", tag={"place": "lab"}).tags == {"place": "lab"}
         verified = opened.verify()
         assert verified.index
         assert not verified.findings
@@ -446,8 +446,8 @@ def test_a_user_who_may_only_read_can_ask_everything(
         assert opened.topic(IMU).where({"header.seq": {"$mod": [100, 0]}}).count() > 0
         assert not opened.verify().findings
         for change in (
-            opened.rebuild_index,
-            lambda: opened.add_index(IMU, "header.seq"),
+            opened.index.rebuild,
+            lambda: opened.index.add(IMU, "header.seq"),
             lambda: opened.start("more"),
         ):
             with pytest.raises(DatabaseError, match="may only read"):

@@ -194,7 +194,7 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
         store.record(bag, name="again", again=True)
 
     attempt(False, look, fetch, ask)
-    attempt(False, lambda store: store.verify(), lambda store: store.rebuild_index())
+    attempt(False, lambda store: store.verify(), lambda store: store.index.rebuild())
     attempt(True, record_live, record, look, fetch)
     attempt(False, lambda store: store.remove("small"))
     attempt(False, look)
@@ -318,7 +318,7 @@ def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
     victims.watch()
     with hl.open(store) as away:
         assert away.database is None
-        assert "Remove" in str(away.without_database)
+        assert "Remove" in str(away.session.unavailable)
         assert away.topic("/imu/data").count() > 0
     (store / "mongod").unlink()
     with hl.open(store) as back:

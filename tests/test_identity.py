@@ -44,6 +44,7 @@ from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
+from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
 
@@ -114,7 +115,7 @@ def test_a_renamed_directory_changes_the_label_alone(place: Path, uri: str) -> N
         assert not store.repairs.indexed
         assert answers(store) == answers(store, "other") == answers(store, before.id) == right()
         assert not store.verify().findings
-        store.rebuild_index()
+        store.index.rebuild()
         assert answers(store) == right()
 
 
@@ -136,9 +137,9 @@ def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, co
             assert answers(store) == answers(store, copy) == right()
             (finding,) = store.verify().findings
             assert (finding.recording, "copy of one" in finding.problem) == (copy, True)
-            store.rebuild_index()
+            store.index.rebuild()
             assert answers(store) == right()
-            done = store.repair()
+            done = store.verify(repair=True)
             assert [one.is_cured for one in done if one.recording == copy] == [False]
     with hl.open(place, mongo=uri) as store:
         store.remove(copy)
@@ -181,10 +182,10 @@ def test_import(place: Path, uri: str, tmp_path: Path) -> None:
         store.record(make_log(tmp_path / "second.mcap", 500), name="second")
     with hl.open(tmp_path / "mine", create=True) as mine:
         mine.record(make_log(tmp_path / "third.mcap", 900), name="one")
-        report = mine.import_from(place, ["one"])
+        report = bring(mine, place, ["one"])
         assert (report.copied, report.known) == (["one-2"], [])
         assert answers(mine, "one-2") == right()
-        again = mine.import_from(place)
+        again = bring(mine, place)
         assert (again.copied, again.known) == (["second"], ["one-2"])
         assert mine.topic("/n").count() == 3 * COUNT
         assert not mine.repairs.adopted  # that stands in the journals already
@@ -205,7 +206,7 @@ def test_an_import_goes_on_where_it_was_stopped(place: Path, uri: str, tmp_path:
         half = (source / "000001.mcap").read_bytes()
         (begun / "000001.mcap").write_bytes(half[: len(half) // 2])
         assert not mine.recordings()
-        report = mine.import_from(place)
+        report = bring(mine, place)
         left = entry.stored_bytes - (source / "000000.mcap").stat().st_size - len(half) // 2
         assert (report.copied, report.bytes_copied) == (["one"], left)
         assert answers(mine) == right()
@@ -218,10 +219,10 @@ def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
     data[data.index(b"xxxx")] ^= 1  # in a payload: nothing but the copy is checked for that
     path.write_bytes(data)
     with hl.open(tmp_path / "mine", create=True) as mine:
-        assert "does not match its checksums" in mine.import_from(place).refused["one"]
+        assert "does not match its checksums" in bring(mine, place).refused["one"]
         assert not mine.recordings()
         path.unlink()
-        assert "is incomplete" in mine.import_from(place).refused["one"]
+        assert "is incomplete" in bring(mine, place).refused["one"]
         assert not mine.recordings()
 
 
@@ -240,10 +241,10 @@ def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
     for _ in range(2):
         with hl.open(copy, mongo=uri) as store:
             assert store.database is None
-            assert "copy" in str(store.without_database)
-            assert "--new-id" in str(store.without_database)
+            assert "copy" in str(store.session.unavailable)
+            assert "--new-id" in str(store.session.unavailable)
             with pytest.raises(DatabaseError, match="--moved"):
-                store.topic("/n") if store.topics() else store.database_for("This")
+                store.topic("/n") if store.topics() else store.session.database_for("This")
         with pytest.raises(StoreError, match="copy"):
             hl.open(copy, mongo=uri, require_database=True)
     assert documents(uri) == before
@@ -295,27 +296,27 @@ def test_a_store_from_another_host_asks_first(place: Path, uri: str) -> None:
         state.claim({"id": mark["id"], "host": "another", "path": "/data/store"})
     with hl.open(place, mongo=uri) as store:
         with pytest.raises(DatabaseError, match="/data/store on another"):
-            store.database_for("This")
+            store.session.database_for("This")
         assert store.topic("/n").count() == COUNT  # by topic and time it goes on
-        store.take_over()
+        store.session.take_over()
         assert answers(store) == right()
 
 
 def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
     with hl.open(place, mongo=uri) as store:
-        entry = store.rename("one", "second floor")
+        entry = store.edit("one", name="second floor")
         assert (entry.label, entry.name) == ("second-floor", "second floor")
-        store.tag("second-floor", b="2", a="3")
-        store.untag("second-floor", "b")
-        store.note("second-floor", "the wheel slipped")
+        store.edit("second-floor", tag={"b": "2", "a": "3"})
+        store.edit("second-floor", untag=["b"])
+        store.edit("second-floor", note="the wheel slipped")
         with pytest.raises(UsageError, match="no tag 'x'"):
-            store.untag("second-floor", "x")
+            store.edit("second-floor", untag=["x"])
         store.mark("second-floor", "+10s", "slip", {"kind": "odd"})
         store.mark("second-floor", "110.5", "after")
         with pytest.raises(TimeError):
             store.mark("second-floor", "never", "x")
         with pytest.raises(TopicError):
-            store.tag("one", a="1")
+            store.edit("one", tag={"a": "1"})
 
     def check(store: hl.Store) -> None:
         (found,) = store.recordings()
@@ -332,7 +333,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             (110 * SECOND + SECOND // 2, "after"),
         ]
         assert marks.where("text == 'slip'").count() == 1
-        near = store.topic("/n").around(marks.where("tags.kind == 'odd'"), before="1s", after="1s")
+        near = store.topic("/n").during(marks.where("tags.kind == 'odd'").windows("1s", "1s"))
         assert [m.fields["n"] for m in near] == [109, 110]
         assert answers(store, "second-floor") == right()
         assert not store.verify().findings
@@ -343,7 +344,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             mirror = database.find_one("hybridlog.recordings", {})
             assert mirror is not None
             assert (mirror["name"], mirror["tags"]) == ("second floor", {"a": "3"})
-        store.rebuild_index()
+        store.index.rebuild()
         check(store)
     shutil.rmtree(place / "catalog")
     with hl.open(place, mongo=uri) as store:
@@ -365,7 +366,7 @@ def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="without --at"):
             store.mark(recording.id, "100", "x")
         with pytest.raises(StoreError, match="being written"):
-            store.tag(recording.id, a="1")
+            store.edit(recording.id, tag={"a": "1"})
         with pytest.raises(StoreError, match="being written"):
             store.remove(recording.id)
 
@@ -386,7 +387,7 @@ def test_a_removal_that_was_announced_is_finished(place: Path, uri: str) -> None
         assert store.repairs.removed == ["one"]
         assert not store.recordings()
         assert list((place / "recordings").iterdir()) == []
-        database = store.database_for("This")
+        database = store.session.database_for("This")
         assert database.count("n", {}) == 0
         assert IndexState(database).of() == {}
 
@@ -477,13 +478,13 @@ def content_of(store: Path, recording: str) -> dict[str, bytes]:
 FOLDER = files.folder
 CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
     "rm": lambda store, one: store.remove(one),
-    "tag": lambda store, one: store.tag(one, b="2"),
-    "untag": lambda store, one: store.untag(one, "a"),
-    "note": lambda store, one: store.note(one, "seen"),
-    "rename": lambda store, one: store.rename(one, "new"),
+    "tag": lambda store, one: store.edit(one, tag={"b": "2"}),
+    "untag": lambda store, one: store.edit(one, untag=["a"]),
+    "note": lambda store, one: store.edit(one, note="seen"),
+    "rename": lambda store, one: store.edit(one, name="new"),
     "mark": lambda store, one: store.mark(one, "start", "seen"),
     "compact": lambda store, one: store.compact([one], ["/scan"], drop_mcap=True),
-    "repair": lambda store, one: store.repair([one]),
+    "repair": lambda store, one: store.verify([one], repair=True),
 }
 
 
@@ -571,7 +572,7 @@ def test_a_command_finds_a_recording_whose_label_goes_around(
                 exchange.steps |= {again}
                 with monkeypatch.context() as patch:
                     patch.setattr(files, "folder", exchange.folder)
-                    assert store.tag(one, b="2").id == one
+                    assert store.edit(one, tag={"b": "2"}).id == one
             assert content_of(place, other) == others, (step, again)
             assert content_of(place, one) != before, (step, again)
             if max(exchange.steps) >= 0:
@@ -585,10 +586,10 @@ def test_twenty_commands_at_once_wait_for_each_other(
     path = tmp_path / "store"
     shutil.copytree(base, path)
     commands: list[Callable[[hl.Store], object]] = [
-        *(partial(hl.Store.tag, recording=one, **{f"key{n}": str(n)}) for n in range(8)),
-        *(partial(hl.Store.note, recording=one, note=f"note {n}") for n in range(4)),
+        *(partial(hl.Store.edit, recording=one, tag={f"key{n}": str(n)}) for n in range(8)),
+        *(partial(hl.Store.edit, recording=one, note=f"note {n}") for n in range(4)),
         *(partial(hl.Store.mark, recording=one, moment="+0s", note=f"mark {n}") for n in range(4)),
-        *(partial(hl.Store.rename, recording=one, name=f"name {n}") for n in range(3)),
+        *(partial(hl.Store.edit, recording=one, name=f"name {n}") for n in range(3)),
         partial(hl.Store.compact, recordings=[one], topics=["/scan"]),
     ]
     waiting: set[int] = set()
@@ -648,9 +649,9 @@ def test_an_import_takes_the_recording_that_was_chosen(
 
             with monkeypatch.context() as patch:
                 patch.setattr(copying, "run", armed)
-                done = store.import_from(place, [one])
+                done = bring(store, place, [one])
                 if change is remove and done.refused:
-                    done = store.import_from(base, [one])
+                    done = bring(store, base, [one])
         assert len(done.copied) == 1, step
         with hl.open(target, mongo=NOWHERE) as store:
             assert [entry.id for entry in store.recordings()] == [one], step
@@ -666,13 +667,13 @@ def test_an_index_is_made_of_the_recording_that_was_chosen(
     with hl.open(place, mongo=uri) as store:
         one = store.entry("one").id
         other = store.record(make_log(tmp_path / "b.mcap", 500), name="b").entry
-        store.rename("one", "a")
+        store.edit("one", name="a")
         for step in range(12):
             exchange = Exchange(place, swap, 40 * step, after=False)
             turns = IndexState(store.connect()).of([one[:16], other.key])
             with monkeypatch.context() as patch:
                 patch.setattr(files, "folder", exchange.folder)
-                assert [entry.id for entry in store.rebuild_index([one])] == [one]
+                assert [entry.id for entry in store.index.rebuild([one])] == [one]
             found = IndexState(store.connect()).of([one[:16], other.key])
             assert found[other.key].turn == turns[other.key].turn, step
             assert found[one[:16]].turn > turns[one[:16]].turn, step

@@ -11,6 +11,7 @@ import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
+from hybridlog.index.of_store import contents
 from hybridlog_storage.mongo import mongod_keeper
 from tests.cli.running import run
 from tests.faults import logs
@@ -33,8 +34,8 @@ def mongod(path: Path) -> psutil.Process:
 def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) -> None:
     limit(clients_wait_s=5.0)
     with hl.open(path) as store:
-        address = store.index_address()
-        assert store.index_contents() == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]
+        address = store.index.address()
+        assert contents(store.session) == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]
     server = mongod(path)
     with MongoClient[dict[str, object]](address.uri) as client:
         time.sleep(7)
@@ -42,7 +43,7 @@ def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) ->
         assert client[address.database]["number"].count_documents({"n": {"$gte": 5}}) == 15
     server.wait(30)
     with hl.open(path) as store:
-        assert store.index_address() == address
+        assert store.index.address() == address
 
 
 def test_a_record_of_the_kernel_tells_connections(path: Path) -> None:

@@ -230,13 +230,13 @@ def test_a_plan_promises_what_goes(store: Path) -> None:
 def test_an_import_says_where_payloads_are(store: Path, recorded: Path, tmp_path: Path) -> None:
     whole = Path(shutil.copytree(recorded, tmp_path / "whole"))
     keep("--max-age", "0s", store=store)
-    assert answer("import", store, store=whole).out == "run is here already\n"
+    assert answer("copy", "--from", store, store=whole).out == "run is here already\n"
     assert payloads(whole)[0] == image(0)
     assert (
         "payloads that were deleted here were not copied"
-        in answer("import", whole, store=store).out
+        in answer("copy", "--from", whole, store=store).out
     )
-    answer("import", store, store=tmp_path / "copy")
+    answer("copy", "--from", store, store=tmp_path / "copy")
     assert payloads(tmp_path / "copy") == payloads(store)
 
 

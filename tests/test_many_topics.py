@@ -57,7 +57,7 @@ def least(value: int) -> dict[str, object]:
 
 
 def database_of(store: hl.Store) -> Database:
-    return store.database_for("this test")
+    return store.session.database_for("this test")
 
 
 def documents(store: hl.Store) -> Counter[str]:
@@ -102,7 +102,7 @@ def test_reindex_and_verify(store: hl.Store) -> None:
     findings = store.verify().findings
     assert {finding.recording for finding in findings} == {"one"}
     assert any("hybridlog.shared" in finding.place for finding in findings)
-    store.rebuild_index()
+    store.index.rebuild()
     assert documents(store) == ALL
     assert store.verify().findings == []
     assert store.all_topics().where(least(3)).count() == 3 * FEW
@@ -116,7 +116,7 @@ def test_few_commands_verify_many_topics(tmp_path: Path, calls: Calls) -> None:
         assert store.verify().findings == []
         assert store.verify(["log"]).findings == []
         assert sent.total() <= 40, sent
-        place = store.topic_place(topic(7))
+        place = store.index.place(topic(7))
         assert database_of(store).delete(place.collection, place.documents()) == 5
         assert "messages in the segments" in store.verify().findings[-1].problem
 
@@ -141,7 +141,7 @@ def test_a_surplus_document_of_a_shared_collection_is_found(store: hl.Store) -> 
     database.replace(SHARED, {"_id": found["_id"]}, found)
     (finding,) = store.verify(["two"]).findings
     assert "37 index documents, 36 messages" in finding.problem
-    store.rebuild_index(["two"])
+    store.index.rebuild(["two"])
     assert documents(store) == ALL
     assert store.verify().findings == []
 
@@ -171,7 +171,7 @@ def test_a_lost_list_of_topics_makes_no_wrong_answer(store: hl.Store) -> None:
         question.count()
     assert store.topic(topic(FEW - 1)).where("data >= 3").count() == 3
     assert len(store.verify().findings) > 0
-    store.rebuild_index()
+    store.index.rebuild()
     assert store.verify().findings == []
     assert documents(store).total() == sum(ALL.values())
     assert question.count() == 3
@@ -200,24 +200,24 @@ def test_an_interrupted_recording_is_indexed_where_it_was_begun(
 def test_an_index_on_a_field_of_a_shared_collection(store: hl.Store) -> None:
     own, mine, other = topic(0), topic(5), topic(6)
     for name in (own, mine):
-        store.add_index(name, "data")
-    assert [(one.topic, one.fields) for one in store.indexes()] == [
+        store.index.add(name, "data")
+    assert [(one.topic, one.fields) for one in store.index.list()] == [
         (own, ("data",)),
         (mine, ("data",)),
     ]
-    assert store.indexes(other) == []
+    assert store.index.list(other) == []
     database = database_of(store)
     question = {"_meta.topic": mine, "data": {"$gt": 2.5}}
     with pymongo.MongoClient[dict[str, Any]](database.address) as client:
         found = client[database.name][SHARED].find(question)
         assert "IXSCAN" in str(found.explain()["queryPlanner"]["winningPlan"])
-    store.rebuild_index()
-    assert len(store.indexes()) == 2
+    store.index.rebuild()
+    assert len(store.index.list()) == 2
     assert store.topic(mine).where(least(3)).count() == 3
     assert store.topic(other).where(least(3)).count() == 3
-    assert store.remove_index(other, "data") == 0
-    assert store.remove_index(mine, "data") == 1
-    assert [one.topic for one in store.indexes()] == [own]
+    assert store.index.remove(other, "data") == 0
+    assert store.index.remove(mine, "data") == 1
+    assert [one.topic for one in store.index.list()] == [own]
 
 
 # Many.

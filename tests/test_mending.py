@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli.open_store import _print_left
+from hybridlog.cli.open_store import _print_left, mended_meanwhile
 from hybridlog_storage.catalog import Catalog
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import NO_MONGODB, Running, begun
@@ -104,7 +104,7 @@ def test_what_was_read_anew_is_written_after_the_answer(died: hl.Store) -> None:
 
 
 def test_a_store_that_stays_open_is_repaired_meanwhile(died: hl.Store, known: Known) -> None:
-    with died.mended_meanwhile(0.05):
+    with mended_meanwhile(died, 0.05):
         deadline = time.monotonic() + 60
         while died.entry(LABEL).status != "recovered":
             assert time.monotonic() < deadline

@@ -525,7 +525,7 @@ class Machine(RuleBasedStateMachine):
         places = {f.place for f in self.store.verify().findings} - self.places()
         assert places <= {"catalog"}
         if places:
-            self.store.repair()
+            self.store.verify(repair=True)
         self.open_again()  # what only decoding tells is found out now, if a question missed it
         self.changed = True
 
@@ -535,7 +535,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule()
     def rebuild(self) -> None:
-        assert {r.id for r in self.store.rebuild_index()} == set(self.model)
+        assert {r.id for r in self.store.index.rebuild()} == set(self.model)
         self.changed = True
 
     # What people do to a recording.
@@ -546,7 +546,7 @@ class Machine(RuleBasedStateMachine):
         recording = self.chosen(which)
         known = self.model[recording]
         known.name, known.label = name, self.free_label(NAMES[name], but=known.label)
-        entry = self.store.rename(recording, name)
+        entry = self.store.edit(recording, name=name)
         assert (entry.name, entry.label) == (known.name, known.label)
         self.changed = True
 
@@ -564,9 +564,9 @@ class Machine(RuleBasedStateMachine):
         if untagged and known.tags:
             gone = min(known.tags)
             del known.tags[gone]
-            self.store.untag(recording, gone)
+            self.store.edit(recording, untag=[gone])
         known.tags |= tags
-        assert self.store.tag(recording, **tags).tags == known.tags
+        assert self.store.edit(recording, tag=tags).tags == known.tags
         self.changed = True
 
     @precondition(lambda self: self.model)
@@ -574,7 +574,7 @@ class Machine(RuleBasedStateMachine):
     def note(self, which: int, text: str) -> None:
         recording = self.chosen(which)
         self.model[recording].notes.append(text)
-        self.store.note(recording, text)
+        self.store.edit(recording, note=text)
         self.changed = True
 
     @precondition(lambda self: self.model)
@@ -688,7 +688,7 @@ class Machine(RuleBasedStateMachine):
             self.open_again()
         else:
             self.store.refresh()
-            self.store.rebuild_index([recording])
+            self.store.index.rebuild([recording])
         self.take_kinds(recording)
         self.changed = True
 

@@ -62,7 +62,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for n in range(MANY):
             record(store, n)
         for field in ("x", "u", "s"):
-            store.add_index("/t", field)
+            store.index.add("/t", field)
     return path
 
 
@@ -147,7 +147,7 @@ def test_recordings_whose_documents_may_not_tell_are_asked(tmp_path: Path, calls
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         for n in range(20):
             record(store, n)
-        store.add_index("/t", "x")
+        store.index.add("/t", "x")
         record(store, 20, b"short")
         record(store, 21, no_index="**")
     with hl.open(tmp_path / "store", require_database=True) as store:
@@ -172,26 +172,26 @@ def test_an_index_that_others_change_is_not_believed(path: Path, tmp_path: Path)
         query = store.topic("/t").where("x >= 38")
         assert query.count() == 10
         with hl.open(path, require_database=True) as other:
-            other.rebuild_index(["log 38"])
+            other.index.rebuild(["log 38"])
             assert query.count() == 10
             key = other.select(["log 39"])[0].key
-            database = other.database_for("the test")
+            database = other.session.database_for("the test")
             state = {"$set": {"index.state": "clearing"}}
             database.update("hybridlog.recordings", {"_id": key}, state)
             database.update("hybridlog.store", {"_id": "turn"}, {"$inc": {"turn": 1}})
             database.delete("t", {"_meta.rec": key})
         assert query.count() == 10
         assert query.count() == 10
-        store.rebuild_index(["log 39"])
+        store.index.rebuild(["log 39"])
         assert query.count() == 10
 
 
 def test_an_index_that_was_dropped_is_not_missed(path: Path) -> None:
     with hl.open(path, require_database=True) as store:
-        store.database_for("the test").drop_index("t", [("x", 1)])
+        store.session.database_for("the test").drop_index("t", [("x", 1)])
         assert store.topic("/t").where("x >= 38").count() == 10
-        store.add_index("/t", "x")
-        assert store.remove_index("/t", "s") == 1
+        store.index.add("/t", "x")
+        assert store.index.remove("/t", "s") == 1
         assert [one.fields for one in store.session.field_indexes] == [("x",), ("u",)]
         assert store.topic("/t").where("s == 'odd 9'").count() == 5
-        store.add_index("/t", "s")
+        store.index.add("/t", "s")

@@ -18,6 +18,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.collection_names import collection_of
 from tests.calls import Calls
 from tests.cli.running import run
+from tests.copies import bring
 from tests.limits import Limit
 from tests.many_topics import topic, write_log
 
@@ -39,7 +40,7 @@ def store(tmp_path: Path, log: Path) -> Iterator[hl.Store]:
 
 
 def documents(store: hl.Store) -> dict[str, int]:
-    database = store.database_for("this test")
+    database = store.session.database_for("this test")
     found = {name: database.count(collection_of(name), {"_meta.seq": {"$gte": 0}}) for name in FOUR}
     return {name: count for name, count in found.items() if count}
 
@@ -71,11 +72,11 @@ def test_index_documents_that_are_not_there_are_no_empty_answer(store: hl.Store)
 
 def test_every_rebuild_keeps_it(store: hl.Store) -> None:
     assert store.verify().findings == []
-    store.rebuild_index()
+    store.index.rebuild()
     assert documents(store) == INDEXED
-    store.rebuild_index(["log"])
+    store.index.rebuild(["log"])
     assert documents(store) == INDEXED
-    store.database_for("this test").drop_all()
+    store.session.database_for("this test").drop_all()
     path = store.directory.path
     store.close()
     shutil.rmtree(path / CATALOG)
@@ -96,20 +97,20 @@ def test_what_has_no_documents_is_not_missing_among_those_of_others(
         store.record(log, name="whole")
         store.record(log, name="part", again=True, no_index=matcher(["re:.*signal[23]"]))
         indexed = calls(StoreIndex, "catch_up")
-        store.rebuild_index()
+        store.index.rebuild()
         assert sorted(label for _, label in indexed) == ["part", "whole"]
         assert store.verify().findings == []
 
 
 def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
-    database = store.database_for("this test")
+    database = store.session.database_for("this test")
     (entry,) = store.recordings()
     stray = {"_id": b"x" * 24, "_meta": {"rec": entry.key}}
     database.ensure_collection(collection_of(LEFT_OUT[0]))
     database.replace(collection_of(LEFT_OUT[0]), {"_id": stray["_id"]}, stray)
     (finding,) = store.verify().findings
     assert "1 index documents, 0 messages" in finding.problem
-    store.rebuild_index()
+    store.index.rebuild()
     assert documents(store) == INDEXED
     assert store.verify().findings == []
 
@@ -121,7 +122,7 @@ def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
     marked = {c.topic for c in channels if c.metadata.get("hybridlog.no_index") == "1"}
     assert marked == set(LEFT_OUT)
     with hl.open(tmp_path / "other", create=True, require_database=True) as other:
-        other.import_from(store.directory.path)
+        bring(other, store.directory.path)
         assert documents(other) == INDEXED
         # A slice is a new log.
         run("fetch", "-t", "**", "-o", tmp_path / "slice.mcap", store=store.directory.path)
@@ -137,7 +138,7 @@ def test_a_live_recording(tmp_path: Path) -> None:
             for number in range(5):
                 for channel in (said, silent):
                     recording.write(channel, b'{"n": %d}' % number)
-        database = store.database_for("this test")
+        database = store.session.database_for("this test")
         assert database.count("said") == 5
         assert not {"silent", "hybridlog.shared"} & set(database.list_collections())
         assert store.topic("silent").where("n >= 3").count() == 2

@@ -49,7 +49,7 @@ READING: Sequence[Sequence[str]] = (
     ("verify",),
 )
 CHANGING: Sequence[Sequence[str]] = (
-    ("repair",),
+    ("verify", "--repair"),
     ("tag", "odd", "k=v"),
     ("edit", "odd", "--note", "x"),
     ("mark", "odd", "--at", "+1s", "m"),
@@ -69,9 +69,9 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
             log = write_log(place / f"{name}.mcap", robot(count))
             store.record(log, name=name, settings=SETTINGS)
         store.compact(topics=["scan"], drop_mcap=True)
-        store.note("odd", "wind")
-        store.tag("odd", place="lab")
-        store.untag("odd", "place")
+        store.edit("odd", note="wind")
+        store.edit("odd", tag={"place": "lab"})
+        store.edit("odd", untag=["place"])
         store.mark("odd", BASE + STEP, "here")
     for name in ("mongod", "catalog"):
         shutil.rmtree(path / name, ignore_errors=True)

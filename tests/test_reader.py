@@ -364,7 +364,6 @@ def test_a_table_without_rows_has_all_columns(store: hl.Store, robot: Truth) -> 
     assert query.to_arrow().column_names == ["log_time", *flat(robot["/battery"][0].message)]
     assert list(query.to_pandas().columns) == list(flat(robot["/battery"][0].message))
     assert list(query) == []
-    assert query.first() is None
 
 
 def test_fields_choose_columns(store: hl.Store, robot: Truth) -> None:
@@ -434,15 +433,12 @@ def test_images_scans_and_clouds_as_arrays(store: hl.Store, robot: Truth) -> Non
     assert np.array_equal(
         np.asarray(scan).reshape(-1)[: len(scan)], np.asarray(scan).reshape(-1)[: len(scan)]
     )
-    cloud = store.topic("/lidar/points").first()
-    assert cloud is not None
-    points = cloud.to_numpy()
+    points = next(iter(store.topic("/lidar/points"))).to_numpy()
     want = robot["/lidar/points"][0].message
     assert points.size == want.width * want.height
     xyz = np.frombuffer(want.data.tobytes(), np.float32).reshape(points.size, -1)[:, 0]
     assert np.array_equal(np.asarray(points["x"]).reshape(-1), xyz, equal_nan=True)
-    first = store.topic("/imu/data").first()
-    assert first is not None
+    first = next(iter(store.topic("/imu/data")))
     with pytest.raises(PayloadError):
         first.to_numpy()
 
@@ -774,7 +770,7 @@ def test_a_topic_without_a_definition_makes_no_table(tmp_path: Path) -> None:
 def test_by_time_without_mongodb(base: Path, store: hl.Store, robot: Truth) -> None:
     with hl.open(base / "store", mongo=NOWHERE) as away:
         assert away.database is None
-        assert isinstance(away.without_database, DatabaseError)
+        assert isinstance(away.session.unavailable, DatabaseError)
         assert [r.id for r in away.recordings()] == [r.id for r in store.recordings()]
         assert [r.messages for r in away.recordings()] == [r.messages for r in store.recordings()]
         assert [r.span for r in away.recordings()] == [r.span for r in store.recordings()]

@@ -76,7 +76,7 @@ DAMAGED = {
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     with hl.open(tmp_path_factory.mktemp("real") / "store", create=True) as opened:
-        assert opened.database is not None, opened.without_database
+        assert opened.database is not None, opened.session.unavailable
         yield opened
 
 
@@ -184,7 +184,7 @@ def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> No
     assert store.verify().findings == []
     before = dump(store)
     assert sum(map(len, before.values())) > 150_000
-    store.rebuild_index()
+    store.index.rebuild()
     assert dump(store) == before
 
 

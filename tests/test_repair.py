@@ -50,10 +50,10 @@ def look(store: Path) -> tuple[str, int, int]:
 def repair(store: Path) -> dict[tuple[str, str], bool]:
     """What `repair` says, by recording and place: whether it is cured."""
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        done = {(one.recording, one.place): one.is_cured for one in opened.repair()}
+        done = {(one.recording, one.place): one.is_cured for one in opened.verify(repair=True)}
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         # What was cured is cured, and what was not is said again.
-        again = opened.repair()
+        again = opened.verify(repair=True)
         assert {(one.recording, one.place) for one in again} == {
             k for k, v in done.items() if not v
         }
@@ -115,7 +115,7 @@ def test_a_damaged_summary_names_its_cure(store: Path) -> None:
     flip_the_summary(store)
     said = answer("verify", "--mongo", "none", store=store, code=None).out
     assert "A repair makes the summary again" in said
-    assert "`mcap recover`; run `hybridlog repair`" in said
+    assert "`mcap recover`; run `hybridlog verify --repair`" in said
 
 
 def test_a_segment_whose_messages_are_damaged_stays_as_it_is(store: Path) -> None:
@@ -228,16 +228,18 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
     data[600] ^= 4
     file(store, 1).write_bytes(data)
     with hl.open(store) as opened:
-        opened.rebuild_index()
+        opened.index.rebuild()
         entry = opened.entry("one")
         lost = sum(row["count"] for row in entry.end["losses"])
         assert (entry.status, lost > 0) == ("damaged", True)
         with pytest.raises(SegmentError, match=r"byte \d+ of .*000001\.mcap is damaged"):
             opened.topic("/n").where("n >= 0").count()
         assert opened.topic("/n").in_recording("two").where("n >= 0").count() == COUNT
-        assert not [one for one in opened.repair() if one.place == "index"]
+        assert not [one for one in opened.verify(repair=True) if one.place == "index"]
         file(store, 1).write_bytes(whole)
-        assert [one.is_cured for one in opened.repair() if one.place == "index"] == [True]
+        assert [one.is_cured for one in opened.verify(repair=True) if one.place == "index"] == [
+            True
+        ]
         assert opened.entry("one").status == "complete"
         assert opened.topic("/n").where("n >= 0").count() == 2 * COUNT
         assert not opened.verify().findings

@@ -18,6 +18,7 @@ from rosbags.typesys import (
 from rosbags.typesys.store import Typestore
 
 import hybridlog as hl
+from hybridlog.query.asked import channels_of
 from hybridlog.query.query import Query
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -90,9 +91,9 @@ def test_every_value_of_real_logs(tmp_path: Path, path: Path) -> None:
         entry = store.record(path).entry
         for topic in sorted({c.topic for c in entry.channels if c.stats.messages}):
             query = store.topic(topic)
-            channel = query.channels()[0]
+            channel = channels_of(query)[0]
             schema = channel.channel.schema
-            if {other.channel.schema for other in query.channels()} != {schema}:
+            if {other.channel.schema for other in channels_of(query)} != {schema}:
                 continue
             if schema is None or channel.codec.reason is not None:
                 continue

@@ -11,6 +11,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.columns.payload_files import WalkedSegment
 from hybridlog.demo.write import write_bag
+from hybridlog.index.of_store import contents
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -92,15 +93,15 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
     for ask in (
         lambda: store.topic("scan").where({"$expr": {"$gt": ["$header.seq", 3]}}).count(),
         lambda: list(store.topic("scan").where({"$expr": True}).documents()),
-        store.indexes,
-        store.rebuild_index,
+        store.index.list,
+        store.index.rebuild,
         store.connect,
     ):
         with pytest.raises(DatabaseError, match=r"without MongoDB.*--mongo embedded"):
             ask()
-    assert isinstance(store.without_database, WithoutMongoError)
+    assert isinstance(store.session.unavailable, WithoutMongoError)
     assert (store.verify().index, store.verify().findings) == (False, [])
-    assert store.index_place == "none"
+    assert store.session.connection.place == "none"
 
 
 def test_header_statistics_and_marks(
@@ -245,4 +246,4 @@ def test_as_many_were_removed_as_recorded_without_mongodb(bag: Path, tmp_path: P
         database = store.connect()
         second = store.entry("second")
         assert IndexState(database).of().keys() == {second.key} != {first.key}
-        assert sum(count for *_, count in store.index_contents()) == second.messages
+        assert sum(count for *_, count in contents(store.session)) == second.messages

@@ -75,7 +75,7 @@ class HybridlogAsker(_Stored, Asker):
 
     def before_errors(self) -> int:
         errors = self.store.topic(ROSOUT).where(f"level == {ERROR}")
-        return self.store.all_topics().around(errors, before="5min").count()
+        return self.store.all_topics().during(errors.windows("5min")).count()
 
 
 class HybridlogReading(_Stored, Reading):

@@ -1,4 +1,4 @@
-"""What a user does with a store: commands, SQL, many recordings, the page, windows, buckets.
+"""What a user does with a store: commands, SQL, many recordings, the page, buckets.
 
 All of it but `many` and `remote` is about one recording of the robot's log. Each group runs
 in a process of its own; a figure is the median of several times after a first one, on the clock
@@ -45,19 +45,17 @@ class Settings(NamedTuple):
         seconds: Of the robot's log.
         recordings: In the store of many.
         times: Of each task.
-        windows: Windows of pictures.
     """
 
     seconds: int
     recordings: int
     times: int
-    windows: int
 
 
 SETTINGS: dict[Scale, Settings] = {
-    "full": Settings(600, 1000, 5, 100),
-    "quick": Settings(300, 1000, 3, 50),
-    "tiny": Settings(10, 10, 1, 5),
+    "full": Settings(600, 1000, 5),
+    "quick": Settings(300, 1000, 3),
+    "tiny": Settings(10, 10, 1),
 }
 NEAR = "/odom: twist.twist.linear.x > 1.2"
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -367,40 +365,6 @@ def _resident_mb(pid: int) -> float:
     return rss(with_children([pid])) / 1e6
 
 
-def windows_side(*, store: str, windows: int, seed: int, **_: Any) -> Values:
-    """Windows of pictures at random places, beside `preadv` of as many bytes."""
-    import numpy as np
-
-    import hybridlog as hl
-
-    topic, rows = "camera/image_raw", {}
-    segment = max(Path(store).rglob("*.mcap"), key=lambda path: path.stat().st_size)
-    with hl.open(store) as opened, segment.open("rb", buffering=0) as file:
-        for length in (1, 16):
-            size = length * robot.WIDTH * robot.HEIGHT
-            found = opened.windows(
-                topic, fps=5, length=length, features={"images": {"camera": topic}}
-            )
-            order = found.order(seed)[:windows].tolist()
-            last = max(segment.stat().st_size - size, 1)
-            offsets = np.random.default_rng(seed).integers(0, last, windows).tolist()
-
-            def ours(found: Any = found, order: Sequence[int] = order) -> object:
-                return [found[number] for number in order]
-
-            def theirs(offsets: Sequence[int] = offsets, size: int = size) -> object:
-                descriptor = file.fileno()
-                return [os.preadv(descriptor, [bytearray(size)], at) for at in offsets]
-
-            mine, plain = timed(ours, 1), timed(theirs, 1)
-            rows[f"window of {length} picture{'s'[: length > 1]}"] = {
-                "ms": mine["ms"] / len(order),
-                "cpu_ms": mine["cpu_ms"] / len(order),
-                "preadv_ms": plain["ms"] / len(offsets),
-            }
-    return {"rows": rows}
-
-
 def remote_side(*, directory: str, **_: Any) -> Values:
     """Requests and bytes of a bucket."""
     from benchmarks.remote import measure
@@ -408,5 +372,5 @@ def remote_side(*, directory: str, **_: Any) -> Values:
     return {"rows": [asdict(cost) for cost in measure(Path(directory))]}
 
 
-GROUPS = ("commands", "sql", "many", "page", "windows", "remote")
+GROUPS = ("commands", "sql", "many", "page", "remote")
 """In their order; `<name>_side` does each."""

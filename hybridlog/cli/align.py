@@ -162,11 +162,13 @@ def _queries(
     store: Store, topics: Sequence[str], choice: Choice, beside: Sequence[str]
 ) -> list[Query]:
     """A query for each topic; the base is one topic."""
+    from hybridlog.query.asked import narrowed
+
     others = Choice.of(beside) if beside else choice
     base, *found = (
         query_of(store, [name], others if n else choice) for n, name in enumerate(topics)
     )
-    return [base, *(q.with_topic(topic) for q in found for topic in q.topics)]
+    return [base, *(narrowed(q, topic) for q in found for topic in q.topics)]
 
 
 def _where(store: Store, queries: list[Query], text: str) -> None:

@@ -10,7 +10,7 @@ import click
 
 from hybridlog import __version__
 from hybridlog.cli.completion import install_completion, show_completion
-from hybridlog.cli.hints import Context, check_moved
+from hybridlog.cli.hints import Context
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
 DIFFERENT: Final = 12
@@ -48,7 +48,6 @@ GROUPS: Final = {
         "mark": "edit",
         "trigger": "top",
         "top": "top",
-        "import": "copy",
     },
     "Look": {"ls": "ls", "info": "info", "view": "open", "open": "open", "plot": "plot"},
     "Ask": {
@@ -67,9 +66,7 @@ GROUPS: Final = {
         "edit": "edit",
         "keep": "keep",
         "index": "index",
-        "tables": "maintain",
         "verify": "maintain",
-        "repair": "maintain",
         "compact": "maintain",
         "rm": "edit",
         "demo": "record",
@@ -95,13 +92,6 @@ class _LazyGroup(click.Group):
         module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if not ctx.resilient_parsing:
-            check_moved(*args[:2])
-        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         width = formatter.width - max(map(len, COMMANDS)) - 6

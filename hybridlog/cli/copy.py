@@ -1,11 +1,11 @@
-"""`hybridlog copy` and `import`."""
+"""`hybridlog copy`."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -31,7 +31,12 @@ _RUNNING: Final = frozenset({"open", "unfinished"})
 @dataclass(frozen=True, kw_only=True)
 class _Copy(Choosing, InStore, AsJson, Quiet):
     names: tuple[str, ...] = options.names_argument()  # type: ignore[misc]
-    to: str = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "TO")
+    to: str | None = argument("A directory, ssh://user@host/path, or s3://bucket/path.", "[TO]")
+    source: Path | None = option(
+        "Instead of TO: copy from this store, a directory or s3://bucket/path, into the one here.",
+        "STORE",
+        name="--from",
+    )
     only_fields: bool = option("Fields first; a later copy adds the payloads.")
     then_expire: bool = option(
         "Delete payloads here once their copy is proved there; pinned ones stay."
@@ -51,13 +56,18 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
 
 @command(_Copy, "copy")
 def copy_command(given: _Copy) -> None:
-    """Copy recordings to a directory, a server over ssh, or a bucket.
+    """Copy recordings to or from another store.
 
-    Every byte is proved there before a recording gets its name. After a cut, run it again: it
-    goes on where it stopped. A recording that is there already is not copied again.
+    It is a directory, a server over ssh, or a bucket. Every byte is proved there before a
+    recording gets its name. After a cut, run it again: it goes on where it stopped. A recording
+    that is there already is not copied again.
     """
     from hybridlog.maintenance.copying import CopyOptions
 
+    if given.source is not None:
+        given = _from_elsewhere(given, given.source)
+    if given.to is None:
+        raise UsageError("Name the place to copy to, or with --from STORE the one to copy from.")
     if given.receive:
         _receive(Path(given.to))
         return
@@ -77,8 +87,17 @@ def copy_command(given: _Copy) -> None:
     _check(report)
 
 
-def _bar(what: str, given: _Copy | _Import) -> closing[LateBar]:
-    return closing(LateBar(what, quiet=given.quiet or given.as_json))
+def _from_elsewhere(given: _Copy, source: Path) -> _Copy:
+    """The same as a copy by the other store, to the one here."""
+    from hybridlog.store import store_path
+    from hybridlog_storage.settings import NONE
+
+    if given.mongo is not None:
+        with given.opened(create=True):
+            pass
+    names = given.names if given.to is None else (*given.names, given.to)
+    to = str(store_path(given.store))
+    return replace(given, names=names, to=to, store=source, mongo=NONE)
 
 
 def _copied(
@@ -92,9 +111,10 @@ def _copied(
     """Copy recordings and print what was copied, also if an error ends it."""
     from hybridlog.maintenance.copying import CopyReport
 
+    assert given.to is not None
     report = CopyReport()
     try:
-        with _bar("copy", given) as bar:
+        with closing(LateBar("copy", quiet=given.quiet or given.as_json)) as bar:
             store.copy(given.to, chosen, how, bar, report)
     except BaseException:
         if report != CopyReport():
@@ -125,10 +145,11 @@ def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Itera
 def _receive(path: Path) -> None:
     """Do what the copy on the other side of standard input asks."""
     from hybridlog.maintenance.ssh import serve
+    from hybridlog.store import receiving
 
     with (
         opened_store(path, None, create=True, quiet=True) as opened,
-        opened.receiving() as place,
+        receiving(opened) as place,
         open(0, "rb", buffering=0, closefd=False) as requests,
     ):
         serve(place, requests, sys.stdout.buffer)
@@ -136,8 +157,7 @@ def _receive(path: Path) -> None:
 
 def _print(
     report: CopyReport,
-    given: _Copy | _Import,
-    words: tuple[str, str] = ("copied", "there"),
+    given: _Copy,
     *,
     is_short: bool = False,
 ) -> None:
@@ -146,18 +166,18 @@ def _print(
     Args:
         report: The result.
         given: The options.
-        words: What was done with the recordings, and where they are.
         is_short: Leave out what is there already; JSON is one line.
     """
+    there = "there" if given.source is None else "here"
     if given.as_json:
         (output.print_json_line if is_short else output.print_json)(asdict(report))
     elif not given.quiet:
         for label in report.copied:
-            output.say(f"{words[0]} {label}")
+            output.say(f"copied {label}")
         for label in () if is_short else report.known:
             lacks = label in report.lacking
-            more = f"; payloads that were deleted {words[1]} were not copied" if lacks else ""
-            output.say(f"{label} is {words[1]} already{more}")
+            more = f"; payloads that were deleted {there} were not copied" if lacks else ""
+            output.say(f"{label} is {there} already{more}")
         if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
             output.say(f"{output.size(report.freed_bytes)} freed")
 
@@ -184,24 +204,3 @@ def _rate(text: str | None) -> float | None:
     if rate == 0:
         raise UsageError("--limit-rate must be more than 0.")
     return rate
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Import(Choosing, InStore, AsJson, Quiet):
-    other: Path = argument("Directory of the other store.", "STORE")
-
-
-@command(_Import, "import")
-def import_command(given: _Import) -> None:
-    """Copy recordings in from another store.
-
-    Every byte is checked. After an interruption, run it again: it goes on where it stopped.
-    """
-    with (
-        given.opened(create=True) as store,
-        if_stopped("What arrived stays here: run the command again."),
-        _bar("import", given) as bar,
-    ):
-        report = store.import_from(given.other, given.choice, bar)
-    _print(report, given, ("imported", "here"))
-    _check(report)

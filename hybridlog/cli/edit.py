@@ -57,10 +57,7 @@ def edit_command(given: _Edit) -> None:
             raise UsageError(f"A {word} needs a text: give one that is not empty.")
     with given.opened() as store:
         (entry,) = store.select([given.recording])
-        if given.note is not None:
-            store.note(entry.id, given.note)
-        if given.name is not None:
-            entry = store.rename(entry.id, given.name)
+        entry = store.edit(entry.id, name=given.name, note=given.note)
     if given.name is not None and not given.quiet:
         output.say(f"renamed to {entry.label}")
 
@@ -86,11 +83,8 @@ def tag_command(given: _Tag) -> None:
         for one in chosen.summaries:
             # Of several recordings, some may lack a tag.
             keys = given.remove if is_one else [key for key in given.remove if key in one.tags]
-            found[one.label] = one.tags
-            if keys:
-                found[one.label] = store.untag(one.id, *keys).tags
-            if tags:
-                found[one.label] = store.tag(one.id, **tags).tags
+            changed = store.edit(one.id, tag=tags, untag=keys) if keys or tags else one
+            found[one.label] = changed.tags
     if given.as_json:
         output.print_json(next(iter(found.values())) if is_one else found)
     elif not given.quiet:
@@ -109,13 +103,15 @@ def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[st
         UsageError: There is neither a word nor an option.
         TopicError: No recording satisfies the choice.
     """
+    from hybridlog.query.choosing import is_one
+
     choice, words = given.choice, given.words
     if not choice.is_everything:
         return recordings_of(store, choice), words, False
     if not words:
         raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
     named = Choice.of(words[0])
-    return recordings_of(store, named), words[1:], store.is_one(named.name)
+    return recordings_of(store, named), words[1:], is_one(store.session, named.name)
 
 
 @dataclass(frozen=True, kw_only=True)

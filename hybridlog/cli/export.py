@@ -94,7 +94,9 @@ def export_command(given: _Given) -> None:
         for path, one in parts:
             to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
             if form in _LOGS:
-                extras = one.extras()
+                from hybridlog.attachments import extras_of
+
+                extras = extras_of(one)
                 if given.no_attachments:
                     extras = extras._replace(attachments=[], left_out=0)
                 _write_file(one, to, path, front, extras)
@@ -160,6 +162,7 @@ def _remove_empty(directory: Path) -> None:
 
 
 def _write_files(query: Query, to: Destination, directory: Path, front: Front) -> None:
+    from hybridlog.query.asked import narrowed
     from hybridlog_storage.mongo.collection_names import collection_of
 
     suffix, topics = OUTPUTS[to.form].suffixes[0], [*query.topics]
@@ -170,7 +173,7 @@ def _write_files(query: Query, to: Destination, directory: Path, front: Front) -
         check_room(path, force=to.force)
     left_out: list[HybridlogError] = []
     for topic, path in paths.items():
-        one = query.with_topic(topic)
+        one = narrowed(query, topic)
         try:
             with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
                 missing = write_answer(one, to.form, path, front=front, quiet=to.quiet)

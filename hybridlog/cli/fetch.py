@@ -35,6 +35,7 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
+    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -126,8 +127,7 @@ def fetch_command(choices: _Choices) -> None:
             query = answer_query(query, to, front=front, strict=choices.strict)
         sys.stdout.flush()
         if not choices.quiet:
-            cost = query.counters.copy()
-            cost.add(query.spent)
+            cost = _cost_of(query)
             print_cost(cost, time.monotonic() - started, count=choices.count)
             given = cost.messages or cost.latched or cost.frames
             if count is None and to.path is not None and not given:
@@ -298,3 +298,11 @@ def _check_near(choices: _Choices) -> None:
         raise UsageError(
             "--where with another topic needs a length of time: add --within, --before or --after."
         )
+
+
+def _cost_of(query: Query) -> Counters:
+    """The cost of an answer, with that of its conditions on other topics."""
+    cost = query.counters.copy()
+    for condition in query.conditions:
+        cost.add(condition.counters)
+    return cost

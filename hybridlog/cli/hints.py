@@ -33,61 +33,6 @@ _NAMED: Final = {"recording": "-r", "topic": "-t", "fields": "--fields"}
 """Options whose values people type as arguments, and how they are written."""
 
 
-MOVED: Final = {
-    "attachments": "info RECORDING --attachments",
-    "changes": "intervals TOPIC --changes FIELDS",
-    "convert": "export FILE",
-    "delete": "rm RECORDING",
-    "du": "info --sizes recording",
-    "filter": "fetch TOPIC --where PREDICATE -o FILE",
-    "gaps": "intervals TOPIC --gaps",
-    "losses": "info --losses",
-    "note": "edit RECORDING --note TEXT",
-    "play": "export DIRECTORY -F rosbag2",
-    "query": "fetch TOPIC --where PREDICATE",
-    "rate": "stats --rate",
-    "record -a": "record --ros2",
-    "reindex": "repair",
-    "remove": "rm RECORDING",
-    "rename": "edit RECORDING --name NAME",
-    "resample": "align TOPIC --step DURATION",
-    "schema": "info --topic TOPIC",
-    "search": "fetch TOPIC --where PREDICATE",
-    "serve": "open websocket",
-    "show": "info RECORDING",
-    "topics": "info",
-    "trigger --rehearse": "intervals --rehearse EXPRESSION",
-    "trust": "index trust",
-    "untag": "tag RECORDING --remove KEY",
-    **dict.fromkeys(
-        ("diff -r", "diff --tag", "diff --last", "diff --older-than"),
-        "diff RECORDING RECORDING --between T0 T1",
-    ),
-}
-"""Other names and options that people try, and the commands that do this."""
-
-_BEFORE: Final = {"bag": "{}", "help": "{} --help"}
-"""Words that people write before a command, and how that is written here."""
-
-
-def check_moved(words: str, after: str = "") -> None:
-    """Say which command does what another name or option was tried for.
-
-    Args:
-        words: The name, with an option or without.
-        after: The word behind them.
-
-    Raises:
-        click.UsageError: One does.
-    """
-    meant = MOVED.get(words)
-    if words in _BEFORE:
-        meant = _BEFORE[words].format(MOVED.get(after, after)).strip()
-        words = f"{words} {after}".strip()
-    if meant is not None:
-        raise click.UsageError(f"There is no `{words}`: use `hybridlog {meant or '--help'}`.")
-
-
 class _Formatter(click.HelpFormatter):
     """Breaks the long terms of a list of options at blanks and behind `|`."""
 
@@ -147,7 +92,6 @@ class Command(click.Command):
         try:
             extra = super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            check_moved(f"{self.name} {error.option_name}")
             near = difflib.get_close_matches(
                 error.option_name, error.possibilities or (), cutoff=_NEAR
             )

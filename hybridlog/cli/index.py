@@ -43,7 +43,7 @@ class _List(_Shared):
 def list_(given: _List) -> None:
     """List the indexes on fields."""
     with given.opened(needs_database=True) as store:
-        found = store.indexes() if given.topic is None else store.indexes(given.topic)
+        found = store.index.list() if given.topic is None else store.index.list(given.topic)
     _print(found, given)
 
 
@@ -59,7 +59,7 @@ class _Fields(_Shared):
 def add(given: _Fields) -> None:
     """Make an index on fields of a topic, for all recordings."""
     with given.opened(needs_database=True) as store:
-        found = store.add_index(given.topic, *given.field)
+        found = store.index.add(given.topic, *given.field)
     _print(found, given)
 
 
@@ -68,10 +68,10 @@ def remove(given: _Fields) -> None:
     """Drop an index."""
     topic, field = given.topic, given.field
     with given.opened(needs_database=True) as store:
-        if not store.remove_index(topic, *field):
-            known = ", ".join(" ".join(one.fields) for one in store.indexes(topic)) or "none"
+        if not store.index.remove(topic, *field):
+            known = ", ".join(" ".join(one.fields) for one in store.index.list(topic)) or "none"
             raise UsageError(f"{topic} has no index on {' '.join(field)}. Its indexes: {known}.")
-        found = store.indexes(topic)
+        found = store.index.list(topic)
     _print(found, given)
 
 
@@ -84,8 +84,10 @@ def address(given: _Shared) -> None:
     runs as long as one is connected.
     """
     with given.opened(needs_database=True) as store:
-        found = store.index_address()
-        places = [] if given.quiet and not given.as_json else store.index_contents()
+        found = store.index.address()
+        from hybridlog.index.of_store import contents
+
+        places = [] if given.quiet and not given.as_json else contents(store.session)
         recordings = len(store.session.snapshot())
     if given.as_json:
         topics = [
@@ -127,7 +129,7 @@ def rebuild(given: _Rebuild) -> None:
             ),
             progress_bar("index rebuild", total, quiet=given.quiet) as bar,
         ):
-            done = store.rebuild_index(None if given.choice.is_everything else chosen, Stages(bar))
+            done = store.index.rebuild(None if given.choice.is_everything else chosen, Stages(bar))
     left = [entry.label for entry in chosen.summaries if entry.id not in {r.id for r in done}]
     for label in left:
         output.note(f"Recording {label} is in use, and was left as it is.")

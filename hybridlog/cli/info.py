@@ -18,6 +18,7 @@ from hybridlog.cli.info_parts import (
     show_attachments,
     show_losses,
     show_sizes,
+    show_tables,
     show_topics,
 )
 from hybridlog.cli.keep import pin_cells
@@ -34,7 +35,7 @@ from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.choice import Choice
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
-from hybridlog.wording import MAX_LISTED
+from hybridlog.wording import MAX_LISTED, listed
 from hybridlog_storage.errors import SegmentError, SourceError, StoreError, UsageError
 
 if TYPE_CHECKING:
@@ -59,6 +60,9 @@ class _Given(Choosing, InStore, AsJson, Forced):
     topic: tuple[str, ...] = options.topics(
         "Instead: the message definition and the fields of this topic. With --losses: only those "
         "of this topic."
+    )
+    tables: bool = option(
+        "With --topic, instead: its Parquet files and SQL for DuckDB, and what is missing of them."
     )
     losses: bool = option("Instead: what is missing, from when to when, and why.")
     sizes: str | None = option(
@@ -112,6 +116,8 @@ def _check(given: _Given) -> None:
     asked = [name for name, wanted in parts.items() if wanted]
     if len(asked) > 1:
         raise UsageError(f"{' and '.join(asked)} exclude each other: give one of them.")
+    if given.tables and (len(given.topic) != 1 or given.losses):
+        raise UsageError("--tables is about one topic: add --topic TOPIC.")
     if given.output is not None and not has_attachments:
         raise UsageError("--output is for --attachments and --attachment.")
 
@@ -125,6 +131,12 @@ def _show_part(store: Store, given: _Given) -> bool:
         show_losses([*given.recordings_in(store)], given.topic, as_json=as_json)
     elif given.topic:
         query = query_of(store, given.topic, given.choice)
+        if given.tables:
+            if len(query.topics) > 1:
+                named = listed(query.topics)
+                raise UsageError(f"--tables is about one topic: name one of {named}.")
+            show_tables(store, query, as_json=as_json)
+            return True
         show_topics(store, query, given.topic, as_json=as_json)
     elif given.sizes is not None:
         show_sizes(store.sizes(given.recordings_in(store)), given.sizes, as_json=as_json)
@@ -137,14 +149,16 @@ def _show_part(store: Store, given: _Given) -> bool:
 
 
 def _show(store: Store, given: _Given) -> None:
+    from hybridlog.query.choosing import is_one
+
     choice = given.choice
     chosen = [with_misfits(store, entry) for entry in given.recordings_in(store)]
     extras = {entry.id: _extras(store, entry) for entry in chosen}
     videos = {entry.id: _videos(store, entry) for entry in chosen[:_MAX_DRAWN]}
     if given.as_json:
         full = [_as_dict(entry, *extras[entry.id], videos.get(entry.id, {})) for entry in chosen]
-        is_one = choice == Choice.of(choice.name[:1]) and store.is_one(choice.name)
-        output.print_json(full[0] if is_one else full)
+        is_single = choice == Choice.of(choice.name[:1]) and is_one(store.session, choice.name)
+        output.print_json(full[0] if is_single else full)
         return
     drawn = {}
     if sys.stdout.isatty() and len(chosen) <= _MAX_DRAWN:
@@ -156,7 +170,7 @@ def _show(store: Store, given: _Given) -> None:
             output.say()
         _print_recording(
             entry,
-            store.index_place,
+            store.session.connection.place,
             *extras[entry.id],
             videos=videos.get(entry.id, {}),
             drawn=drawn.get(entry.id),

@@ -1,9 +1,9 @@
-"""Parts of `hybridlog info`, by option: definitions, losses, sizes, attachments."""
+"""Parts of `hybridlog info`, by option: definitions, tables, losses, sizes, attachments."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from fnmatch import fnmatchcase
 from functools import partial
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
 
+_MAX_NAMES = 5  # recordings in a note
 _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 
@@ -35,8 +36,10 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
     Raises:
         TopicError: No recording of the query has any of them.
     """
+    from hybridlog.query.asked import channels_of
+
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
-    for recorded in query.channels():
+    for recorded in channels_of(query):
         schema = recorded.channel.schema
         key = (
             recorded.channel.topic,
@@ -350,3 +353,72 @@ def _write(attachment: StoredAttachment, path: Path) -> None:
     with if_stopped(partial(not_written, path)):
         attachment.save(path)
     output.note(f"{path}: {output.size(attachment.size)}")
+
+
+def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
+    """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
+    from hybridlog.maintenance.tables import missing
+    from hybridlog.query.asked import channels_of
+    from hybridlog.snapshot import UNFINISHED
+
+    (topic,) = query.topics
+    channels = channels_of(query)
+    recordings = {one.recording.id: one.recording for one in channels}.values()
+    ended = [one for one in recordings if one.status not in UNFINISHED]
+    found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
+    tables = store.session.tables
+    lacking = [one.label for one in ended if missing(store.directory, one, tables, [topic])]
+    if as_json:
+        output.print_json({"tables": found, "missing": lacking})
+        return
+    for item in found:
+        for name in item["files"]:
+            output.say(name)
+        output.say()
+        output.say(f"{item['statement']};")
+        output.say()
+    if lacking:
+        output.note(
+            f"Without {listed(lacking, _MAX_NAMES)}, whose rows are missing: "
+            "`hybridlog verify --repair` makes them again."
+        )
+    if others := len(recordings) - len(ended):
+        left = output.counted(others, "unfinished recording")
+        output.note(f"Without {left}: rows are added when a recording ends.")
+
+
+def _tables_of(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
+    """Folders with rows of a topic in some recordings: files, rows, statement."""
+    from glob import escape
+
+    from hybridlog.columns.folders import files_of
+    from hybridlog.columns.layout import type_prefix
+
+    topics = {one.channel.topic for one in channels}
+    recordings = {one.recording.id for one in channels}
+    schemas = [one.channel.schema for one in channels]
+    prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
+    (name,) = topics or {""}
+    folders: dict[Path, dict[str, Any]] = {}
+    others: set[Path] = set()
+    for file in files_of(store.directory.path, prefixes) if prefixes else ():
+        sections = [one for one in file.about.recordings if name in one.topics]
+        rows = sum(one.topics[name].rows for one in sections if one.id in recordings)
+        if not all(one.id in recordings for one in sections):
+            others.add(file.path.parent)
+        if rows:
+            folder = file.path.parent
+            found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
+            found["rows"] += rows
+            found["files"].append(str(file.path))
+    chosen = f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
+    for folder, found in folders.items():
+        files = _quoted(f"{escape(str(folder))}/*.parquet")
+        # The only texts in it are quoted, and nothing is run here.
+        statement = f"select * from {files} where topic = {_quoted(name)}"  # noqa: S608
+        found["statement"] = statement + (chosen if folder in others else "")
+    return list(folders.values())
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

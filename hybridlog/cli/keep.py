@@ -89,7 +89,9 @@ def keep_command(given: _Given) -> None:
 
 
 def _tidy(store: Store, given: _Given) -> None:
-    count, size = store.tidy(dry_run=given.dry_run)
+    from hybridlog.maintenance.keep import tidy
+
+    count, size = tidy(store.directory, dry_run=given.dry_run)
     if given.as_json:
         output.print_json({"objects": count, "bytes": size, "dry_run": given.dry_run})
     elif not given.quiet:

@@ -105,9 +105,10 @@ def export_set(
 
 def _proposed(query: Query) -> str:
     """A map for the topics that are there; those with few messages are in comments."""
+    from hybridlog.query.asked import narrowed
     from hybridlog.training.feature_map import nearly_empty, proposed
 
-    empty = nearly_empty(query.with_topic(*proposed(query).topics))
+    empty = nearly_empty(narrowed(query, *proposed(query).topics))
     return proposed(query, empty).to_yaml() + "".join(
         f"# left out: {topic} has {output.counted(count, 'message')}\n"
         for topic, count in empty.items()

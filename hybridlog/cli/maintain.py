@@ -1,51 +1,55 @@
-"""`hybridlog verify`, `repair`, `compact` and `tables`."""
+"""`hybridlog verify` and `compact`."""
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_topic
-from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet, query_of
+from hybridlog.cli.binder import command, option
+from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, TopicError, UsageError, WithoutMongoError
+from hybridlog_storage.errors import DatabaseError, UsageError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from hybridlog.maintenance.report import CompactedTopic
     from hybridlog.maintenance.verify import Verification
-    from hybridlog.query.question import RecordedChannel
-    from hybridlog.store import Store
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Verify(Named, InStore, AsJson, Quiet):
-    pass
+    repair: bool = option("Mend what can be mended without losing anything; list the rest.")
+    moved: bool = option("With --repair: the store was moved to here, take its index over.")
+    new_id: bool = option(
+        "With --repair: the store is a copy, give it an id of its own, with the index at --mongo."
+    )
 
 
 @command(_Verify)
 def verify_command(given: _Verify) -> None:
     """Read everything, check checksums and references.
 
-    Exits with 1 when it finds a problem, and prints a cure for each.
+    Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
+    the names of segments, writes damaged summaries and journals again, and brings catalog and
+    index up to date; it exits with 1 when only a copy can restore the rest.
     """
+    if given.repair:
+        _repair(given)
+        return
+    if given.moved or given.new_id:
+        raise UsageError("--moved and --new-id are for --repair: give that, too.")
     started = time.monotonic()
     with given.opened(quiet=given.quiet) as store:
         chosen = given.recordings_in(store)
         total = sum(entry.stored_bytes for entry in chosen.summaries)
         with progress_bar("verify", total, quiet=given.quiet) as bar:
             result = store.verify(None if given.choice.is_everything else chosen, Stages(bar))
-        why = store.without_database
+        why = store.session.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
@@ -81,22 +85,8 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Repair(Named, InStore, AsJson, Quiet):
-    moved: bool = option("The store was moved to here: take its index over.")
-    new_id: bool = option(
-        "The store is a copy: give it an id of its own, with the index at --mongo."
-    )
-
-
-@command(_Repair)
-def repair_command(given: _Repair) -> None:
-    """Repair what can be repaired without losing anything.
-
-    It restores the names of segments, writes damaged summaries and journals again, and brings
-    catalog and index up to date. Exits with 1, and a list, when only a copy can restore the
-    rest.
-    """
+def _repair(given: _Verify) -> None:
+    """Mend what can be mended, and list what is left."""
     if given.moved and given.new_id:
         raise UsageError("A store was moved or it is a copy: give --moved or --new-id, not both.")
     if given.new_id:
@@ -107,11 +97,11 @@ def repair_command(given: _Repair) -> None:
         output.say("the store has a new id now")
     with given.opened(quiet=given.quiet) as store:
         if given.moved:
-            store.take_over()
+            store.session.take_over()
             output.say("the index belongs to the store at this place now")
         chosen = None if given.choice.is_everything else given.recordings_in(store)
         with progress_bar("repair", 0, quiet=given.quiet) as bar:
-            done = store.repair(chosen, Stages(bar))
+            done = store.verify(chosen, Stages(bar), repair=True)
     left = [one for one in done if not one.is_cured]
     if given.as_json:
         output.print_json([asdict(one) for one in done])
@@ -181,79 +171,3 @@ def _told(one: CompactedTopic, *, dry_run: bool) -> str:
     if one.kept:
         parts.append(f"{one.kept} without columns: {one.reason}")
     return f"{one.recording} {one.topic}: {'; '.join(parts)}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Tables(Choosing, InStore, AsJson):
-    topic: str = argument(
-        "Full name, or an unambiguous short one (scan).", "TOPIC", shell_complete=complete_topic
-    )
-
-
-@command(_Tables)
-def tables_command(given: _Tables) -> None:
-    """Show a topic's Parquet files, and SQL for DuckDB."""
-    from hybridlog.snapshot import UNFINISHED
-
-    with given.opened() as store:
-        channels = query_of(store, [given.topic], given.choice).channels()
-        ended = [one for one in channels if one.recording.status not in UNFINISHED]
-        for one in ended:  # made again where they are missing
-            store.session.table(one.recording, one.channel.topic)
-        store.mend(math.inf)
-        store.session.write_recordings_file()
-        found = _found(store, ended)
-        others = len({one.recording.id for one in channels}) - len(
-            {one.recording.id for one in ended}
-        )
-    if given.as_json:
-        output.print_json(found)
-        return
-    if not found:
-        raise TopicError(f"No chosen recording that has ended has a table of {given.topic}.")
-    for item in found:
-        for name in item["files"]:
-            output.say(name)
-        output.say()
-        output.say(f"{item['statement']};")
-        output.say()
-    if others:
-        left = output.counted(others, "unfinished recording")
-        output.note(f"Without {left}: rows are added when a recording ends.")
-
-
-def _found(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:
-    """Folders with rows of a topic in some recordings: files, rows, statement."""
-    from glob import escape
-
-    from hybridlog.columns.folders import files_of
-    from hybridlog.columns.layout import type_prefix
-
-    topics = {one.channel.topic for one in channels}
-    recordings = {one.recording.id for one in channels}
-    schemas = [one.channel.schema for one in channels]
-    prefixes = {type_prefix("" if schema is None else schema.name) for schema in schemas}
-    (name,) = topics or {""}
-    folders: dict[Path, dict[str, Any]] = {}
-    others: set[Path] = set()
-    for file in files_of(store.directory.path, prefixes) if prefixes else ():
-        sections = [one for one in file.about.recordings if name in one.topics]
-        rows = sum(one.topics[name].rows for one in sections if one.id in recordings)
-        if not all(one.id in recordings for one in sections):
-            others.add(file.path.parent)
-        if rows:
-            folder = file.path.parent
-            found = folders.setdefault(folder, {"folder": str(folder), "rows": 0, "files": []})
-            found["rows"] += rows
-            found["files"].append(str(file.path))
-    chosen = f" and recording in ({', '.join(map(_quoted, sorted(recordings)))})"
-    for folder, found in folders.items():
-        files = _quoted(f"{escape(str(folder))}/*.parquet")
-        # The only texts in it are quoted, and nothing is run here.
-        statement = f"select * from {files} where topic = {_quoted(name)}"  # noqa: S608
-        found["statement"] = statement + (chosen if folder in others else "")
-    return list(folders.values())
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"

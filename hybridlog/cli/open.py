@@ -136,9 +136,10 @@ def _check(given: _Given) -> None:
 
 def _written(store: Store, query: Query, given: _Given) -> Path:
     """The slice as an MCAP file."""
+    from hybridlog.attachments import extras_of
 
     def write(query: Query, path: Path) -> None:
-        write_answer(query, "mcap", path, extras=query.extras(), quiet=given.quiet)
+        write_answer(query, "mcap", path, extras=extras_of(query), quiet=given.quiet)
 
     if given.path is None:
         ids = query.recordings
@@ -232,7 +233,9 @@ def _print_address(port: int, *, quiet: bool) -> None:
 
 def print_unplayed(query: Query) -> None:
     """Print the topics with messages that are left out, since their payload is gone."""
-    topics = {each.channel.topic for each in query.channels() if each.is_reduced}
+    from hybridlog.query.asked import channels_of
+
+    topics = {each.channel.topic for each in channels_of(query) if each.is_reduced}
     if topics:
         found = listed(sorted(topics), _MAX_SHOWN)
         output.note(f"Messages without their payload are not played; there are some of {found}.")

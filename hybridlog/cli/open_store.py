@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _MAX_LISTED = 3  # recordings that are reported one by one, stores that are named
 _MAX_FOLDERS = 1000
+_EVERY_S: Final = 2.0  # between repairs while a command lasts
 _READING: Final = ("Look", "Ask", "Export")
 """Groups of commands that take the only store that is near; others name it."""
 
@@ -85,7 +86,7 @@ def opened_store(
         bar.close()
     during: AbstractContextManager[None] = store.at_one_moment()
     if is_lasting:
-        during = store.mended_meanwhile() if recover else nullcontext()
+        during = mended_meanwhile(store) if recover else nullcontext()
     with store, during:
         doing = "so the files answer"
         if records:
@@ -194,7 +195,7 @@ def _print_rebuilt(store: Store, doing: str) -> None:
             note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
     for recording in repairs.removed:
         note(f"Recording {recording} has no files any more; it is out of the index.")
-    reason = store.without_database
+    reason = store.session.unavailable
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
         note(f"MongoDB is unavailable, {doing}: {reason}")
@@ -208,7 +209,7 @@ def _print_left(store: Store) -> None:
     found = {"recording": len(repairs.noted), "table": len(repairs.noted_tables)}
     left = " and ".join(counted(number, what) for what, number in found.items() if number)
     if left and store.directory.is_writable:
-        note(f"Left to repair: {left}. `hybridlog repair` does it.")
+        note(f"Left to repair: {left}. `hybridlog verify --repair` does it.")
 
 
 def _print_recovered(recording: str, segments: list[Recovered]) -> None:
@@ -223,3 +224,29 @@ def _print_recovered(recording: str, segments: list[Recovered]) -> None:
     for segment in segments:
         for damage in segment.damage:
             note(f"  damaged: {damage}")
+
+
+@contextmanager
+def mended_meanwhile(store: Store, every: float = _EVERY_S) -> Iterator[None]:
+    """A block during which another thread calls `Store.mend` again and again.
+
+    Args:
+        store: The store.
+        every: Seconds between two calls.
+    """
+    import math
+    import threading
+
+    ended = threading.Event()
+
+    def mend() -> None:
+        while not ended.wait(every):
+            store.mend(math.inf)
+
+    thread = threading.Thread(target=mend, name="hybridlog-mend", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

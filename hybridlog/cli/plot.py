@@ -25,11 +25,10 @@ if TYPE_CHECKING:
     from hybridlog.drawing.lines import Line
     from hybridlog.drawing.series import Series
 
-_FORMATS = ("png", "svg", "pdf", "html")
+_FORMATS = ("png", "svg", "pdf")
 _WIDTH, _HEIGHT = 1200, 400
 _LETTERS = 60  # of a line of text in a file
 _MAX_LETTERS = 500
-_PAGE_PIXELS = 10_000  # of a page, in which one can zoom
 _SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 
@@ -42,8 +41,8 @@ class _Given(Asking, Forced):
         shell_complete=complete_path,
     )
     output: Path | None = option(
-        "Write a picture (.png, .svg, .pdf) or a page to zoom in (.html); - is standard "
-        "output. Without: a line of text for each field.",
+        "Write a picture (.png, .svg, .pdf); - is standard output. Without: a line of text for "
+        "each field.",
         "FILE",
         short="-o",
     )
@@ -70,8 +69,7 @@ def plot_command(given: _Given) -> None:
 
         names = [] if given.fields is None else parse_fields(given.fields)
         width = _WIDTH if shape is None else shape[0]
-        pixels = {"": _MAX_LETTERS, "html": _PAGE_PIXELS}.get(form, width)
-        found = lines(asked.query, names, pixels=pixels)
+        found = lines(asked.query, names, pixels=width if form else _MAX_LETTERS)
         if not form:
             _print(found)
         else:
@@ -89,8 +87,7 @@ def _form(path: Path | None, form: str | None) -> str:
         return ""
     if str(path) == "-" and form is not None and sys.stdout.isatty():
         raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
-    suffix = path.suffix.lower().removeprefix(".")
-    found = form or {"htm": "html"}.get(suffix, suffix)
+    found = form or path.suffix.lower().removeprefix(".")
     if found not in _FORMATS:
         raise UsageError(
             f"The name {path} does not give the format: add --format, or end it in "
@@ -107,16 +104,10 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _write(found: Sequence[Line], form: str, size: tuple[int, int], path: Path | None) -> None:
+    from hybridlog.drawing.figure import figure
     from hybridlog.formats.writing import Sink
 
-    if form == "html":
-        from hybridlog.drawing.page import page
-
-        made = page(found, ", ".join(dict.fromkeys(line.topic for line in found)) or "No message")
-    else:
-        from hybridlog.drawing.figure import figure
-
-        made = figure(found, size=size, form=form)
+    made = figure(found, size=size, form=form)
     sink = Sink(sys.stdout.buffer if path is None else path)
     try:
         sink.write(made)

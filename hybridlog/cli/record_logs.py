@@ -173,7 +173,7 @@ def print_stores(stores: Iterable[Path]) -> None:
     """Print which stores were met and not searched."""
     for store in stores:
         output.note(
-            f"{store} is a store and is not searched; `hybridlog import {store}` takes its "
+            f"{store} is a store and is not searched; `hybridlog copy --from {store}` takes its "
             "recordings."
         )
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.frames.names import is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
@@ -15,13 +15,7 @@ from hybridlog_storage.errors import SegmentError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    import pyarrow as pa
-
     from hybridlog.message import Message
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.intervals import Intervals
-    from hybridlog.query.question import Question, Span
-    from hybridlog_storage.summary import RecordingSummary
 
 
 MAX_FIELDS: Final = 5000
@@ -88,38 +82,3 @@ def _observed(messages: Iterator[Message]) -> Iterator[Field]:
         # A name within backquotes may have dots, which a path cannot tell from its own.
         if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):
             yield Field(path, "|".join(kinds))
-
-
-class SeriesQuery(Protocol):
-    """A query; its methods are described there."""
-
-    question: Question
-    counters: Counters
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Full names of the topics."""
-
-    def fields(self, *paths: str) -> Self:
-        """Only these fields."""
-
-    def with_topic(self, topic: str) -> Self:
-        """Only this topic."""
-
-    def in_recording(self, *names: str) -> Self:
-        """Only these recordings."""
-
-    def during(self, intervals: Intervals) -> Self:
-        """Only messages in these intervals."""
-
-    def field_types(self) -> dict[str, str] | None:
-        """Paths of fields and their types."""
-
-    def summaries(self) -> Sequence[RecordingSummary]:
-        """The recordings."""
-
-    def spans(self) -> dict[str, Span]:
-        """Log time of the messages of each recording, by id."""
-
-    def to_tables(self) -> Iterator[pa.Table | Any]:
-        """The answer in tables."""

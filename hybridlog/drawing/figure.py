@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.drawing.lines import Line, drawable, lines, printable
+from hybridlog.drawing.lines import Line, drawable, printable
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import MissingDependencyError
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Text
 
-    from hybridlog.drawing.fields import SeriesQuery
 
 DPI: Final = 100
 MAX_MARKED_POINTS: Final = 100
@@ -35,32 +34,12 @@ def _matplotlib() -> Iterator[None]:
         import matplotlib as mpl  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
-            "a plot needs matplotlib: pip install 'hybridlog[plot]'; an HTML page (-o NAME.html) "
-            "does not"
+            "a plot needs matplotlib: pip install 'hybridlog[plot]'"
         ) from error
     with warnings.catch_warnings():
         # Letters that the font lacks are boxes; in a picture that is too small, names overlap.
         warnings.filterwarnings("ignore", "Glyph|constrained_layout")
         yield
-
-
-def new_axes() -> Axes:
-    """Axes in a new figure of pyplot.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
-    with _matplotlib():
-        from matplotlib import pyplot as plt
-
-        return plt.subplots(layout="constrained")[1]
-
-
-def plot(axes: Axes, query: SeriesQuery, fields: Sequence[str]) -> None:
-    """Draw fields of a query over time; see `Query.plot`."""
-    with _matplotlib():
-        width = max(1, round(axes.get_window_extent().width))
-        draw(axes, lines(query, fields or query.question.fields or (), pixels=width))
 
 
 def figure(found: Sequence[Line], *, size: tuple[int, int], form: str) -> bytes:

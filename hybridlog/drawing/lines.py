@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hybridlog.drawing.series import Series, numbers_of, series
+from hybridlog.query.asked import field_types, narrowed, spans_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.fields import SeriesQuery
     from hybridlog.drawing.series import Numbers
+    from hybridlog.query.query import Query
 
 MAX_LINES: Final = 50
 """Lines that can be told apart, with good will."""
@@ -41,7 +42,7 @@ class Line:
     series: Series
 
 
-def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Line]:
+def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
     """The fields of a query over time, by topic and recording; the query's counters are set.
 
     Args:
@@ -63,7 +64,7 @@ def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Lin
         missing: dict[str, TopicError] = {}
         had: set[str] = set()
         for one in _by_topic(query):
-            for recording in one.spans():
+            for recording in spans_of(one):
                 part = one.in_recording(recording)
                 about = summaries[recording]
                 for group in _groups(part, fields, missing):
@@ -87,7 +88,7 @@ def lines(query: SeriesQuery, fields: Sequence[str], *, pixels: int) -> list[Lin
 
 
 def _groups(
-    query: SeriesQuery, fields: Sequence[str], missing: dict[str, TopicError]
+    query: Query, fields: Sequence[str], missing: dict[str, TopicError]
 ) -> Iterator[list[str]]:
     """The fields that a topic has, together; one by one where only messages tell.
 
@@ -96,7 +97,7 @@ def _groups(
         fields: Paths.
         missing: Gets the fields that it does not have.
     """
-    if query.field_types() is None:
+    if field_types(query) is None:
         yield from ([field] for field in fields)
         return
     own = []
@@ -111,8 +112,8 @@ def _groups(
         yield own
 
 
-def _by_topic(query: SeriesQuery) -> Iterator[SeriesQuery]:
-    return (query.with_topic(topic) for topic in query.topics)
+def _by_topic(query: Query) -> Iterator[Query]:
+    return (narrowed(query, topic) for topic in query.topics)
 
 
 def drawable(values: Numbers) -> NDArray[np.float64]:

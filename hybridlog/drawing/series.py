@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from hybridlog.frames.names import FIELD
+from hybridlog.query.asked import field_types, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps, usual_period
 from hybridlog.query.times import TIME_LIMIT
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.fields import SeriesQuery
+    from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
@@ -92,7 +93,7 @@ class Series:
 
 
 def series(
-    query: SeriesQuery, fields: Sequence[str], *, pixels: int, span: Span | None = None
+    query: Query, fields: Sequence[str], *, pixels: int, span: Span | None = None
 ) -> list[Series]:
     """Fields of the messages of a query over log time.
 
@@ -125,9 +126,7 @@ def series(
     return found
 
 
-def _narrowed(
-    query: SeriesQuery, wanted: Sequence[_Wanted], span: Span | None
-) -> tuple[SeriesQuery, Span]:
+def _narrowed(query: Query, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Query, Span]:
     """The query for the wanted fields, and the part of the span that it covers.
 
     Raises:
@@ -138,8 +137,8 @@ def _narrowed(
     if not wanted:
         raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
     narrowed = query.fields(*dict.fromkeys(one.path for one in wanted))
-    _check(wanted, narrowed.field_types() or {})
-    spans = query.spans()
+    _check(wanted, field_types(narrowed) or {})
+    spans = spans_of(query)
     if len(query.topics) != 1 or len(spans) > 1:
         raise UsageError(
             f"A series is of one topic in one recording; these are {len(query.topics)} topics in "
@@ -153,9 +152,9 @@ def _narrowed(
     return narrowed, (begin, end)
 
 
-def numbers_of(query: SeriesQuery) -> list[str]:
+def numbers_of(query: Query) -> list[str]:
     """Paths of the fields that are single numbers; none where no definition fixes them."""
-    known = query.field_types() or {}
+    known = field_types(query) or {}
     return [p for p, kind in known.items() if kind in NUMERIC and "[" not in p]
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.frames.names import FIELD
+from hybridlog.query.asked import field_types, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog_storage.errors import UsageError
@@ -186,7 +187,7 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     """
     if pixels < 1:
         raise UsageError("A track has at least one pixel.")
-    known = query.field_types()
+    known = field_types(query)
     position = position_of(known)
     if position is None:
         raise UsageError("These messages have no latitude and longitude, and no pose.")
@@ -210,7 +211,7 @@ def _narrowed(query: Query, paths: Sequence[str], span: Span | None) -> tuple[Qu
     """
     if query.question.reverse:
         raise UsageError("A track goes forward in time: leave out reverse.")
-    spans = query.spans()
+    spans = spans_of(query)
     if len(query.topics) != 1 or len(spans) > 1:
         raise UsageError(
             f"A track is of one topic in one recording; these are {len(query.topics)} topics in "

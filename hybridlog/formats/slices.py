@@ -109,10 +109,11 @@ def add_extras(log: LogWriter, extras: Extras) -> Iterator[str]:
 
 def write_mcap(query: Query, path: Path) -> None:
     """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
+    from hybridlog.attachments import extras_of
     from hybridlog.formats.mcap.writer import McapWriter
 
     with McapWriter(path, profile=profile_of(query)) as log:
-        for _ in add_extras(log, query.extras()):
+        for _ in add_extras(log, extras_of(query)):
             pass  # the ledger has what is damaged
         for batch, channels in batches_of(query, IN_FORCE):
             log.write(batch, channels)

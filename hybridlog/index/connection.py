@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from functools import wraps
+from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -23,9 +25,27 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 _TIMEOUT_S = 5.0
 _EMBEDDED_TIMEOUT_S = 2.0
 """Seconds to wait for a server that was reached before; the embedded one has no network."""
+
+
+def again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Do something once more if the connection to MongoDB was lost.
+
+    The new connection has started a MongoDB that had ended, and replaced damaged data files.
+    """
+
+    @wraps(work)
+    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
+        try:
+            return work(*args, **options)
+        except ConnectionLostError:
+            return work(*args, **options)
+
+    return tried
 
 
 class IndexAddress(NamedTuple):

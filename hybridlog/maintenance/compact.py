@@ -140,7 +140,8 @@ class _Compaction:
         state = self._inventory.state
         if state is None or state.end is None:
             raise StoreError(
-                f"The journal of recording {label!r} has no end: run `hybridlog repair` first."
+                f"The journal of recording {label!r} has no end: run `hybridlog verify --repair` "
+                "first."
             )
         self.state = state
         self._size = sum(summary.size for summary in self._inventory.summaries.values())

@@ -1,8 +1,7 @@
 """Copies recordings from a store to a place, with checks; resumes after an interruption.
 
-`Store.copy` and `Store.import_from` are this from two sides. A file is sent from the byte on
-that the place has of it; the place then proves the whole file (`places.py`). The journal goes
-last.
+A file is sent from the byte on that the place has of it; the place then proves the whole file
+(`places.py`). The journal goes last.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ class CopyOptions:
 
 @dataclass(slots=True)
 class CopyReport:
-    """The result of `copy` and `import`.
+    """The result of `copy`.
 
     Attributes:
         copied: Labels, in the place, of the copied recordings.

@@ -157,7 +157,7 @@ class _Expiry:
     def _journal(self) -> JournalState:
         state = journal.read(self._path)
         if state is None:
-            raise StoreError(f"{self._path} has no journal: run `hybridlog repair` first.")
+            raise StoreError(f"{self._path} has no journal: run `hybridlog verify --repair` first.")
         return state
 
     def _choose(self, segment: WalkedSegment) -> None:
@@ -167,7 +167,7 @@ class _Expiry:
         if sealed is None or summary.whole_digest != sealed.digest:
             raise StoreError(
                 f"{segment.reader.path} is not the segment that the journal lists; nothing was "
-                "deleted. Run `hybridlog repair` first."
+                "deleted. Run `hybridlog verify --repair` first."
             )
         chosen = {place.number for place in summary.chunks if self._goes(place, summary)}
         if chosen:

@@ -36,6 +36,7 @@ from hybridlog_storage.errors import (
     SegmentError,
     StoreError,
     TopicError,
+    UsageError,
 )
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.remote.store import RemoteDirectory
@@ -376,3 +377,29 @@ class RetentionThread:
         reasons = (f"making room: {step.reason}" for step in done.plan.steps)
         for text in (*reasons, *done.problems, *warnings):
             self._say(text)
+
+
+def tidy(directory: StoreDirectory, *, dry_run: bool = False) -> tuple[int, int]:
+    """Delete what a store in a bucket does not need any more.
+
+    That is what no list of the last hour names, such as files of removed recordings, if it
+    is a week old: what is younger may belong to a copy that is under way.
+
+    Args:
+        directory: The store.
+        dry_run: True to delete nothing.
+
+    Returns:
+        Number and bytes of the objects.
+
+    Raises:
+        UsageError: The store is a directory, which has nothing of the kind.
+    """
+    from hybridlog_storage.remote.store import RemoteDirectory
+
+    if not isinstance(directory, RemoteDirectory):
+        raise UsageError("A store on a disk is tidy: `tidy` is for stores in buckets.")
+    found = directory.unneeded()
+    if not dry_run:
+        directory.source.bucket.delete([one.name for one in found])
+    return len(found), sum(one.size for one in found)

@@ -67,9 +67,9 @@ def check(
     raise StoreError(
         f"The database {database.name!r} at {database.address} belongs to the store at "
         f"{mark['path']} on {mark['host']}, and this one is a copy of it, or that one was moved "
-        "here. A copy needs an index of its own: `hybridlog repair --new-id --mongo URI`. A "
-        "store that was moved takes the index along: `hybridlog repair --moved`. Nothing was "
-        "changed."
+        "here. A copy needs an index of its own: `hybridlog verify --repair --new-id --mongo "
+        "URI`. A store that was moved takes the index along: `hybridlog verify --repair --moved`. "
+        "Nothing was changed."
     )
 
 

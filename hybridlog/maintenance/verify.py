@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace
 
-_REPAIR = "run `hybridlog repair`"
+_REPAIR = "run `hybridlog verify --repair`"
 RESTORE = "restore the file from a copy"
 _COPY_AGAIN = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"

@@ -96,6 +96,11 @@ def is_exact(session: Session, name: str) -> bool:
     return not _GLOB & set(name) or len(session.snapshot().called(name)) == 1
 
 
+def is_one(session: Session, names: Sequence[str]) -> bool:
+    """True if a choice by these names is of one recording, whatever the store holds."""
+    return len(names) == 1 and is_exact(session, names[0])
+
+
 def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
     """Positions of recordings by names and globs.
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from hybridlog.query.steps import Steps
 from hybridlog.session import of_one_moment
@@ -18,22 +17,6 @@ if TYPE_CHECKING:
 
 class IntervalAnswers(Steps):
     """Answers with times, and times as conditions."""
-
-    def around(self, events: Steps, before: DurationLike = 0, after: DurationLike = 0) -> Self:
-        """Only messages near an event, in its recording: `t - before <= time < t + after`.
-
-        Args:
-            events: A query; its messages are the events.
-            before: Time before an event, a duration.
-            after: Time after an event, a duration.
-
-        Raises:
-            TimeError: `before` or `after` is no duration.
-            UsageError: both are zero.
-        """
-        events = copy(events)
-        query = self.during(events.windows(before, after))
-        return type(self)(self.session, query.question, (*query.conditions, events))
 
     @of_one_moment
     def intervals(

@@ -22,7 +22,6 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.attachments import Extras
     from hybridlog.message import Message
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.question import RecordedChannel
@@ -64,10 +63,6 @@ class MessageAnswers(Steps):
 
         self.counters.reset()
         return Following(self.session, self.question, self.counters, names)
-
-    def first(self) -> Message | None:
-        """The first message; None if the answer is empty."""
-        return next(iter(self.limit(1)), None)
 
     @of_one_moment
     def at(self, moment: TimeLike) -> Message:
@@ -145,17 +140,6 @@ class MessageAnswers(Steps):
         return in_force(self.session, self.question, self.counters, original_times=original_times)
 
     @of_one_moment
-    def extras(self) -> Extras:
-        """Attachments and metadata records that belong to the answer as a slice.
-
-        Raises:
-            SegmentError: A segment is damaged.
-        """
-        from hybridlog.attachments import extras_of
-
-        return extras_of(self.session, self.question)
-
-    @of_one_moment
     def count(self) -> int:
         """Number of messages."""
         with self.counters.timed():
@@ -220,7 +204,7 @@ class MessageAnswers(Steps):
         """Laser scans of one length as an array, from columns; None for everything else."""
         from hybridlog.frames.answer import FIELDS, are_scans, scans_in
 
-        if not are_scans(self.channels()):
+        if not are_scans(self._planner().channels()):
             return None
         self.counters.reset()
         question = replace(self.question, fields=FIELDS, tags=())

@@ -49,10 +49,6 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
 
         return properties_html("Query", self._described())
 
-    def _ipython_key_completions_(self) -> list[str]:
-        """Fields, for `query["…"]`."""
-        return list(self.field_types() or ())
-
     def _described(self) -> dict[str, str]:
         """The parts of the question in words."""
         question = self.question

@@ -22,12 +22,9 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.query.answers.interval_queries import IntervalQueries
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.question import RecordedChannel, Span
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -72,22 +69,9 @@ class Steps:
         return self.question.topics
 
     @property
-    def directory(self) -> Path:
-        """The store's directory."""
-        return self.session.directory.path
-
-    @property
     def recordings(self) -> tuple[str, ...]:
         """Ids of the recordings, oldest first."""
         return tuple(summary.id for summary in self.summaries())
-
-    @property
-    def spent(self) -> Counters:
-        """The cost of its conditions on other topics, which were answered before."""
-        found = Counters()
-        for condition in self.conditions:
-            found.add(condition.counters)
-        return found
 
     def __copy__(self) -> Self:
         """The same question with separate counters."""
@@ -236,7 +220,7 @@ class Steps:
 
         if not all(isinstance(path, str) for path in paths):
             raise UsageError('Fields are names: fields("header.stamp", "ranges.min").')
-        known = self.field_types()
+        known = self.session.field_types(self.topics, self.question.recordings)
         for path in paths:
             if known and not (_is_field(path, known) or is_own(path)):
                 raise TopicError(_no_field(path, known, self.topics))
@@ -252,10 +236,6 @@ class Steps:
             frame: Its name.
         """
         return self._with(frame=frame)
-
-    def __getitem__(self, fields: str | tuple[str, ...]) -> Self:
-        """`query["header.stamp", "ranges.min"]` is `query.fields("header.stamp", "ranges.min")`."""
-        return self.fields(*(fields if isinstance(fields, tuple) else (fields,)))
 
     @of_one_moment
     def tags(self, *keys: str) -> Self:
@@ -311,16 +291,6 @@ class Steps:
         return self._on(self.topics, [summary.id for summary in chosen.summaries])
 
     @of_one_moment
-    def with_topic(self, *names: str) -> Self:
-        """The same question about one or some of its topics, by their full names.
-
-        If the question is about several recordings, tables of each topic name them.
-        """
-        several = self.question.names_recording or len(self.session.chosen(self.question)) > 1
-        topics, chosen = self.session.having(names, self.question.recordings)
-        return self._with(topics=topics, recordings=chosen, names_recording=several)
-
-    @of_one_moment
     def during(self, intervals: Intervals) -> Self:
         """Only messages whose log time is in one of some intervals of their recording.
 
@@ -360,38 +330,10 @@ class Steps:
             return self._intervals().windows(before, after)
 
     @of_one_moment
-    def channels(self) -> list[RecordedChannel]:
-        """Every channel of the question."""
-        return Planner(self.session, self.question, self.counters).channels()
-
-    @of_one_moment
-    def field_types(self) -> dict[str, str] | None:
-        """Paths that can be queried and their types; None when a topic has no fixed fields."""
-        return self.session.field_types(self.topics, self.question.recordings)
-
-    @of_one_moment
     def summaries(self) -> list[RecordingSummary]:
         """The recordings in short, oldest first; some may have no message in the answer."""
         places = self.session.chosen(self.question).tolist()
         return [self.session.snapshot().summaries[place] for place in places]
-
-    @of_one_moment
-    def spans(self) -> dict[str, Span]:
-        """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
-
-        It is known without reading messages: those at its ends may not satisfy the predicate,
-        or a range of another clock.
-
-        Raises:
-            TimeError: the range is empty, or outside all recordings.
-        """
-        found: dict[str, Span] = {}
-        for part in Planner(self.session, self.question, Counters()).parts():
-            extent = part.extent
-            if extent is not None:
-                low, high = found.get(part.recording.id, extent)
-                found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
-        return found
 
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries

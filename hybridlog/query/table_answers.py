@@ -12,7 +12,6 @@ from hybridlog.session import of_one_moment
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
-    from matplotlib.axes import Axes
 
     from hybridlog.across.align import Aligned
     from hybridlog.query.answers.field_statistics import FieldStatistics
@@ -72,34 +71,6 @@ class TableAnswers(Steps):
         self._as_they_came("Lines")
         for batch in lines(self._planner()):
             yield [line if isinstance(line, str) else "".join(line) for line in batch]
-
-    @of_one_moment
-    def plot(self, *fields: str, ax: Axes | None = None) -> Axes:
-        """Draw fields over time with matplotlib, a line for each topic and recording.
-
-        Where messages are closer than pixels, the line goes through the least and the greatest
-        value of each pixel. Times without messages, and values that are NaN, are gaps.
-
-        Args:
-            fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
-                (`twist.linear`); without, those of `fields`.
-            ax: Where to draw; None for a new figure of pyplot.
-
-        Returns:
-            The axes; seconds since the beginning of each recording are from left to right.
-
-        Raises:
-            TopicError: no topic has such a field.
-            UsageError: no field, a field that is no number, `reverse`, or too many lines.
-            TimeError: the range is outside all recordings.
-            MissingDependencyError: matplotlib is not installed.
-        """
-        from hybridlog.drawing.figure import new_axes, plot
-
-        self._as_they_came("Plots")
-        axes = new_axes() if ax is None else ax
-        plot(axes, self, fields)
-        return axes
 
     @of_one_moment
     def resample(

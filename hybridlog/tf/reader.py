@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
@@ -73,7 +74,7 @@ def frames_and_stamps(query: Steps) -> tuple[list[str], NDArray[np.int64]]:
     Returns:
         Names of frames, and int64[n]: header stamps, or log times without headers; ns.
     """
-    known = query.field_types() or {}
+    known = field_types(query) or {}
     wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
     if "header.stamp" not in wanted:  # no message has to be read
         times = match_times(query.session, query.question, query.counters)

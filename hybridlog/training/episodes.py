@@ -11,7 +11,6 @@ import numpy as np
 
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
@@ -19,7 +18,6 @@ from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration, format_time
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
-from hybridlog_storage.times import BEGIN, END
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,8 +59,6 @@ class Episode:
         vectors: float32[n, width] by name of the feature.
         names: Names of the columns, by name of the feature.
         held: Frames whose value is older than usual, by topic.
-        is_stale: bool[n], frames with such a value of any topic, or whose own may be lost.
-        shown: int64[n] by topic of pictures: log time of the picture of each frame, ns.
     """
 
     name: str
@@ -71,8 +67,6 @@ class Episode:
     vectors: dict[str, NDArray[np.float32]]
     names: dict[str, tuple[str, ...]]
     held: dict[str, int]
-    is_stale: NDArray[np.bool_]
-    shown: dict[str, NDArray[np.int64]]
 
 
 def episodes(
@@ -116,9 +110,6 @@ def episodes(
         late = np.any([*is_old.values()], axis=0)
         if late.any() and on_gap == "refuse":
             _refuse(name, grid, times, is_old)
-        is_stale = late.copy()
-        for topic, own in times.items():
-            is_stale |= reader.is_lost(topic, own, grid)
         runs = [(0, len(grid))] if on_gap == "hold" else _runs(~late)
         long_runs = [(low, high) for low, high in runs if high - low >= MIN_FRAMES]
         if dropped is not None and late.any():
@@ -143,11 +134,6 @@ def episodes(
                     for topic, old in is_old.items()
                     if old[low:high].any()
                 },
-                is_stale[low:high],
-                {
-                    topic: times[topic][match(own_grid, times[topic], "asof", None).before]
-                    for topic in features.images.values()
-                },
             )
 
 
@@ -166,13 +152,13 @@ def pictures(
         while place < len(frames) and frames[place] < message.log_time_ns:
             place += 1
         if place > shown:
-            yield picture_or_none(current), place - shown
+            yield _picture_or_none(current), place - shown
         current = message
     if place < len(frames):
-        yield picture_or_none(current), len(frames) - place
+        yield _picture_or_none(current), len(frames) - place
 
 
-def picture_or_none(message: Message | None) -> NDArray[np.uint8] | None:
+def _picture_or_none(message: Message | None) -> NDArray[np.uint8] | None:
     """The picture of a message in colours; None if it cannot be shown, or has no payload."""
     if message is None:
         return None
@@ -249,24 +235,6 @@ class _Reader:
         times = table["log_time"].cast(pa.int64()).to_numpy()
         self._checked(source.topic, times)
         return Values(times, np.concatenate(columns, axis=1), tuple(names))
-
-    def is_lost(
-        self, topic: str, messages: NDArray[np.int64], grid: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
-        """True for times whose message of a topic may be lost, until the next one is there.
-
-        Where nobody knows when messages were lost, it is any time with an older message than
-        usual.
-        """
-        found = np.zeros(len(grid), np.bool_)
-        for lost in lost_times(self._session, Question((topic,), (self._recording,))):
-            if lost.begin_ns == BEGIN:
-                period = usual_period(np.diff(messages))
-                return _ages(grid, messages) > period if period else ~found
-            after = np.searchsorted(messages, lost.end_ns)
-            until = messages[after] if after < len(messages) else END
-            found |= (grid >= lost.begin_ns) & (grid < until)
-        return found
 
     def _checked(self, topic: str, times: NDArray[np.int64]) -> NDArray[np.int64]:
         if not len(times):

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
+from hybridlog.query.asked import narrowed
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -159,7 +160,7 @@ class FeatureMap:
 def nearly_empty(query: Query) -> dict[str, int]:
     """Topics of a question with less than a message a second, and their number of messages."""
     found = {}
-    for one in map(query.with_topic, query.topics):
+    for one in (narrowed(query, topic) for topic in query.topics):
         length = sum(end - begin for begin, end in (each.extent for each in one.summaries()))
         if (count := one.count()) < max(length / 1e9, 1):
             found[one.topics[0]] = count

@@ -21,6 +21,7 @@ from hybridlog import __version__
 from hybridlog.arrays.video import pyav
 from hybridlog.formats.slices import fingerprint
 from hybridlog.formats.writing import failures
+from hybridlog.query.asked import narrowed
 from hybridlog.query.pieces import pieces
 from hybridlog.training.episodes import episodes
 from hybridlog.training.feature_map import IMAGE_PREFIX
@@ -101,7 +102,7 @@ def write_lerobot(
     """
     pyav()
     features = features.resolved(query.session)
-    selected = query.with_topic(*features.topics)
+    selected = narrowed(query, *features.topics)
     plan = _plan(selected, features, options)
     root, report = Path(path), LerobotReport(Path(path))
     unfinished = root / _UNFINISHED

@@ -270,7 +270,7 @@ def _message(query: Query, moment: int, seq: int) -> Message | None:
     if seq < END:
         with suppress(TimeError):
             beside = query.between(*span_of(moment, moment)).where(f"_meta.seq <= {seq}")
-            found = beside.reverse().first()
+            found = next(iter(beside.reverse().limit(1)), None)
             if found is not None:
                 return found
         moment -= 1

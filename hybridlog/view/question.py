@@ -97,7 +97,9 @@ class PageQuestion:
 
     def python(self) -> str:
         """A program that asks the same."""
-        steps = [f"store.query({list(self._topics())!r}, [{self.recording.label!r}])"]
+        recordings = f"store.recordings({self.recording.label!r})"
+        topics = ", ".join(map(repr, self.topics))
+        steps = [f"{recordings}.topic({topics})" if topics else f"{recordings}.all_topics()"]
         if self.span is not None:
             steps.append(f".between({self.span[0]}, {self.span[1]})")
         if self.where:

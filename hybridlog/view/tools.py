@@ -16,6 +16,7 @@ from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of
@@ -123,7 +124,7 @@ def schema(context: Context, topic: str | None, recording: str | None) -> Answer
         is_cut = len(listed) > MAX_ROWS or len(chosen) > len(found)
         return _answer({"topics": listed[:MAX_ROWS]}, "topics", is_cut=is_cut)
     query = chosen.topic(topic)
-    known = query.field_types()
+    known = field_types(query)
     if known is None:
         known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
     fields = [{"field": path, "type": kind} for path, kind in known.items()]

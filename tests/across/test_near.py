@@ -193,8 +193,8 @@ def test_before_and_after(logs: Logs) -> None:
     text = "right/pose: state == 'stop'"
     events = logs.store.topic("right/pose").where("state == 'stop'")
     base = logs.store.topic("base")
-    assert base.where(text, within=("5ms", "9ms")) == base.around(events, "5ms", "9ms")
-    assert base.where(text, within=("5ms", 0)) == base.around(events, before="5ms")
+    assert base.where(text, within=("5ms", "9ms")) == base.during(events.windows("5ms", "9ms"))
+    assert base.where(text, within=("5ms", 0)) == base.during(events.windows("5ms"))
 
 
 def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
@@ -202,12 +202,13 @@ def test_only_what_belongs_to_the_answer_is_read(logs: Logs) -> None:
     whole = copy(base)
     list(whole)
     few = base.where("right/pose: header.seq < 440", within="2ms")
-    assert few.spent.bytes_read > 0
-    assert few.spent.chunks_read == 0  # columns of the table
+    (condition,) = few.conditions
+    assert condition.counters.bytes_read > 0
+    assert condition.counters.chunks_read == 0  # columns of the table
     messages = list(few)
     assert 0 < len(messages) < 20
     assert few.counters.bytes_read < whole.counters.bytes_read / 3
-    assert few.limit(1).spent.bytes_read == few.spent.bytes_read
+    assert few.limit(1).conditions == few.conditions
     # A range bounds what is asked about the other topic.
     assert few.between("+0ms", "+100ms").count() <= len(messages)
     none = base.where("right/pose: header.seq < 0", within="2ms")
@@ -219,7 +220,7 @@ def test_what_is_refused(logs: Logs) -> None:
     with pytest.raises(UsageError, match="Topics are names"):
         logs.store.topic(["base"])  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="Fields are names"):
-        base[0]  # type: ignore[index]
+        base.fields(0)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="time within which"):
         base.where("left/pose: x > 1")
     with pytest.raises(UsageError, match="on other topics"):
@@ -249,7 +250,7 @@ def test_a_slice_of_another_topic(logs: Logs, tmp_path: Path) -> None:
     done = run(*asked, "--within", "4ms", "-o", path, "-v", store=store)
     query = logs.store.topic("base").where(asked[-1], within="4ms")
     assert [m.payload for m in read_mcap(path)] == [m.raw for m in query]
-    cost = query.counters.bytes_read + query.spent.bytes_read
+    cost = sum(one.counters.bytes_read for one in (query, *query.conditions))
     assert 0 < cost < 200_000
     assert f"{cost / 1000:.1f} kB read from disk" in done.err
     for code, arguments in (

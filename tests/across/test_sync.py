@@ -21,6 +21,7 @@ import hybridlog as hl
 from hybridlog.across.sync import Synced, approximate_sets
 from hybridlog_storage.errors import StoreError, TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema
+from tests.copies import bring
 
 from .conftest import MS, Logs, Said
 
@@ -368,7 +369,7 @@ def test_what_is_refused(logs: Logs) -> None:
 @pytest.fixture
 def emptied(tmp_path: Path, logs: Logs) -> Iterator[tuple[hl.Store, Synced]]:
     with hl.open(tmp_path / "store", create=True) as store:
-        store.import_from(logs.store.directory.path, ["c"])
+        bring(store, logs.store.directory.path, ["c"])
         yield store, store.sync(["base", "left/pose"])
 
 

@@ -70,7 +70,6 @@ def samples() -> list[Sample]:
         "many": {"rows": {"`ls`": timed}},
         "page": {"rows": {"zoom": timed}, "memory_mb": 100.0},
         "remote": {"rows": [{"step": "open", "requests": 3, "received": 5000, "sent": 0}]},
-        "windows": {"rows": {"window of 16 pictures": {**timed, "preadv_ms": 0.4}}},
     }
     for name, measured in groups.items():
         case = {"group": name, "seconds": 600, "recordings": 1000}

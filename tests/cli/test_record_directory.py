@@ -97,7 +97,7 @@ def test_one_error_does_not_stop_the_others(top: Path, store: Path) -> None:
     assert code == 3  # of the first error
     assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11, "torn": 3}
     assert err.count("aa.bag: not a log of a known kind") == 2  # when it is met, and at the end
-    assert f"{inner} is a store and is not searched; `hybridlog import {inner}`" in err
+    assert f"{inner} is a store and is not searched; `hybridlog copy --from {inner}`" in err
     assert "not recorded: " in err.splitlines()[-1]
 
 

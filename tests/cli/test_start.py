@@ -15,7 +15,6 @@ import pytest
 
 from hybridlog.cli.app import COMMANDS, GROUPS, app
 from hybridlog.cli.binder import PATH
-from hybridlog.cli.hints import MOVED
 from hybridlog.cli.installed import NEEDED_FOR
 from hybridlog.cli.main import EXIT_CODES
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -110,30 +109,13 @@ def test_help_names_commands_and_exit_codes() -> None:
     out = run("--help").out
     assert run("-h").out == out
     assert run("fetch", "-h").out == run("fetch", "--help").out
-    assert len(COMMANDS) <= 31
+    assert len(COMMANDS) <= 28
     for title, commands in GROUPS.items():
         lines = out.split(f"\n{title}:\n")[1].splitlines()
         assert [line.split()[0] for line in lines[: len(commands)]] == [*commands]
     for code, meaning in EXIT_CODES.items():
         assert f"{code} {meaning}" in " ".join(out.split())
     assert "..." not in out.split("Record:")[1].split("The store is")[0]
-
-
-@pytest.mark.parametrize("name", MOVED)
-def test_another_name_says_the_command(name: str) -> None:
-    """The words that it says are those of a command and its options."""
-    done = run(*name.split(), "x", code=2)
-    (words,) = re.findall(r"use `hybridlog (.+)`", done.err)
-    command, *more = words.split()
-    if command.startswith("-"):
-        assert command in run("--help").out
-        return
-    found = commands()[command]
-    if isinstance(found, click.Group):
-        assert more[0] in found.commands
-        return
-    known = {opt for parameter in found.params for opt in parameter.opts}
-    assert {word for word in more if word.startswith("-")} <= known
 
 
 def test_version() -> None:
@@ -181,7 +163,6 @@ def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
 def test_usage_names_what_is_wanted() -> None:
     for command, words in (
         ("record", "[PATH]..."),
-        ("tables", "tables [OPTIONS] TOPIC\n"),
         ("verify", "[RECORDING]..."),
         ("rm", "rm [OPTIONS] [RECORDING]...\n"),
         ("export", "-t, --topic TOPIC"),
@@ -267,10 +248,6 @@ def test_paths_are_checked_by_the_library() -> None:
     ("words", "hint"),
     [
         ("fech", "Did you mean 'fetch'?"),
-        ("help fetch", ": use `hybridlog fetch --help`."),
-        ("bag info x", "There is no `bag info`: use `hybridlog info`."),
-        ("bag play x", ": use `hybridlog export DIRECTORY -F rosbag2`."),
-        ("bag", ": use `hybridlog --help`."),
         ("record /scan /lidar/points", ": `hybridlog record --ros2 -t /scan -t /lidar/points`."),
         ("fetch --betwee", "'--between'"),
         ("check robot", "robot is a recording: -r robot."),
@@ -438,7 +415,7 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
         ("stats", "scan", "-r", "robot"),
         ("check", "-r", "robot"),
         ("diff", "robot", "torn"),
-        ("tables", "scan"),
+        ("info", "--tables", "-t", "scan"),
         ("info", "--sizes", "both"),
         ("info", "--attachments"),
         ("compact", "--dry-run"),
@@ -446,7 +423,7 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
         ("index", "address"),
         ("index", "list"),
         ("verify", "robot"),
-        ("repair", "robot"),
+        ("verify", "robot", "--repair"),
         ("index", "rebuild", "-r", "odd"),
     ],
     ids=" ".join,

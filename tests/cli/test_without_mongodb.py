@@ -156,7 +156,7 @@ def test_recording_needs_no_server(store: Path, tmp_path: Path, kind: str) -> No
         ("stats", "-t", "/imu/data", "--fields", "orientation.x"),
         ("mark", "-r", "robot", "--at", "+0s", "here"),
         ("verify",),
-        ("repair",),
+        ("verify", "--repair"),
     ):
         without(path, *words)
     script = "import hybridlog, sys; s = hybridlog.open(sys.argv[1]); "

@@ -17,6 +17,7 @@ from hybridlog.maintenance import expiry
 from hybridlog.maintenance.places import Place
 from hybridlog.maintenance.ssh import Server, serve
 from hybridlog.record.losses import losses_of
+from hybridlog.store import receiving
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.payloads.logs import robot, write_log
@@ -39,8 +40,8 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.compact(["compacted"])
         store.compact(["dropped"], drop_mcap=True)
         expire(store, "expired")
-        store.tag("noted", place="field")
-        store.note("noted", "it rained")
+        store.edit("noted", tag={"place": "field"})
+        store.edit("noted", note="it rained")
         store.mark("noted", "start", "here")
         store.pin("noted", reason="to keep")
     return path / "store"
@@ -58,7 +59,7 @@ def expire(store: hl.Store, label: str, segments: Sequence[int] = ()) -> None:
 @contextmanager
 def directory_at(path: Path) -> Iterator[Place]:
     """A store's directory."""
-    with hl.open(path, mongo="none", create=True) as store, store.receiving() as place:
+    with hl.open(path, mongo="none", create=True) as store, receiving(store) as place:
         yield place
 
 

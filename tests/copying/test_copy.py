@@ -237,10 +237,10 @@ def test_fields_come_first_and_payloads_later(
     assert len(fields) < len(right), "payloads are not there"
     with hl.open(lab, mongo="none") as store:
         assert not store.verify().findings
-        store.tag("noted", place="lab")
-        store.note("noted", "seen")
+        store.edit("noted", tag={"place": "lab"})
+        store.edit("noted", note="seen")
         store.mark("noted", "end", "there")
-        store.rename("recorded", "drive")
+        store.edit("recorded", name="drive")
     # What was added there stays, and the robot's own later tags do not come.
     with place_at(lab) as place:
         report = copied(robots, place)
@@ -502,8 +502,8 @@ def test_labels_are_read_once(robots: Path, tmp_path: Path, calls: Calls) -> Non
         assert counts[-1] <= counts[1]
         with hl.open(lab, mongo="none") as store:
             ids = {name: store.entry(name).id for name in ("recorded", "noted")}
-            store.rename("recorded", "other")
-            store.rename("noted", "recorded")
+            store.edit("recorded", name="other")
+            store.edit("noted", name="recorded")
         found = place.have([*ids.values()])
     assert {name: found[one].label for name, one in ids.items()} == {
         "recorded": "other",

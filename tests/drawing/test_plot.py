@@ -1,4 +1,4 @@
-"""`hybridlog plot`, `Query.plot`, and small bars of text."""
+"""`hybridlog plot`, and small bars of text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from PIL import Image
 from hybridlog.cli.sparkline import bar, densities, sparkline
 from hybridlog.drawing.figure import figure
 from hybridlog.drawing.lines import MAX_LINES, Line, lines
-from hybridlog.drawing.page import increasing
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts
 from hybridlog.record.losses import Cause
@@ -54,7 +53,7 @@ def test_lines_are_by_topic_and_recording(drive: Drive) -> None:
         lines(drive.store.topic("drive"), [], pixels=9)
 
 
-@pytest.mark.parametrize("form", ["png", "svg", "pdf", "html"])
+@pytest.mark.parametrize("form", ["png", "svg", "pdf"])
 def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
     path = tmp_path / f"speed.{form}"
     ask = ("-t", "drive", "--fields", "linear.z,y", "-o", path)
@@ -75,7 +74,7 @@ def test_files(drive: Drive, tmp_path: Path, form: str) -> None:
         plot(drive, *ask[:-1], again, "--size", "600x200")
         assert again.read_bytes() == content
     else:
-        assert content.startswith({"pdf": b"%PDF", "html": b"<!doctype html>"}[form])
+        assert content.startswith(b"%PDF")
     plot(drive, *ask, code=2)
     assert path.read_bytes() == content
     if form == "png":  # topics without such a field take no room
@@ -111,7 +110,7 @@ def test_standard_output_and_text(drive: Drive) -> None:
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        (("-o", "x.gif"), "end it in .png, .svg, .pdf, .html"),
+        (("-o", "x.gif"), "end it in .png, .svg, .pdf."),
         (("-F", "svg"), "-o FILE.svg"),
         (("-o", "x.png", "--size", "1x1"), "A size is 1200x400"),
         (("-o", "x.png", "--size", "99999x100"), "A size is 1200x400"),
@@ -135,34 +134,6 @@ def test_what_is_refused(
     assert isinstance(done.exception, UsageError)
     assert problem in str(done.exception)
     assert [*tmp_path.iterdir()] == []
-
-
-def test_query_plot(drive: Drive) -> None:
-    import matplotlib as mpl
-    from matplotlib import pyplot as plt
-
-    mpl.use("Agg")
-    query = drive.store.topic("drive").between("+1s", "+2s")
-    axes = query.plot("linear.z", "ticks")
-    try:
-        curves = [line for line in axes.get_lines() if line.get_linestyle() == "-"]
-        at, values = curves[0].get_data()
-        assert np.allclose(at, np.arange(1, 2, 0.01))
-        assert np.array_equal(values, drive.z[100:200])
-        assert np.array_equal(curves[1].get_data()[1], drive.ticks[100:200])
-        legend = axes.get_legend()
-        assert legend is not None
-        assert [text.get_text() for text in legend.get_texts()] == ["linear.z", "ticks"]
-        assert query.counters.messages == 100
-        assert query.plot("linear.x", ax=axes) is axes
-        assert len(plt.get_fignums()) == 1
-        with pytest.raises(UsageError, match="Name a field"):
-            query.plot(ax=axes)
-        before = len(axes.get_lines())
-        query["y"].plot(ax=axes)
-        assert np.array_equal(axes.get_lines()[before].get_data()[1], np.arange(100, 200) / 4)
-    finally:
-        plt.close("all")
 
 
 def curves_of(found: list[Line]) -> str:
@@ -213,10 +184,6 @@ def test_corners_of_a_line() -> None:
     assert np.array_equal(values, [0, 1, NAN, NAN, 2, 3], equal_nan=True)
 
 
-def test_times_of_a_page_are_different() -> None:
-    assert increasing(np.array([5, 5, 5, 6, 9, 20])).tolist() == [5, 6, 7, 8, 9, 20]
-
-
 def test_columns_of_text() -> None:
     series = made([0, 1, 2, 3, 8, 9], [2, 4, NAN, 6, 8, np.inf]).series
     assert series.by_column(3).tolist() == pytest.approx([4, NAN, 8], nan_ok=True)
@@ -229,10 +196,9 @@ def test_without_matplotlib(drive: Drive, tmp_path: Path, calls: Calls) -> None:
     calls.missing("matplotlib")
     ask = ("-t", "drive", "--fields", "y")
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[plot\]'"):
-        drive.store.topic("drive").plot("y")
+        figure([], size=(500, 300), form="png")
     plot(drive, *ask, "-o", tmp_path / "y.png", code=MissingDependencyError.exit_code)
     assert [*tmp_path.iterdir()] == []
-    plot(drive, *ask, "-o", tmp_path / "y.html")
     assert plot(drive, *ask).lines
 
 

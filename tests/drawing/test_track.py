@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
 from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
+from hybridlog.query.asked import field_types
 from hybridlog.query.topics import TopicMatcher
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -239,7 +240,7 @@ def test_one_fix(tmp_path: Path) -> None:
                 values = {"latitude": 48.0, "longitude": 11.0, **one}
                 recorder.write(fix, payload(**values), log_time=BASE + at)
         fixes = [fix_of(message) for message in store.topic("fix")]
-        assert position_of(store.topic("fix").field_types()) == Position("", is_geographic=True)
+        assert position_of(field_types(store.topic("fix"))) == Position("", is_geographic=True)
     assert fixes[0].ellipse == pytest.approx((2 * 2.4477, 2.4477, math.pi / 2), abs=1e-3)
     assert fixes[0].altitude == 12.5
     assert fixes[0].time == BASE
@@ -289,7 +290,7 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         store.record(bag)
         query = store.topic("odom")
-        assert position_of(query.field_types()) == Position(
+        assert position_of(field_types(query)) == Position(
             "pose.pose.position.", is_geographic=False
         )
         got = track(query, pixels=len(read))
@@ -307,7 +308,7 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
         turned = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
         assert found.heading is not None
         assert math.cos(found.heading - turned) == pytest.approx(1)
-        assert position_of(store.topic("r_cart/command_pose").field_types()) == Position(
+        assert position_of(field_types(store.topic("r_cart/command_pose"))) == Position(
             "pose.position.", is_geographic=False
         )
         with pytest.raises(UsageError, match="has no position"):

@@ -25,6 +25,7 @@ from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
 from hybridlog_storage.disk import files
+from tests.copies import bring
 
 LIMIT_S = 60.0
 ROOT = Path(__file__).parents[2]
@@ -384,7 +385,7 @@ def _record(store: Any, args: Sequence[str]) -> None:
 def _repair(store: Any, _args: Sequence[str]) -> None:
     from hybridlog_storage.errors import StoreError
 
-    left = [one for one in store.repair() if not one.is_cured]
+    left = [one for one in store.verify(repair=True) if not one.is_cured]
     if left:  # the command line tells it, and exits with 1
         raise StoreError(str(left))
 
@@ -392,12 +393,12 @@ def _repair(store: Any, _args: Sequence[str]) -> None:
 COMMANDS: Mapping[str, Command] = {
     "open": _open,
     "rm": _on_store(lambda store, args: store.remove(args[0])),
-    "reindex": _on_store(lambda store, args: store.rebuild_index(args or None)),
-    "rename": _on_store(lambda store, args: store.rename(args[0], args[1])),
-    "tag": _on_store(lambda store, args: store.tag(args[0], **{args[1]: args[2]})),
-    "note": _on_store(lambda store, args: store.note(args[0], args[1])),
+    "reindex": _on_store(lambda store, args: store.index.rebuild(args or None)),
+    "rename": _on_store(lambda store, args: store.edit(args[0], name=args[1])),
+    "tag": _on_store(lambda store, args: store.edit(args[0], tag={args[1]: args[2]})),
+    "note": _on_store(lambda store, args: store.edit(args[0], note=args[1])),
     "mark": _on_store(lambda store, args: store.mark(args[0], args[1], args[2])),
-    "import": _on_store(lambda store, args: store.import_from(args[0])),
+    "import": _on_store(lambda store, args: bring(store, args[0])),
     "repair": _on_store(_repair),
     "record": _on_store(_record),
     "compact": _on_store(lambda store, args: store.compact(topics=args)),

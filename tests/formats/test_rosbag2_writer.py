@@ -12,6 +12,7 @@ from ruamel.yaml import YAML
 
 import hybridlog as hl
 from hybridlog.formats.rosbag2.writer import STORAGES, Rosbag2Writer
+from hybridlog.query.asked import channels_of
 from hybridlog_storage.errors import DiskFullError, UsageError
 from tests.cli.running import run
 from tests.data import DATA, needs_data
@@ -33,7 +34,7 @@ def test_every_byte_and_profile_in_split_files(storage: str, tmp_path: Path) -> 
         store.record(LOG, name="auv")
         query = store.all_topics()
         with Rosbag2Writer(tmp_path / "bag", storage=storage, max_file=300_000) as writer:
-            writer.declare([one.channel for one in query.channels()])
+            writer.declare([one.channel for one in channels_of(query)])
             for batch, channels in query.batches():
                 writer.write(batch, [one.channel for one in channels])
         sent = [(m.topic, m.type, m.log_time_ns, m.raw) for m in query]

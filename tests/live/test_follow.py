@@ -202,7 +202,7 @@ def test_what_has_no_end_yet_is_refused(path: Path) -> None:
         for asked in (
             topic.reverse(),
             topic.between("start", "-1s"),
-            topic.around(topic, after=1),
+            topic.during(topic.windows(after=1)),
             topic.where({"$expr": {"$eq": ["$data", "x"]}}),
         ):
             with pytest.raises(UsageError):

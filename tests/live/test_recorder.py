@@ -109,7 +109,7 @@ def test_what_is_received_is_stored_or_in_the_ledger(store: hl.Store) -> None:
     assert robot.speaker.stopped == 1
     # The index is disposable, and so is the catalog's ledger.
     before = [r.end for r in store.recordings()]
-    store.rebuild_index()
+    store.index.rebuild()
     assert [r.end for r in store.recordings()] == before
     assert [m.decode().data for m in store.topic("/chatter")] == [str(n) for n in range(100)]
 
@@ -147,7 +147,7 @@ def test_payloads_step_down_and_fields_stay(store: hl.Store, limit: Limit) -> No
     assert [d["id"] for d in documents] == list(range(1, 61))
     assert {d["data"]["n"] for d in documents} == {9000}
     assert store.topic("/cam").where("near > 5 and near <= 10").count() == 10
-    store.rebuild_index()
+    store.index.rebuild()
     assert list(store.topic("/cam").documents()) == documents
     store.verify()
 
@@ -478,7 +478,7 @@ def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
     robot.recorder.stop()
     marks = store.topic(MARKS).where("tags.trial = '7'")
     assert [m.fields["text"] for m in marks] == ["gripper slipped"]
-    around = store.topic("/chatter").around(marks, "2s", "1500ms")
+    around = store.topic("/chatter").during(marks.windows("2s", "1500ms"))
     assert {m.decode().data for m in around} <= {"3", "4", "5", "6", "7"}
     assert around.count() >= 3
 
@@ -623,7 +623,7 @@ def test_the_reserve_holds_for_what_waits_in_memory(
 
 def test_what_is_expected_is_ready_before_its_first_message(store: hl.Store, limit: Limit) -> None:
     limit(expected_topics=2)
-    database = store.database_for("This")
+    database = store.session.database_for("This")
     robot = Running(store)
     channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]
     for channel in channels:
@@ -642,7 +642,7 @@ def test_what_a_ring_expects_is_in_no_index(store: hl.Store) -> None:
     robot = Running(store, RecorderOptions(reserve_bytes=0, snapshots=SnapshotOptions(ring_s=5)))
     robot.recorder.expect(text_channel("/said"))
     assert robot.recorder.stop() == []
-    assert collection_of("/said") not in store.database_for("This").list_collections()
+    assert collection_of("/said") not in store.session.database_for("This").list_collections()
 
 
 def test_a_standard_type_without_its_definition(store: hl.Store) -> None:

@@ -20,6 +20,7 @@ from hybridlog.contract.judge import broken
 from hybridlog.live.recorder import Recorder, RecorderOptions, state_of, summary_of
 from hybridlog.live.silence import SilenceWatch
 from hybridlog.live.sources.replay import ReplaySource
+from hybridlog.query.asked import channels_of
 from hybridlog.query.topics import matcher
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.messages import Channel
@@ -236,7 +237,7 @@ def test_breaches_in_real_logs_have_one_verdict(tmp_path: Path) -> None:
         with hl.open(tmp_path / real.log, create=True, mongo="none") as store:
             store.record(DATA / "real" / real.log, name="real", matcher=matcher([real.topic]))
             query = store.topic(real.topic).between("start", f"+{real.seconds}s")
-            channel = query.channels()[0].channel
+            channel = channels_of(query)[0].channel
             assert channel.schema is not None
             usual = channel.schema.name
             sent = [real.stamped(Sent(m.log_time_ns, m.raw, usual), 5 * MS) for m in query]

@@ -128,8 +128,8 @@ def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
             recording.close()
     with half_written(path):
         other = tmp_path / "other"
-        done = run("import", path, store=other, code=5)
-        assert done.lines == ["imported before", "imported zulu"]
+        done = run("copy", "--from", path, store=other, code=5)
+        assert done.lines == ["copied before", "copied zulu"]
         assert "'live' of" in done.err
         assert "is being written. Copy it when it has ended." in done.err
     with hl.open(other, mongo=NOWHERE) as store:

@@ -23,6 +23,7 @@ from hybridlog_storage.errors import DiskFullError, StoreError
 from hybridlog_storage.journal import Journal
 from tests.calls import Calls
 from tests.cli.running import run
+from tests.copies import bring
 from tests.payloads.logs import (
     BASE,
     COUNT,
@@ -161,7 +162,7 @@ def test_damage_of_columns_is_found(plain: Path, copy: Path) -> None:
 @pytest.mark.exhaustive
 def test_columns_follow_a_recording(compacted: hl.Store, tmp_path: Path) -> None:
     with hl.open(tmp_path / "other", create=True) as store:
-        assert store.import_from(compacted.directory.path).copied == ["log"]
+        assert bring(store, compacted.directory.path).copied == ["log"]
         copied = {
             str(p.relative_to(store.directory.path)): p.read_bytes()
             for p in store.directory.path.rglob("*.parquet")
@@ -172,7 +173,7 @@ def test_columns_follow_a_recording(compacted: hl.Store, tmp_path: Path) -> None
             for p in compacted.directory.path.rglob("*.parquet")
             if "payloads" in p.parts
         }
-        store.rename("log", "new")
+        store.edit("log", name="new")
         assert store.recordings()[0].payloads == compacted.recordings()[0].payloads
         assert store.verify().findings == []
         store.remove("new")
@@ -187,7 +188,7 @@ def test_a_rebuilt_journal_keeps_the_columns(copy: Path) -> None:
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join([lines[0], b"x" + lines[1], *lines[2:]]))
     with hl.open(copy) as store:
-        store.repair()
+        store.verify(repair=True)
         assert store.recordings()[0].payloads == listed
 
 

@@ -22,6 +22,7 @@ from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.segments.segment_format import moved_record
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from tests.calls import Calls
+from tests.copies import bring
 from tests.payloads.logs import (
     BASE,
     COUNT,
@@ -101,7 +102,7 @@ def test_index_and_tables_are_made_again_from_columns(plain: Path, copy: Path) -
     with hl.open(copy) as store:
         store.compact(drop_mcap=True)
         shutil.rmtree(copy / "tables")
-        store.rebuild_index()
+        store.index.rebuild()
         assert store.verify().findings == []
         documents = [d["ranges"]["max"] for d in store.topic("/scan").documents()]
         with hl.open(plain) as other:
@@ -220,7 +221,7 @@ def test_what_else_is_in_a_segment_stays(tmp_path: Path) -> None:
 @pytest.mark.exhaustive
 def test_columns_follow_a_recording(thin: hl.Store, tmp_path: Path) -> None:
     with hl.open(tmp_path / "other", create=True) as store:
-        store.import_from(thin.directory.path)
+        bring(store, thin.directory.path)
         assert messages(store) == messages(thin)
         assert store.verify().findings == []
 
@@ -250,7 +251,7 @@ def test_a_damaged_line_of_the_journal_loses_nothing(
     ]
     path.write_bytes(b"".join(lines))
     with hl.open(tmp_path / "store") as store:
-        store.repair()
+        store.verify(repair=True)
         assert store.recordings()[0].status == "unproven"
         assert messages(store) == messages(thin)
 
@@ -398,7 +399,7 @@ def edited(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl
         store.compact(topics=["scan"], drop_mcap=True)
         store.compact(topics=["cloud"])
         store.compact(drop_mcap=True)
-        store.tag("log", place="lab")
+        store.edit("log", tag={"place": "lab"})
         store.mark("log", BASE + STEP, "here")
         yield store
 
@@ -418,7 +419,7 @@ def test_a_journal_that_lacks_its_last_lines_loses_no_message(
         assert store.recordings()[0].status == "unproven"
         assert messages(store) == messages(edited)
         assert store.recordings()[0].digests == edited.recordings()[0].digests
-        assert all(one.is_cured for one in store.repair())
+        assert all(one.is_cured for one in store.verify(repair=True))
     with hl.open(tmp_path / "store", mongo=NOWHERE) as store:
         assert messages(store) == messages(edited)
         assert [one.place for one in store.verify().findings] == ["journal"]
@@ -456,6 +457,6 @@ def test_exchanged_segments_that_the_journal_lists_as_whole_ones(
     one.write_bytes(other.read_bytes())
     other.write_bytes(content)
     with hl.open(tmp_path / "store", mongo=NOWHERE) as store:
-        store.repair()
+        store.verify(repair=True)
         assert other.read_bytes() != content == one.read_bytes()
         assert messages(store) == messages(thin)

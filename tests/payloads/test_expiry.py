@@ -22,6 +22,7 @@ from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
 from tests.cli.within import answer
+from tests.copies import bring
 from tests.format_reader import FormatReader
 from tests.payloads.logs import COUNT
 
@@ -195,10 +196,10 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
     expire(copy, [0, 1])
     other = tmp_path / "other"
     with hl.open(other, create=True, mongo="none") as store:
-        store.import_from(copy)
+        bring(store, copy)
         assert store.verify().findings == []
-        store.rename("log", "new")
-        store.rename("new", "log")
+        store.edit("log", name="new")
+        store.edit("new", name="log")
     assert answers(other) == right
     (copy / "recordings" / "log" / journal.JOURNAL).unlink()
     with hl.open(copy, mongo="none") as store:
@@ -238,12 +239,12 @@ def test_files_of_fields_are_joined(copy: Path, tmp_path: Path) -> None:
     assert answers(copy) == before
     with hl.open(copy, mongo="none") as store, hl.open(tmp_path / "o", create=True) as other:
         assert store.verify().findings == []
-        other.import_from(copy)
+        bring(other, copy)
         assert other.verify().findings == []
     # Without its journal a recording knows which files the others were joined to.
     (recording_of(copy) / "journal").unlink()
     with hl.open(copy, mongo="none") as store:
-        store.repair()
+        store.verify(repair=True)
         found = [one.place for one in store.verify().findings]
         assert found in ([], ["journal"])
     rebuilt = journal.read(recording_of(copy))

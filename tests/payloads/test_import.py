@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from tests.copies import bring
 from tests.payloads.logs import messages, recording_of
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
@@ -63,11 +64,11 @@ def test_a_source_that_was_mended_is_imported(
     whole = path.read_bytes()
     fault(path)
     for _ in range(2):
-        (why,) = mine.import_from(source).refused.values()
+        (why,) = bring(mine, source).refused.values()
         assert re.search(r"damaged|incomplete|[Nn]o such file", why)
         assert not mine.recordings()
     path.write_bytes(whole)
-    assert mine.import_from(source).copied == ["log"]
+    assert bring(mine, source).copied == ["log"]
     assert mine.recordings()[0].status == "complete"
     assert files_of(mine.directory.path) == files_of(thin)
     with hl.open(thin, mongo=NOWHERE) as store:
@@ -83,7 +84,7 @@ def test_only_what_is_listed_is_copied(source: Path, mine: hl.Store, thin: Path)
     (recording / "payloads" / "topic=other" / "link").symlink_to("/etc/passwd")
     with columns.open("ab") as file:
         file.write(b"behind its end" * 1000)
-    report = mine.import_from(source)
+    report = bring(mine, source)
     assert report.copied == ["log"]
     assert report.bytes_copied == sum(files_of(thin).values())
     assert files_of(mine.directory.path) == files_of(thin)
@@ -103,7 +104,7 @@ def test_what_an_earlier_import_left_is_checked(source: Path, mine: hl.Store, th
     for path in hidden.glob("payloads/topic=cloud/*"):
         flip(path)
     cut(hidden / "000001.mcap")
-    mine.import_from(source)
+    bring(mine, source)
     assert files_of(mine.directory.path) == files_of(thin)
     assert mine.recordings()[0].status == "complete"
     assert not mine.verify().findings

@@ -21,6 +21,7 @@ from hybridlog.maintenance.verify import verify
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError
+from tests.copies import bring
 from tests.payloads.logs import SETTINGS, messages, recording_of, robot, write_log
 from tests.power import PowerCut
 
@@ -53,7 +54,7 @@ def new_store(path: Path, _: Path) -> None:
 
 def import_from(path: Path, stores: Path) -> None:
     with hl.open(path, mongo=NOWHERE) as store:
-        store.import_from(stores / "thin")
+        bring(store, stores / "thin")
 
 
 def import_again(path: Path, stores: Path) -> None:
@@ -70,8 +71,8 @@ def import_again(path: Path, stores: Path) -> None:
         patch.setattr(files, "sync_folder", fail)
         for _ in range(2):
             with suppress(HybridlogError):
-                store.import_from(stores / "thin")
-        store.import_from(stores / "thin")
+                bring(store, stores / "thin")
+        bring(store, stores / "thin")
 
 
 def reopen(path: Path, _: Path) -> None:
@@ -189,7 +190,7 @@ def check(found: Path, way: Way, stores: Path, right: list[Any], *, is_done: boo
         assert not store.repairs.unreadable
         if way.work in {import_from, import_again} and not store.recordings():
             assert not is_done
-            store.import_from(stores / "thin")
+            bring(store, stores / "thin")
         assert messages(store) == right
         (entry,) = store.recordings()
         is_rebuilt = entry.status == "unproven"

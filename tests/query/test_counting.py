@@ -61,7 +61,7 @@ def test_a_count_is_what_a_loop_counts(
     has = [model.ids[name] for name in chosen if model.of(model.ids[name])]
     if not has:
         return
-    database = store.database_for("the test")
+    database = store.session.database_for("the test")
     if index is not None:
         database.create_index("state", [(index, 1)])
     query = store.topic("/state").in_recording(*has).where("s >= 1")
@@ -78,7 +78,7 @@ def test_a_count_is_what_a_loop_counts(
 def test_what_no_recording_has_is_not_counted(store: hl.Store, trace: str, calls: Calls) -> None:
     recorded(store, {"a": [(second, "/state", {"s": 1}) for second in range(6)]})
     query = store.topic("/state").where("s == 1")
-    database = store.database_for("the test")
+    database = store.session.database_for("the test")
     stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": GONE}})
     database.insert_raw("state", stray, 1)
     if trace != "documents":

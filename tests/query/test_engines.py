@@ -23,6 +23,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
+from hybridlog.query.asked import field_types
 from hybridlog.query.engines import Engine
 from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
@@ -380,7 +381,7 @@ def expected(world: World, question: dict[str, Any]) -> list[Sent]:
 
 
 def _types(world: World, question: dict[str, Any]) -> dict[str, str] | None:
-    return world.store.topic(*question["topics"]).field_types()
+    return field_types(world.store.topic(*question["topics"]))
 
 
 def check(world: World, question: dict[str, Any]) -> None:

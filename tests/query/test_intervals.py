@@ -470,7 +470,7 @@ def test_messages_near_events_are_what_a_loop_finds(
     events = store.topic("/state").where("s == 2")
     want = model.near(lambda m: m.value["s"] == 2, before * SECOND, after * SECOND)
     everything = store.all_topics()
-    near = everything.around(events, f"{before}s", timedelta(seconds=after))
+    near = everything.during(events.windows(f"{before}s", timedelta(seconds=after)))
     got = [(m.log_time_ns, m.recording, m.topic) for m in near]
     assert sorted(got) == want
     keys = {r.id: r.key for r in store.recordings()}
@@ -504,7 +504,7 @@ def test_messages_near_events_are_what_a_loop_finds(
 def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> None:
     logs = [(second, "/state", {"s": 9 - second}) for second in range(10)]
     model = recorded(store, {"a": logs})
-    database = store.database_for("the test")
+    database = store.session.database_for("the test")
     database.create_index("state", [("s", 1)])
     query = store.topic("/state").where("s > 2")
     assert [d["s"] for d in query.documents()] == [9, 8, 7, 6, 5, 4, 3]
@@ -545,7 +545,7 @@ def test_nothing_found_is_no_error(plain: hl.Store) -> None:
     assert len(none.intervals()) == 0
     assert list(none.windows("5s")) == []
     assert len(query.changes("x")) == 0
-    nothing = plain.all_topics().around(none, before="5min")
+    nothing = plain.all_topics().during(none.windows("5min"))
     assert nothing.count() == 0
     assert list(nothing) == []
     assert list(nothing.documents()) == []
@@ -555,7 +555,7 @@ def test_nothing_found_is_no_error(plain: hl.Store) -> None:
 
 def test_a_message_in_two_windows_is_given_once(plain: hl.Store) -> None:
     events = plain.topic("/state").where("s == 1")
-    near = plain.topic("/state").around(events, before="3s")
+    near = plain.topic("/state").during(events.windows("3s"))
     assert near.count() == len(list(near)) == 9
     assert len(events.windows("3s")) == 5
     assert len(events.windows("3s").merged()) == 1
@@ -583,7 +583,7 @@ def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
         assert query.counters.chunks_read == 0
     query.changes("s", "x")
     assert query.counters.chunks_read == 1
-    near = plain.topic("/state").around(query, before="1s")
+    near = plain.topic("/state").during(query.windows("1s"))
     assert near.to_pandas().attrs["hybridlog"]["chunks_read"] <= 2
 
 
@@ -661,7 +661,9 @@ def test_a_real_log_against_a_loop(tmp_path: Path) -> None:
         steps = [t for (t, v), (_, w) in zip(seen[1:], seen, strict=False) if v != w]
         assert [row.begin_ns for row in query.changes("voltage", pause=0)] == steps
         assert errors
-        before = store.all_topics().around(store.topic("/rosout").where("level >= 30"), before="5s")
+        before = store.all_topics().during(
+            store.topic("/rosout").where("level >= 30").windows("5s")
+        )
         assert [m.log_time_ns for m in before] == sorted(
             t for t in times if any(e - 5 * SECOND <= t < e for e in errors)
         )

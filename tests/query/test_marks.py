@@ -104,7 +104,7 @@ def test_a_mark_is_removed(store: hl.Store, tmp_path: Path) -> None:
         assert opened.verify().findings == []
     (folder / f"{number:06d}.mcap").write_bytes(left)
     with hl.open(path, mongo="none") as opened:
-        opened.repair()
+        opened.verify(repair=True)
         assert marks not in opened.topics()
         opened.mark("drive", "+90s", "end")  # in a segment of the same number
         assert times(opened.topic(marks)) == [90]

@@ -82,7 +82,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 recording.write(SCAN, scan, log_time=at)
                 recording.write(ARM, struct.pack("<Id", number, number / 2), log_time=at + 1)
             recording.close()
-        store.tag("run", place="lab")
+        store.edit("run", tag={"place": "lab"})
         store.mark("run", "+1s", "slipped", {"trigger": "bump"})
         store.compact(["moved"], ["/scan"], drop_mcap=True)
     return path

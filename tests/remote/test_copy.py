@@ -17,6 +17,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import BucketError, StoreError, UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
+from tests.copies import bring
 from tests.copying.conftest import (
     STATES,
     Disturbed,
@@ -79,7 +80,7 @@ def test_from_the_robot_to_the_bucket(
         with pytest.raises(UsageError, match="this very store"):
             store.copy(f"{address}/")
         with hl.open(tmp_path / "back", mongo="none", create=True) as back:
-            assert sorted(back.import_from(address).copied) == sorted(STATES)
+            assert sorted(bring(back, address).copied) == sorted(STATES)
             assert not back.verify().findings
     objects = {one.name for one in Bucket(address).objects("recordings")}
     with hl.open(here) as store:
@@ -140,8 +141,8 @@ def test_fields_come_first_and_payloads_go_here(
         assert len(fields) < len(right["recorded"])
         assert fields.items() <= right["recorded"].items()
         with hl.open(address) as there:
-            there.tag("recorded", seen="yes")
-            there.rename("noted", "known")
+            there.edit("recorded", tag={"seen": "yes"})
+            there.edit("noted", name="known")
             assert not there.verify().findings
         size = sum(path.stat().st_size for path in (here / "recordings").glob("*/**/*.*"))
         report = store.copy(address, options=CopyOptions(then_expire=True, limit_rate=2 * size))

@@ -120,7 +120,7 @@ def test_a_lost_journal_is_brought_back(robot: hl.Store, address: str) -> None:
     """With what was added there since."""
     robot.copy(address)
     with hl.open(address) as there:
-        there.tag("run", seen="yes")
+        there.edit("run", tag={"seen": "yes"})
         there.mark("run", "+1s", "lab")
     lose(address, "journal")
     assert robot.copy(address).copied == ["run"]
@@ -185,7 +185,7 @@ def test_a_removed_mark_there_is_no_mark(robot: hl.Store, address: str) -> None:
     with hl.open(address) as there:
         there.mark("run", "+1s", "lab")
         there.unmark("run", "lab")
-        there.tag("run", seen="yes")
+        there.edit("run", tag={"seen": "yes"})
     robot.mark("run", "+2s", "here")
     assert robot.copy(address).copied == ["run"]
     assert states(address) == {"whole": COUNT}
@@ -275,7 +275,7 @@ def test_only_fields_name_a_damaged_copy(robot: hl.Store, address: str) -> None:
     assert robot.copy(address).known == ["run"]  # messages answer, too
     expire(robot, "run", [0])
     shutil.rmtree(robot.directory.path / "tables")
-    robot.repair()  # now its tables say so, and those that are sent
+    robot.verify(repair=True)  # now its tables say so, and those that are sent
     assert robot.copy(address, options=CopyOptions(check=True)).copied == ["run"]
     files.mounted.clear()
     with hl.open(address) as there:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
@@ -18,7 +17,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.maintenance.bucket_place import BucketPlace
-from hybridlog.training.windows import Windows
+from hybridlog.maintenance.keep import tidy
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     BucketError,
@@ -35,14 +34,10 @@ from hybridlog_storage.remote.lists import StoreList, list_name
 from hybridlog_storage.remote.store import RemoteDirectory
 from tests.cli import running as commands
 from tests.cli.within import Answer, answer
+from tests.copies import bring
 from tests.limits import Limit
 from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy
-
-
-def windows_of(store: hl.Store) -> Windows:
-    arm = {"features": {"action": {"/arm": "x"}}}
-    return store.windows("/arm", fps=10, length=4, features=arm)
 
 
 def everything(store: hl.Store) -> dict[str, Any]:
@@ -61,10 +56,6 @@ def everything(store: hl.Store) -> dict[str, Any]:
             for message in store.topic("/arm", "/scan")
         ],
         "fields": store.topic("/arm").where("n == 7").to_pandas().to_dict("list"),
-        "windows": [
-            window["action"].tolist()
-            for window in pickle.loads(pickle.dumps(windows_of(store)))[:5]
-        ],
         "sql": store.sql("select count(*), sum(x) from arm where n < 10").to_arrow().to_pylist(),
     }
 
@@ -115,9 +106,9 @@ def test_requests(published: str, proxy: Proxy) -> None:
 def test_edits(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "short-0"))
     with hl.open(address) as store:
-        store.tag("run", who="me")
-        store.note("run", "good")
-        assert store.rename("run", "A new run").label == "A-new-run"
+        store.edit("run", tag={"who": "me"})
+        store.edit("run", note="good")
+        assert store.edit("run", name="A new run").label == "A-new-run"
         store.remove("short-0")
         assert [one.label for one in store.recordings()] == ["A-new-run"]
     files.mounted.clear()
@@ -137,9 +128,9 @@ def test_changes_keep_their_order(here: Path, address: str, proxy: Proxy) -> Non
     with hl.open(address) as store:
         bucket, name = Bucket(address), f"recordings/{store.entry('run').id}/journal.1"
         bucket.create(name, b"?")
-        store.tag("run", x="1")
+        store.edit("run", tag={"x": "1"})
         bucket.delete([name])
-        store.tag("run", x="2")
+        store.edit("run", tag={"x": "2"})
     files.mounted.clear()
     with hl.open(address) as store:
         assert store.entry("run").tags["x"] == "2"
@@ -174,13 +165,13 @@ def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
         return ""
 
     proxy.spoil = meanwhile
-    one.tag("run", a="1")
+    one.edit("run", tag={"a": "1"})
     assert not is_first
     proxy.reset()
     proxy.old_lists = {}
     assert one.entry("run").tags == {"place": "lab", "a": "1", "b": "2"}
     other("tag", "short-0", "c=3")
-    one.tag("short-0", d="4")  # the list that it sees is from before
+    one.edit("short-0", tag={"d": "4"})  # the list that it sees is from before
     proxy.reset()
     files.mounted.clear()
     with hl.open(address) as last:
@@ -250,10 +241,10 @@ def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Prox
         assert isinstance(directory, RemoteDirectory)
         gone = store.entry("short-0").id
         store.remove("short-0")
-        store.tag("run", a="b")
+        store.edit("run", tag={"a": "b"})
         directory.source.bucket.create("recordings/x/000000.mcap", b"of a copy")
         now = directory.source.bucket.now()
-        assert store.tidy() == (0, 0)
+        assert tidy(store.directory) == (0, 0)
         later = [one.name for one in directory.unneeded(now + 2 * hour)]
         assert later == [list_name(number) for number in (3, 2, 1)]
         names = {one.name for one in directory.unneeded(now + week + hour)}
@@ -370,7 +361,7 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, changes: bool) -
         assert "hybridlog copy" in found.findings[0].cure
         assert found.recordings == 2
     with hl.open(tmp_path / "back", mongo="none", create=True) as store:
-        report = store.import_from(address)
+        report = bring(store, address)
         assert (report.copied, [*report.refused]) == (["short-0"], ["run"])
         assert f"--store {address} run" in report.refused["run"]
     with hl.open(here, mongo="none") as source:
@@ -515,7 +506,7 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
         refused: list[Callable[[], Any]] = [
             store.compact,
             store.repair,
-            lambda: store.import_from(published),
+            lambda: bring(store, published),
             lambda: store.start("new"),
         ]
         for change in refused:

@@ -341,7 +341,6 @@ COMMANDS: dict[str, list[Asked]] = {
     ],
     "plot": [
         asked("plot -t said --fields x -o OUT.png", _page, lambda _: True),
-        asked("plot -t said --fields x -o OUT.html", _page, lambda _: True),
     ],
     "sql": [
         asked(
@@ -366,8 +365,8 @@ COMMANDS: dict[str, list[Asked]] = {
     "verify": [
         asked("verify --json", lambda a, _: a.json["findings"], lambda _: []),
         asked("verify", lambda a, _: f"as far as sealed: {LABEL}" in a.err, lambda _: True),
+        asked("verify --repair --json", lambda a, _: a.json, lambda _: []),
     ],
-    "repair": [asked("repair --json", lambda a, _: a.json, lambda _: [])],
     "index": [
         asked("index list --json", lambda a, _: a.json, lambda _: []),
         refused(f"index rebuild -r {LABEL}", 5),
@@ -398,15 +397,13 @@ COMMANDS: dict[str, list[Asked]] = {
 EXEMPT: dict[str, str] = {
     "record": "it makes recordings",
     "top": "it asks the recorder, not the store",
-    "import": "it copies recordings that have ended, from a store",
-    "copy": "it copies recordings that have ended, to a store",
+    "copy": "it copies recordings that have ended",
     "view": "it serves until it is stopped; see tests/view",
     "trigger": "it asks the recorder, not the store",
     "mcp": "it serves until it is stopped; see tests/view/test_tools.py",
     "open": "it opens a program with a slice, which `fetch -o` makes",
     "demo": "it makes a recording",
     "tf": "these recordings have no transforms; see tests/tf/test_tree.py",
-    "tables": "it names the files of recordings that have ended",
 }
 """Commands without a rule here, and why."""
 

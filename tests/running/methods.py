@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
+from hybridlog.attachments import extras_of
+from hybridlog.query.asked import channels_of, field_types, narrowed, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
 from tests.running.sequence import CHANNELS, MS, SECOND, START, STEP, Known, Sent
@@ -257,25 +259,6 @@ def _table(table: Any, *names: str) -> list[tuple[Any, ...]]:
     return [*zip(*columns, strict=True)]
 
 
-def _plotted(store: hl.Store) -> list[list[tuple[int, float]]]:
-    from matplotlib.figure import Figure
-
-    axes = store.topic("/said").plot("x", ax=Figure(figsize=(60, 4)).subplots())
-    found = []
-    for line in axes.get_lines():
-        points = np.asarray(line.get_xydata())
-        kept = points[~np.isnan(points[:, 1])]
-        found.append(sorted({(round(1e3 * x), float(y)) for x, y in kept}))
-    return [points for points in found if points]
-
-
-def _points(known: Known) -> Any:
-    first = known.span[0]
-    return [
-        sorted({(round((m.log_time - first) / MS), m.fields["x"]) for m in known.of("/said")})  # type: ignore[index]
-    ]
-
-
 def _clocks(store: hl.Store) -> Any:
     said, arm = store.topic("said"), store.topic("arm")
     return {
@@ -329,10 +312,6 @@ def _is_high(fields: dict[str, Any]) -> bool:
     return bool(fields["x"] > 50)
 
 
-def _marks(known: Known) -> list[int]:
-    return [one.log_time for one in known.of("/hybridlog/marks")]
-
-
 def _second(known: Known, *topics: str) -> list[Sent]:
     return known.of(*topics, between=(FIRST_S, LAST_S))
 
@@ -346,26 +325,12 @@ def _lost(store: hl.Store) -> Any:
 
 METHODS: dict[str, Rule] = {
     "__iter__": Rule(lambda s: rows(s.all_topics()), lambda k: sent(k.of())),
-    "__getitem__": Rule(
-        lambda s: s.topic("arm")["n", "position"].to_arrow().column_names[-2:],
-        lambda _: ["n", "position"],
-    ),
     "__eq__": Rule(lambda s: s.topic("arm") == s["/arm"], lambda _: True),
     "__hash__": Rule(lambda s: len({s.topic("arm"), s["/arm"]}), lambda _: 1),
     "__repr__": Rule(
         lambda s: repr(s.topic("said")), lambda _: f"<Query /said; recording {LABEL}>"
     ),
     "_repr_html_": Rule(lambda s: LABEL in s.topic("said")._repr_html_(), lambda _: True),
-    "_ipython_key_completions_": Rule(
-        lambda s: (
-            {"n", "header.stamp", "position"} <= set(s.topic("arm")._ipython_key_completions_())
-        ),
-        lambda _: True,
-    ),
-    "around": Rule(
-        lambda s: seqs(s.topic("arm").around(s.topic("marks"), "0.3s", "0.1s")),
-        lambda k: seqs(around(k, _marks(k), 300 * MS, 100 * MS, "/arm")),
-    ),
     "at": Rule(
         lambda s: [s.topic("said").at(t).seq for t in (FIRST_S, LAST_S + 1, "-0.3s", "end")],
         lambda k: [
@@ -411,10 +376,6 @@ METHODS: dict[str, Rule] = {
             changed(k, "/arm", "name", SECOND // 10),
         ),
     ),
-    "channels": Rule(
-        lambda s: sorted(c.channel.topic for c in s.all_topics().channels()),
-        lambda _: sorted(CHANNELS),
-    ),
     "clock": Rule(_clocks, _right_clocks),
     "check": Rule(
         lambda s: [
@@ -454,7 +415,6 @@ METHODS: dict[str, Rule] = {
             ),
         ),
     ),
-    "directory": Rule(lambda s: s.topic("arm").directory == s.directory.path, lambda _: True),
     "in_frame": Rule(  # the recording has no transforms
         lambda s: refusal(lambda: s.topic("said").in_frame("map").to_arrow()),
         lambda k: "UsageError",
@@ -464,16 +424,6 @@ METHODS: dict[str, Rule] = {
         lambda k: _right_thrice(_second(k, "/said", "/cam")),
     ),
     "every": Rule(lambda s: seqs(s.topic("said").every(7)), lambda k: seqs(k.of("/said")[::7])),
-    "extras": Rule(
-        lambda s: (
-            sorted(c.topic for c in s.all_topics().extras().channels),
-            len(s.all_topics().extras().problems),
-        ),
-        lambda _: (sorted(CHANNELS), 0),
-    ),
-    "field_types": Rule(
-        lambda s: (s.topic("arm").field_types() or {}).get("position"), lambda _: "float64[]"
-    ),
     "fields": Rule(
         lambda s: _table(
             s.topic("arm").fields("n", "name", "ranges.max").to_arrow(), "n", "name", "ranges.max"
@@ -482,10 +432,6 @@ METHODS: dict[str, Rule] = {
             (m.fields["n"], m.fields["name"], max(m.fields["ranges"]))  # type: ignore[index]
             for m in k.of("/arm")
         ],
-    ),
-    "first": Rule(
-        lambda s: (s.topic("arm").first().seq, s.topic("arm").reverse().first().seq),  # type: ignore[union-attr]
-        lambda k: (k.of("/arm")[0].seq, k.of("/arm")[-1].seq),
     ),
     "gaps": Rule(
         lambda s: (
@@ -519,7 +465,6 @@ METHODS: dict[str, Rule] = {
         lambda k: [in_force(k, FIRST_S), in_force(k, k.span[1] + 1 - 200 * MS)],
     ),
     "limit": Rule(lambda s: seqs(s.all_topics().limit(23)), lambda k: seqs(k.of()[:23])),
-    "plot": Rule(_plotted, _points),
     "rate": Rule(
         lambda s: (
             _table(
@@ -548,11 +493,6 @@ METHODS: dict[str, Rule] = {
         lambda k: regular(k, "/said", SECOND // 10),
     ),
     "reverse": Rule(lambda s: rows(s.all_topics().reverse()), lambda k: sent(reversed(k.of()))),
-    "spans": Rule(
-        lambda s: [*s.topic("arm").spans().values()],
-        lambda k: [k.clock_span("log", ["/arm"])],
-    ),
-    "spent": Rule(lambda s: s.topic("arm").spent.messages, lambda _: 0),
     "stats": Rule(
         lambda s: [
             (f.topic, f.field, f.count, f.nan, f.infinite, f.min, f.max, f.mean, f.std)
@@ -634,9 +574,6 @@ METHODS: dict[str, Rule] = {
             for m in k.of("/cam")
         ],
     ),
-    "with_topic": Rule(
-        lambda s: _thrice(s.all_topics().with_topic("/arm")), lambda k: _right_thrice(k.of("/arm"))
-    ),
 }
 """By name of the method."""
 
@@ -661,6 +598,27 @@ def _aligned(found: Any) -> Any:
 
 
 STORE: dict[str, Rule] = {
+    "channels": Rule(
+        lambda s: sorted(c.channel.topic for c in channels_of(s.all_topics())),
+        lambda _: sorted(CHANNELS),
+    ),
+    "field_types": Rule(
+        lambda s: (field_types(s.topic("arm")) or {}).get("position"), lambda _: "float64[]"
+    ),
+    "spans": Rule(
+        lambda s: [*spans_of(s.topic("arm")).values()],
+        lambda k: [k.clock_span("log", ["/arm"])],
+    ),
+    "with_topic": Rule(
+        lambda s: _thrice(narrowed(s.all_topics(), "/arm")), lambda k: _right_thrice(k.of("/arm"))
+    ),
+    "extras": Rule(
+        lambda s: (
+            sorted(c.topic for c in extras_of(s.all_topics()).channels),
+            len(extras_of(s.all_topics()).problems),
+        ),
+        lambda _: (sorted(CHANNELS), 0),
+    ),
     "__repr__": Rule(lambda s: "<Store " in repr(s), lambda _: True),
     "_repr_html_": Rule(lambda s: LABEL in s._repr_html_(), lambda _: True),
     "_ipython_key_completions_": Rule(
@@ -677,7 +635,6 @@ STORE: dict[str, Rule] = {
         lambda s: {t: n for t, n in s.entry(LABEL).messages_by_topic().items() if n},
         lambda k: {t: n for t, n in k.counts.items() if n},
     ),
-    "is_one": Rule(lambda s: s.is_one([LABEL]), lambda _: True),
     "query": Rule(lambda s: s.query(["/arm"], [LABEL]).count(), lambda k: len(k.of("/arm"))),
     "recordings": Rule(
         lambda s: (

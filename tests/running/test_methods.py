@@ -16,8 +16,8 @@ from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
 from tests.some import in_turn
 
-SPECIAL = {"__iter__", "__getitem__", "__eq__", "__hash__", "__repr__"}
-PRIVATE = {"_repr_html_", "_ipython_key_completions_"}
+SPECIAL = {"__iter__", "__eq__", "__hash__", "__repr__"}
+PRIVATE = {"_repr_html_"}
 READERS = (
     pytest.param("writer", marks=pytest.mark.slow),
     "before",

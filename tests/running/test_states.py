@@ -13,6 +13,7 @@ import pytest
 from mcap.records import Metadata
 
 import hybridlog as hl
+from hybridlog.attachments import extras_of
 from hybridlog.maintenance.expiry import expire
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.segments.attachments import Attachment
@@ -194,11 +195,11 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             (attachment,) = store.attachments(LABEL)
             assert (attachment.name, b"".join(attachment.pieces())) == (record.name, b"fx: 500")
             assert [one.values for one in store.metadata(LABEL)] == [{"name": "seven"}]
-            extras = store.topic("arm").extras()
+            extras = extras_of(store.topic("arm"))
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
         done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]
-        image = found.before.topic("cam").first()
+        image = next(iter(found.before.topic("cam")))
         assert image is not None
         assert "<img" in image._repr_html_()
         assert LABEL in found.before.recordings()._repr_html_()
@@ -234,7 +235,7 @@ def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
     steps = iter(store.all_topics())
     first = next(steps)
     with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
-        other.rename(LABEL, "other")
+        other.edit(LABEL, name="other")
     assert rows([first, *steps]) == sent(known.of())
     assert store.topic("arm").in_recording("other").count() == len(known.of("/arm"))
     assert [r.label for r in store.summaries()] == ["other"]

@@ -17,6 +17,7 @@ import hybridlog as hl
 from hybridlog.sql import topic_view
 from hybridlog_storage.catalog_parts import MAX_PART_BYTES
 from tests.calls import Calls
+from tests.copies import bring
 from tests.imports import ROOT
 from tests.scale.cost import Cost, cost_of
 
@@ -86,8 +87,8 @@ ASKED: dict[str, Work] = {
     "align of a day": lambda store: store.align(
         store.topic("pose").between(*day(4)), ["imu"]
     ).to_arrow(),
-    "first of all": lambda store: store.topic("pose").first(),
-    "last of all": lambda store: store.topic("pose").reverse().first(),
+    "first of all": lambda store: [*store.topic("pose").limit(1)],
+    "last of all": lambda store: [*store.topic("pose").reverse().limit(1)],
     "one recording": lambda store: store.query(["/pose"], ["day00004"]).count(),
     "topics": lambda store: store.topics(),
     "chosen ones": lambda store: [
@@ -145,13 +146,13 @@ def test_opening_asks_once(stores: dict[int, Path]) -> None:
 
 
 CHANGES: dict[str, Work] = {
-    "tag": lambda store: store.tag("day00004", place="hall"),
-    "note": lambda store: store.note("day00004", "all quiet"),
-    "rename": lambda store: store.rename("day00004", "fourth"),
-    "rename back": lambda store: store.rename("fourth", "day00004"),
+    "tag": lambda store: store.edit("day00004", tag={"place": "hall"}),
+    "note": lambda store: store.edit("day00004", note="all quiet"),
+    "rename": lambda store: store.edit("day00004", name="fourth"),
+    "rename back": lambda store: store.edit("fourth", name="day00004"),
     "verify of one": lambda store: store.verify(["day00004"]),
-    "reindex of one": lambda store: store.rebuild_index(["day00004"]),
-    "repair of one": lambda store: store.repair(["day00004"]),
+    "reindex of one": lambda store: store.index.rebuild(["day00004"]),
+    "repair of one": lambda store: store.verify(["day00004"], repair=True),
 }
 
 
@@ -188,10 +189,10 @@ def test_a_recording_is_imported_without_a_look_at_the_others(
     imports, answers, removals = {}, {}, {}
     for count, path in stores.items():
         with hl.open(path, mongo="none") as store:
-            store.import_from(tmp_path / "from-before")
+            bring(store, tmp_path / "from-before")
             asked = store.topic("pose").where("data > 4.5").between(*day(5_001))
             imports[count] = cost_of(
-                store, lambda store=store: store.import_from(tmp_path / "from-more")
+                store, lambda store=store: bring(store, tmp_path / "from-more")
             )
             answers[count] = cost_of(store, lambda asked=asked: asked.count())
             assert asked.count() == MESSAGES - 5
@@ -225,7 +226,7 @@ def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) 
     with hl.open(stores[MANY], mongo="none") as store:
         asked = store.topic("pose").where("data > 4.5")
         assert asked.count() == MANY * (MESSAGES - 5)
-        store.tag("day00004", place="roof")
+        store.edit("day00004", tag={"place": "roof"})
         cost = cost_of(store, asked.count)
     assert cost.looks < 20
     assert not [path for path in cost.opened if path.endswith(".parquet")]
@@ -281,7 +282,7 @@ def test_bounds_leave_out_recordings_that_cannot_match(stores: dict[int, Path]) 
         assert asked[:3] == [{f"day{MANY - 1:05d}"}, {"day00012"}, {"day00001"}]
         for cost in costs[-3:]:
             assert {*cost.opened} <= {str(store.directory.path)}
-        store.tag("day00012", place="hall")
+        store.edit("day00012", tag={"place": "hall"})
         assert imu.where("data in [1205, 3]").count() == 2
 
 
@@ -318,7 +319,7 @@ import hybridlog as hl
 with hl.open(sys.argv[1]) as store:
     pose = store.topic("pose")
     print(pose.count(), pose.where("data > 4.5").count(), sum(1 for _ in pose))
-    print(len(pose.to_pandas()), len(store.rebuild_index()), len(store.verify().findings))
+    print(len(pose.to_pandas()), len(store.index.rebuild()), len(store.verify().findings))
 """
 
 

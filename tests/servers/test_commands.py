@@ -81,7 +81,7 @@ def asked(path: Path) -> tuple[dict[str, list[Sent]], dict[str, object]]:
         heard["record"] = [*sent]
         store.connect()
         sent.clear()
-        store.rebuild_index(["more"])
+        store.index.rebuild(["more"])
         heard["reindex"] = [*sent]
         store.connect()
         sent.clear()
@@ -122,7 +122,7 @@ def test_a_large_recording_leaves_no_journal(
         with commands() as sent:
             store.connect()
             store.record(log, name="one")
-            store.rebuild_index(["one"])
+            store.index.rebuild(["one"])
         assert [one.name for one in sent].count("fsync") == (2 if is_large else 0)
 
 

@@ -19,6 +19,7 @@ from hybridlog.maintenance import tables as making
 from hybridlog_storage.disk import files
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
 from tests.tables.logs import BASE, channel, varied, write_log
@@ -89,7 +90,7 @@ def test_tables_keep_their_place_when_a_recording_is_renamed(few: hl.Store) -> N
 def test_tables_of_an_imported_recording(few: hl.Store, tmp_path: Path, server: str) -> None:
     mongo = server.replace("/?", "/imported?")
     with hl.open(tmp_path / "other", create=True, mongo=mongo) as other:
-        other.import_from(few.directory.path)
+        bring(other, few.directory.path)
         assert compare(other) == 90
         assert not other.repairs.tables  # they were made at once, for other readers
         assert contents(other).keys() == contents(few).keys()
@@ -144,10 +145,10 @@ def test_what_is_gone_has_no_tables_without_mongodb(few: hl.Store, tmp_path: Pat
 
 def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
     before = contents(few)
-    few.rebuild_index()
+    few.index.rebuild()
     assert contents(few) == before
     shutil.rmtree(few.directory.path / TABLES)
-    few.rebuild_index()
+    few.index.rebuild()
     assert contents(few) == before
 
 
@@ -155,7 +156,7 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     few: hl.Store, server: str, tmp_path: Path
 ) -> None:
     before = contents(few)
-    path, database = few.directory.path, few.database_for("This")
+    path, database = few.directory.path, few.session.database_for("This")
     # As if the recorder had been killed while it wrote.
     (entry,) = few.recordings()
     IndexState(database).put(entry, "open", turn=1)
@@ -195,13 +196,13 @@ def test_repair_makes_missing_tables(few: hl.Store) -> None:
     before = contents(few)
     for path in (few.directory.path / TABLES).glob("*/*.parquet"):
         path.unlink()
-    done = few.repair()
+    done = few.verify(repair=True)
     assert [(one.place, one.is_cured) for one in done] == [
         ("table of /a", True),
         ("table of /b", True),
     ]
     assert contents(few) == before
-    assert not few.repair()
+    assert not few.verify(repair=True)
 
 
 def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:

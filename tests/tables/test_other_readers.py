@@ -392,10 +392,10 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
     """A statement for each type of the topic; together they have all of its rows."""
 
     def shown(*arguments: str) -> str:
-        return answer("tables", *arguments, store=many.directory.path).out
+        return answer("info", "--tables", "-t", *arguments, store=many.directory.path).out
 
     for topic in ("/large", "/small", "/changed", "/two"):
-        items = json.loads(shown(topic, "--json"))
+        items = json.loads(shown(topic, "--json"))["tables"]
         assert len(items) == (2 if topic in {"/changed", "/two"} else 1)
         rows = 0
         for item in items:
@@ -408,7 +408,7 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
     assert all(Path(file).is_file() for file in files)
     (statement,) = (line for line in lines if line.startswith("select"))
     assert len(duckdb.sql(statement)) == 160
-    one = json.loads(shown("/large", "-r", "1", "--json"))
+    one = json.loads(shown("/large", "-r", "1", "--json"))["tables"]
     assert [item["rows"] for item in one] == [600]
     assert [len(duckdb.sql(item["statement"])) for item in one] == [600]
     assert "recording" not in shown("/large")
@@ -417,7 +417,8 @@ def test_the_command_prints_statements_to_paste(many: hl.Store) -> None:
 def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) -> None:
     place = tmp_path / "it's [1]*?"
     copytree(many.directory.path, place)
-    (item,) = json.loads(answer("tables", "/small", "--json", store=place).out)
+    asked = ("info", "--tables", "-t", "/small", "--json")
+    (item,) = json.loads(answer(*asked, store=place).out)["tables"]
     assert len(duckdb.sql(item["statement"])) == 160
 
 
@@ -452,8 +453,8 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
     other = write_log(tmp_path / "other.mcap", [(BASE, "/a", payload(0))])
     changes: list[Callable[[hl.Store], object]] = [
         lambda store: store.record(other, name="other"),
-        lambda store: store.tag("log", robot="7", place="hall"),
-        lambda store: store.rename("log", "first"),
+        lambda store: store.edit("log", tag={"robot": "7", "place": "hall"}),
+        lambda store: store.edit("log", name="first"),
         lambda store: store.mark("first", BASE, "here"),
         lambda store: store.remove("other"),
         lambda store: store.catalog.rebuild() or store.refresh(),
@@ -475,7 +476,7 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
     assert listed(place) == listed_by_command(place)
     assert listed(place).keys() == {"first", "live"}
     for work in (
-        lambda: answer("tables", "/a", store=place),
+        lambda: answer("info", "--tables", "-t", "/a", store=place),
         lambda: answer("sql", "select count(*) from a", store=place),
     ):
         path.unlink()

@@ -239,7 +239,7 @@ def test_damaged_tables_are_none_and_are_made_again(
     places = {f.place for f in recorded.verify().findings}
     if harm is not delete:
         assert f"table of {topic}" in places
-        done = recorded.repair()
+        done = recorded.verify(repair=True)
         assert {f"table of {topic}"} <= {one.place for one in done if one.is_cured}
     else:
         assert not places
@@ -279,7 +279,7 @@ def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables, mongo
     assert recorded.verify().findings == []
     assert count(recorded, tables, "/large") == want
     with hl.open(recorded.directory.path, mongo=mongo) as indexed:
-        indexed.rebuild_index()
+        indexed.index.rebuild()
         assert compare(indexed) == 1800
 
 

@@ -454,7 +454,7 @@ def test_a_disk_that_fills_up(
     tables = Tables(store.directory.path)
     assert all(tables.of(entry, topic) is None for topic in topics_of(entry))
     monkeypatch.undo()
-    store.rebuild_index()
+    store.index.rebuild()
     assert compare(store) == 2400
 
 

@@ -22,7 +22,7 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer
 from tests.data import DATA, needs_data
-from tests.training.test_lerobot import about, digests, episodes_of, rows_of
+from tests.training.test_lerobot import about, digests, episodes_of
 
 FPS = 10
 FRONT = "/camera/front/image_raw"
@@ -85,10 +85,6 @@ def test_real_logs_with_cameras(tmp_path: Path, log: str, cameras: int) -> None:
         query, path = store.topic(*names), tmp_path / "set"
         report = store.to_lerobot(query, tmp_path / "map.yaml", path, fps=30, task="x")
         assert check_pictures(store, path, features, 30) == report.frames * cameras > 0
-        # The same frames without an export.
-        windows = store.windows(names, fps=30, length=1)
-        assert [*windows[0]][:cameras] == [f"observation.images.{name}" for name in features.images]
-        assert len(windows) == sum(one["length"] for one in episodes_of(path))
 
 
 def test_a_set_of_the_demo(demo: Path, tmp_path: Path) -> None:
@@ -101,13 +97,6 @@ def test_a_set_of_the_demo(demo: Path, tmp_path: Path) -> None:
         )
         assert (report.lost, report.held, report.missing) == (0, 0, 0)
         assert check_pictures(store, tmp_path / "set", features, FPS) == 2 * report.frames
-        windows = store.windows(store.all_topics(), fps=FPS, length=2, horizon=3)
-        rows = rows_of(tmp_path / "set")
-        for place, window in enumerate(windows):
-            assert not window["is_stale"].any()
-            for frame in range(5):
-                told = window["observation.state"][frame].tolist()
-                assert told == rows[place + frame]["observation.state"]
 
 
 def test_a_damaged_recording(demo: Path, tmp_path: Path) -> None:

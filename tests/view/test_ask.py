@@ -477,8 +477,7 @@ def test_a_question_is_asked_and_its_matches_become_a_file(
     question.press("Enter")
     page.locator("td", has_text="<b>x</b>").nth(1).wait_for()
     page.locator("td button").first.click()
-    last = demo_store.topic("scan").reverse().first()
-    assert last is not None
+    last = next(iter(demo_store.topic("scan").reverse()))
     at = last.log_time_ns - start
     page.wait_for_url(lambda url: f"&at={at}&" in url)
     question.press("ArrowUp")

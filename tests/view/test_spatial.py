@@ -393,6 +393,6 @@ def test_python_that_gets_the_same(browser: Browser, url: str) -> None:
                 names["store"].close()
             said.append(output.getvalue())
         assert said[0] == "(6,) ('range', 'intensity', 'angle')\n"
-        assert said[1].startswith("Grid(latitude=48.0, longitude=11.0")
+        assert said[1].split()[:2] == ["latitude", "longitude"]
     finally:
         context.close()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from hybridlog.query.asked import channels_of, narrowed, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.latching import depth_of, is_video
 from hybridlog.query.query import Query
@@ -89,7 +90,7 @@ class PlayedLog:
     """
 
     def __init__(self, query: Query) -> None:
-        spans = query.spans()
+        spans = spans_of(query)
         if not spans:
             raise TimeError("There are no messages to play.")
         times = np.array([(begin, end, 0) for begin, end in spans.values()], np.int64)
@@ -103,7 +104,7 @@ class PlayedLog:
         self.covered = Covered(times[:, 0], times[:, 1])
         self._ids: dict[tuple[str, int], int] = {}
         self._latching: set[str] = set()
-        self.channels = self._merge(query.channels())
+        self.channels = self._merge(channels_of(query))
 
     def _merge(self, recorded: Sequence[RecordedChannel]) -> list[PlayedChannel]:
         """The channels as viewers see them."""
@@ -126,7 +127,7 @@ class PlayedLog:
         """All messages of some topics behind a log time, ns, in order."""
         if not topics or position >= self.end:
             return
-        query = self._whole.with_topic(*topics).during(self._during).between(position + 1, None)
+        query = narrowed(self._whole, *topics).during(self._during).between(position + 1, None)
         for batch, channels in query.batches():
             yield self._block(batch, channels)
 
@@ -140,7 +141,7 @@ class PlayedLog:
         if not topics:
             return
         if found := self._latching.intersection(topics):
-            latched = self._whole.with_topic(*found).between(min(position + 1, self.end), None)
+            latched = narrowed(self._whole, *found).between(min(position + 1, self.end), None)
             for batch, channels in latched.latched(original_times=True):
                 yield self._block(batch, channels)
             if position >= self.end:
@@ -153,7 +154,7 @@ class PlayedLog:
     def _last(self, topic: str, position: int) -> Iterator[Block]:
         """The last message of a topic until a log time, ns, if the range has one."""
         try:
-            query = self._whole.with_topic(topic).at_time(position)
+            query = narrowed(self._whole, topic).at_time(position)
         except TopicError:
             return  # the topic has none yet
         for batch, channels in query.during(self._during).batches():

@@ -21,6 +21,7 @@ from hybridlog.drawing.matches import (
 )
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.asked import field_types
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
@@ -124,7 +125,7 @@ def completion(context: Context, params: RequestParams) -> dict[str, Any]:
         except (TopicError, ValueError):
             return None
         query = context.query(recording, name)
-        known = query.field_types()
+        known = field_types(query)
         if known is None:
             known = {str(one["path"]): str(one["type"]) for one in infer_fields(query)}
         return known

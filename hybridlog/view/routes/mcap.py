@@ -13,6 +13,7 @@ from urllib.parse import urlencode
 from starlette.responses import FileResponse
 
 from hybridlog.formats.slices import fingerprint, write_mcap
+from hybridlog.query.asked import channels_of, spans_of
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time
@@ -46,11 +47,11 @@ def slice_file(context: Context, params: RequestParams) -> Response:
 def manifest(context: Context, params: RequestParams) -> dict[str, Any]:
     """The manifest of a remote data loader: topics, times and data URL of a selection."""
     query = _query(context, params)
-    spans = query.spans().values()
+    spans = spans_of(query).values()
     if not spans:
         raise TimeError("This selection has no messages.")
     schemas: dict[Schema, int] = {}
-    topics = [_topic(channel, schemas) for channel in query.channels() if not channel.is_reduced]
+    topics = [_topic(channel, schemas) for channel in channels_of(query) if not channel.is_reduced]
     source = {
         "url": f"data?{urlencode(_parameters(params))}",
         "id": fingerprint(query),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
 from hybridlog.drawing.tree import MAX_SHOWN, tree
+from hybridlog.query.asked import channels_of
 from hybridlog.query.times import format_time
 from hybridlog.schema.states import CAUSES
 from hybridlog.view.context import current, route, start_of
@@ -90,7 +91,7 @@ def log_count(context: Context, params: RequestParams) -> dict[str, Any]:
 def _log(query: Query, params: RequestParams) -> Log:
     level = params.word("level", ("", *LEVELS), "")
     text = params.text("text", "", longest=_MAX_FILTER)
-    schemas = (channel.channel.schema for channel in query.channels())
+    schemas = (channel.channel.schema for channel in channels_of(query))
     type_name = next((schema.name for schema in schemas if schema is not None), "")
     return Log(query, kind_of(type_name), level, text)
 

@@ -12,6 +12,7 @@ from starlette.responses import Response
 from hybridlog.drawing.images import picture
 from hybridlog.drawing.points import MAX_POINTS, bounds, points
 from hybridlog.drawing.track import Position, fix_of, pose_of, position_of, track
+from hybridlog.query.asked import field_types
 from hybridlog.view.context import current, json_response, packed_response, route, start_of
 from hybridlog_storage.errors import DefinitionError, MissingDependencyError, PayloadError
 
@@ -113,7 +114,7 @@ def fix_at(context: Context, params: RequestParams) -> dict[str, Any]:
     if shown.message is None:
         return answer
     _, query = context.topic(params)
-    position = position_of(query.field_types()) or Position("", is_geographic=True)
+    position = position_of(field_types(query)) or Position("", is_geographic=True)
     if position.is_geographic:
         found = asdict(fix_of(shown.message, position.prefix))
     else:

@@ -15,6 +15,7 @@ from hybridlog.drawing.series import series as read_series
 from hybridlog.query.answers.infer_fields import SAMPLE
 from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.answers.marks import marks as marks_of
+from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
 from hybridlog.view.context import Context, extent, route, start_of
 from hybridlog_storage.errors import UsageError
@@ -131,7 +132,7 @@ def _filled(content: bytes) -> bytes:
 def fields(context: Context, params: RequestParams) -> dict[str, Any]:
     """The fields of a topic that can be drawn, and their types."""
     _, query = context.topic(params)
-    found = fields_of(query.field_types(), iter(query.limit(SAMPLE)))
+    found = fields_of(field_types(query), iter(query.limit(SAMPLE)))
     return {"fields": [{"path": path, "type": kind} for path, kind in found]}
 
 

@@ -15,6 +15,14 @@ const accepts = ofTypes(
   "std_msgs/String",
 );
 const LEVELS = ["debug", "info", "warning", "error", "fatal"];
+/** Field with the text and the numbers of the levels by type, as the server has them. */
+const KINDS = {
+  "rosgraph_msgs/Log": ["msg", [1, 2, 4, 8, 16]],
+  "rcl_interfaces/Log": ["msg", [10, 20, 30, 40, 50]],
+  "foxglove_msgs/Log": ["message", [1, 2, 3, 4, 5]],
+  "foxglove.Log": ["message", [1, 2, 3, 4, 5]],
+  "std_msgs/String": ["data", null],
+};
 const ROW = 22; // pixels; the style sheet says the same
 const PAGE = 200; // lines of a request
 const MAX_LINES = 2000;
@@ -33,16 +41,28 @@ export default {
     const { recording } = panel;
     return [
       opening(panel),
-      "from hybridlog.drawing.log import Log, kind_of",
-      "",
       `query = query.between(${moment(recording, begin)}, ${moment(recording, end)})`,
-      `kind = kind_of(${literal(panel.topic.type)})`,
-      `log = Log(query, kind, ${literal(level)}, ${literal(text)})`,
-      "for message in log.filtered.limit(1000):",
+      ...conditions(panel.topic.type, level, text).map((one) => `query = query.where(${literal(one)})`),
+      "for message in query.limit(1000):",
       "    print(message.log_time_ns, message.fields)",
     ].join("\n");
   },
 };
+
+/** Predicates for the lines that the filters let pass. */
+function conditions(type, level, text) {
+  const [field, numbers] = KINDS[type.replace("/msg/", "/")];
+  const found = [];
+  if (level && numbers) found.push(`level >= ${numbers[LEVELS.indexOf(level)]}`);
+  if (text) {
+    // Written as numbers, characters mean nothing to the pattern nor to the predicate.
+    const plain = (c) => (/[\p{L}\p{N}]/u.test(c) ? c : `\\x{${c.codePointAt(0).toString(16)}}`);
+    const pattern = `"(?i)${[...text].map(plain).join("")}"`;
+    const fields = numbers ? [field, "name"] : [field];
+    found.push(fields.map((one) => `${one} ~ ${pattern}`).join(" or "));
+  }
+  return found;
+}
 
 function filtersOf({ level, text }) {
   return {

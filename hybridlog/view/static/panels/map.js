@@ -7,7 +7,7 @@ import { metres, plane } from "../spatial/plane.js";
 import { instant } from "../state.js";
 import { counted, offset } from "../words.js";
 import { follow } from "./follow.js";
-import { opening } from "./python.js";
+import { literal, opening } from "./python.js";
 import { ofTypes } from "./types.js";
 
 const PIXELS = 2000; // steps of time of a track
@@ -39,12 +39,17 @@ export default {
   python: (panel) =>
     [
       opening(panel),
-      "from hybridlog.drawing.track import track",
-      "",
-      `found = track(query, pixels=${PIXELS})`,
-      "print(found.grid, found.xy)",
+      `frame = query.fields(${fieldsOf(panel.topic.type).map(literal).join(", ")}).to_pandas()`,
+      "print(frame)",
     ].join("\n"),
 };
+
+/** Fields with the position. */
+function fieldsOf(type) {
+  if (/Odometry|WithCovariance/.test(type)) return ["pose.pose.position"];
+  if (/PoseStamped|PoseInFrame/.test(type)) return ["pose.position"];
+  return /Pose|PointStamped/.test(type) ? ["position"] : ["latitude", "longitude"];
+}
 
 function mount(body, panel) {
   const fit = element("button", { type: "button", title: "Show the whole track (0)" }, "Fit");

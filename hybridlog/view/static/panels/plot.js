@@ -24,14 +24,14 @@ export default {
   python: (panel) => {
     const { begin, end } = panel.range();
     const [from, to] = [moment(panel.recording, begin), moment(panel.recording, end)];
-    const names = fieldsOf(panel.options) ?? [];
+    // Tables have whole arrays as columns.
+    const names = (fieldsOf(panel.options) ?? []).map((name) => name.replace(/\[\d+\]$/, ""));
+    const fields = [...new Set(names)].map(literal).join(", ");
     return [
       opening(panel),
-      "from hybridlog.drawing.series import series",
-      "",
-      `fields = [${names.map(literal).join(", ")}]`,
-      `for one in series(query, fields, pixels=1000, span=(${from}, ${to})):`,
-      "    print(one.field, one.times, one.least, one.greatest)",
+      `query = query.between(${from}, ${to})`,
+      `frame = query${fields && `.fields(${fields})`}.to_pandas()`,
+      "print(frame)",
     ].join("\n");
   },
 };

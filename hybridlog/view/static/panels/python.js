@@ -11,7 +11,7 @@ export function opening({ recording, topic }) {
     "import hybridlog",
     "",
     `store = hybridlog.open(${literal(recording.info.store)})`,
-    `query = store.query([${literal(topic.topic)}], [${literal(recording.info.id)}])`,
+    `query = store.topic(${literal(topic.topic)}).in_recording(${literal(recording.info.id)})`,
   ].join("\n");
 }
 

@@ -1,0 +1,161 @@
+"""What a user does with the index of an open store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from hybridlog.index import field_indexes
+from hybridlog.index.connection import IndexAddress, again_if_lost
+from hybridlog.query.query import Query
+from hybridlog.query.question import Question
+
+if TYPE_CHECKING:
+    from hybridlog.index.field_indexes import FieldIndex
+    from hybridlog.maintenance.report import Progress
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.mongo.topic_places import TopicPlace
+
+# `list` is a method below.
+_Entries: TypeAlias = "list[RecordingEntry]"
+_FieldIndexes: TypeAlias = "list[FieldIndex]"
+_CLIENTS_WAIT_S: Final = 600.0
+"""Seconds for which a published MongoDB waits for clients."""
+
+
+class Index:
+    """The index of an open store.
+
+    Args:
+        session: The open store.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    @again_if_lost
+    def rebuild(
+        self,
+        recordings: Iterable[str | RecordingEntry] | None = None,
+        progress: Progress | None = None,
+    ) -> _Entries:
+        """Rebuild the index from the segments, recording by recording.
+
+        Args:
+            recordings: The recordings; None for all, which also removes unknown documents.
+            progress: Called after each chunk.
+
+        Returns:
+            The indexed recordings.
+
+        Raises:
+            StoreError: A named recording is being written.
+        """
+        from hybridlog.maintenance.index import StoreIndex
+
+        session = self._session
+        database = session.database_for("Rebuilding the index", writes=True)
+        if recordings is None:
+            session.catalog.mend()
+        session.invalidate()
+        chosen = session.select(recordings)
+        index = StoreIndex(session.directory, session.catalog, database, progress)
+        left = index.rebuild(chosen)
+        if recordings is None:
+            index.remove_rest(session.recordings())
+        elif left:
+            raise next(iter(left.values()))
+        session.invalidate()
+        return session.as_now([entry for entry in chosen if entry.id not in left])
+
+    @again_if_lost
+    def add(self, topic: str, *fields: str) -> _FieldIndexes:
+        """Add a MongoDB index on fields of a topic.
+
+        Args:
+            topic: Full name, short name, glob, or `re:` and a regular expression.
+            fields: Fields of the messages, or `_meta.inserted_at` and the like. Questions
+                should give a value or a range of the first one; the others narrow it down.
+
+        Returns:
+            All indexes of the topics.
+
+        Raises:
+            TopicError: A topic or field does not exist.
+            DatabaseError: MongoDB refuses, for example because two fields are arrays.
+        """
+        query = self._about(topic)
+        database = self._session.database_for("An index", writes=True)
+        query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
+        field_indexes.add(database, query.topics, fields)
+        self._session.field_indexes = field_indexes.listed(database)
+        return field_indexes.of_topics(database, query.topics)
+
+    @again_if_lost
+    def remove(self, topic: str, *fields: str) -> int:
+        """Drop the index on exactly these fields; return the number of topics.
+
+        Raises:
+            TopicError: A topic does not exist.
+        """
+        query = self._about(topic)
+        database = self._session.database_for("An index", writes=True)
+        found = field_indexes.remove(database, query.topics, fields)
+        self._session.field_indexes = field_indexes.listed(database)
+        return found
+
+    @again_if_lost
+    def list(self, *topics: str) -> _FieldIndexes:
+        """The indexes on fields, of these topics or of all."""
+        database = self._session.database_for("Indexes")
+        names = self._about(*topics).topics if topics else self._session.topics()
+        return field_indexes.of_topics(database, names)
+
+    @again_if_lost
+    def address(self) -> IndexAddress:
+        """The address of the index for other programs, after it was brought up to date.
+
+        The embedded MongoDB keeps its address, waits ten minutes for the first client, and runs
+        as long as one is connected.
+
+        Raises:
+            DatabaseError: MongoDB is unavailable.
+        """
+        database = self._session.connect()
+        return IndexAddress(self._session.connection.address(_CLIENTS_WAIT_S), database.name)
+
+    @again_if_lost
+    def place(self, topic: str) -> TopicPlace:
+        """The place of a topic's index documents in MongoDB.
+
+        Args:
+            topic: Full name, or an unambiguous short one.
+
+        Returns:
+            Has `collection`, its name, and `documents(begin, end)`, a filter for the
+            documents of the topic with log times in `[begin, end)`, ns.
+
+        Raises:
+            TopicError: The topic does not exist.
+        """
+        (name, *_) = self._about(topic).topics
+        return self._session.places("The place of a topic").of([name])[name]
+
+    def _about(self, *topics: str) -> Query:
+        with self._session.at_one_moment():
+            return Query(self._session, Question(*self._session.resolve(topics)))
+
+
+@again_if_lost
+def contents(session: Session) -> list[tuple[str, str, int]]:
+    """Each topic with the MongoDB collection of its documents, and their number there."""
+    database = session.database_for("The contents of the index")
+    places = session.places("The contents of the index").of(session.topics())
+    known = [place for place in places.values() if place.is_listed]
+    filters = [(place.collection, place.documents()) for place in known]
+    counts = iter(database.count_each([one for one in filters if one[1]]))
+    return [
+        (place.topic, collection, next(counts) if own else database.count(collection))
+        for place, (collection, own) in zip(known, filters, strict=True)
+    ]

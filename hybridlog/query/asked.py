@@ -1,0 +1,60 @@
+"""What is known about a question without reading messages, for commands and the page."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
+
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.session import of_one_moment
+
+if TYPE_CHECKING:
+    from hybridlog.query.question import RecordedChannel, Span
+    from hybridlog.query.steps import Steps
+
+_Query = TypeVar("_Query", bound="Steps")
+
+
+@of_one_moment
+def narrowed(query: _Query, *topics: str) -> _Query:
+    """The same question about one or some of its topics, by their full names.
+
+    If the question is about several recordings, tables of each topic name them.
+    """
+    session, question = query.session, query.question
+    several = question.names_recording or len(session.chosen(question)) > 1
+    names, chosen = session.having(topics, question.recordings)
+    question = replace(question, topics=names, recordings=chosen, names_recording=several)
+    return type(query)(session, question, query.conditions)
+
+
+@of_one_moment
+def channels_of(query: Steps) -> list[RecordedChannel]:
+    """Every channel of a question."""
+    return Planner(query.session, query.question, query.counters).channels()
+
+
+@of_one_moment
+def field_types(query: Steps) -> dict[str, str] | None:
+    """Paths that can be queried and their types; None when a topic has no fixed fields."""
+    return query.session.field_types(query.topics, query.question.recordings)
+
+
+@of_one_moment
+def spans_of(query: Steps) -> dict[str, Span]:
+    """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
+
+    It is known without reading messages: those at its ends may not satisfy the predicate,
+    or a range of another clock.
+
+    Raises:
+        TimeError: the range is empty, or outside all recordings.
+    """
+    found: dict[str, Span] = {}
+    for part in Planner(query.session, query.question, Counters()).parts():
+        extent = part.extent
+        if extent is not None:
+            low, high = found.get(part.recording.id, extent)
+            found[part.recording.id] = min(low, extent[0]), max(high, extent[1])
+    return found
