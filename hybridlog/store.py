@@ -108,7 +108,6 @@ def open_store(
     *,
     mongo: str | None = None,
     create: bool = False,
-    shared: bool = False,
     require_database: bool = False,
     progress: Progress | None = None,
     cache_mb: int | None = None,
@@ -124,7 +123,6 @@ def open_store(
         mongo: URI of the MongoDB that holds the index, `embedded`, or `none` for no index; by
             default `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
         create: Create the store if it does not exist.
-        shared: Let the group write a new store.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
         cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
@@ -144,7 +142,7 @@ def open_store(
     wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
     if address_of(where) is not None:
         directory = directory_of(where, read_only=read_only)
-        if create or shared:
+        if create:
             directory.check_writable()
         if mongo not in {None, NONE}:
             raise UsageError("A store in a bucket is asked without MongoDB: leave out --mongo.")
@@ -160,7 +158,7 @@ def open_store(
     if create:
         own = None if mongo in {None, EMBEDDED} else mongo
         is_new = not os.path.lexists(where / NAME)
-        directory = StoreDirectory.create(where, mongo=own, shared=shared, cache_mb=cache_mb)
+        directory = StoreDirectory.create(where, mongo=own, cache_mb=cache_mb)
         directory.check_writable()
         if is_new and is_uri(own):
             with suppress(StoreError):  # without a home directory, each command must name it again

@@ -32,7 +32,6 @@ from typing import Any, ClassVar, Final
 from hybridlog_storage import journal
 from hybridlog_storage.catalog_parts import MemoryFolder
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.sharing import make_shared
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
@@ -122,7 +121,6 @@ class StoreDirectory:
         path: Path,
         *,
         mongo: str | None = None,
-        shared: bool = False,
         cache_mb: int | None = None,
     ) -> StoreDirectory:
         """Create a store, or open an existing one.
@@ -130,7 +128,6 @@ class StoreDirectory:
         Args:
             path: The directory.
             mongo: URI of the MongoDB to use instead of the embedded one; without a password.
-            shared: Whether a group may write it; for a new store only.
             cache_mb: Size of the embedded MongoDB's cache in MiB; for a new store only.
 
         Raises:
@@ -143,9 +140,7 @@ class StoreDirectory:
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
                 with files.locked_folder(path, 0):
-                    settings = StoreSettings(
-                        secrets.token_hex(16), mongo=mongo, shared=shared, cache_mb=cache_mb
-                    )
+                    settings = StoreSettings(secrets.token_hex(16), mongo=mongo, cache_mb=cache_mb)
                     cls._make(path, settings)
             store = cls(path)
             try:
@@ -170,8 +165,6 @@ class StoreDirectory:
                 "Choose an empty or a new directory with --store."
             )
         write_settings(path, settings)
-        if settings.shared:
-            make_shared(path)
 
     @property
     def is_writable(self) -> bool:

@@ -5,9 +5,6 @@ relative to the handle of its folder, and a symlink on the way is an error. The 
 store itself may contain symlinks: only the last `depth` parts of a path lie inside the
 store.
 
-A folder that is setgid and group-writable is shared: new files in it are group-writable,
-too, whatever the umask is.
-
 A store in a bucket is read by the same functions: `mounted` knows who answers for its path, and
 nothing in it can be changed here. What is read of its files goes through `pread` and `preadv`,
 or is announced by `fetch` before.
@@ -42,8 +39,6 @@ IN_RECORDING: Final = 3
 """Depth of a file of a recording."""
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-_SHARED = stat.S_ISGID | stat.S_IWGRP
-_GROUP = stat.S_IRWXG
 _POLL_S = 0.005  # between two looks at a lock
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 Identity = tuple[int, int]
@@ -123,10 +118,6 @@ class System:
         """Remove an empty folder."""
         os.rmdir(name, dir_fd=folder)
 
-    def chmod(self, fd: int, mode: int) -> None:
-        """Change the permissions of a file."""
-        os.fchmod(fd, mode)
-
 
 system: System = System()
 """The calls used by all functions here; looked up on each use."""
@@ -173,14 +164,7 @@ def open_file(path: Path, flags: int, mode: int = 0o666, *, depth: int = IN_RECO
     if outer in mounted and not flags & _WRITES:
         return mounted[outer].open(inner)
     with folder(path.parent, depth - 1) as fd:
-        opened = system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
-        try:
-            if flags & os.O_CREAT:
-                _let_group_in(fd, opened, mode)
-        except BaseException:
-            os.close(opened)
-            raise
-        return opened
+        return system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
 
 
 def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
@@ -382,11 +366,6 @@ def make_folder(path: Path, mode: int = 0o777, *, depth: int) -> None:
     """
     with folder(path.parent, depth - 1) as fd:
         system.mkdir(path.name, mode, folder=fd)
-        made = os.open(path.name, _FOLDER | os.O_NOFOLLOW, dir_fd=fd)
-        try:
-            _let_group_in(fd, made, mode)
-        finally:
-            os.close(made)
 
 
 def rename(
@@ -457,16 +436,6 @@ def remove_tree(path: Path, *, depth: int) -> None:
     """
     with folder(path.parent, depth - 1) as fd:
         _remove(fd, path.name)
-
-
-def _let_group_in(parent: int, fd: int, mode: int) -> None:
-    """In a shared folder, give the group the requested permissions of this user's file."""
-    if os.fstat(parent).st_mode & _SHARED != _SHARED:
-        return
-    about = os.fstat(fd)
-    wanted = about.st_mode | (mode & _GROUP)
-    if wanted != about.st_mode and about.st_uid == os.geteuid():
-        system.chmod(fd, stat.S_IMODE(wanted))
 
 
 def _remove(parent: int, name: str) -> None:
