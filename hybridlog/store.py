@@ -268,7 +268,6 @@ class Store:
         recover: False to leave what a crash has cut to another opening.
 
     Attributes:
-        session: Its state while it is open.
         directory: The store's directory.
         catalog: Recordings, channels, chunks and schemas, in a local file.
     """
@@ -283,12 +282,12 @@ class Store:
         recover: bool = True,
     ) -> None:
         self.directory = directory
-        self.session = Session(directory, mongo, progress, cache_mb, recover)
+        self._session = Session(directory, mongo, progress, cache_mb, recover=recover)
         self._sql: SqlEngine | None = None
         try:
-            self.session.snapshot()
+            self._session.snapshot()
         except BaseException:
-            self.session.catalog.close()
+            self._session.catalog.close()
             raise
 
     def __enter__(self) -> Self:
@@ -297,9 +296,16 @@ class Store:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close; an interruption repairs nothing."""
-        if kind is None or issubclass(kind, Exception):
-            self.mend()
-        self._close()
+        self._close(mends=kind is None or issubclass(kind, Exception))
+
+    @property
+    def session(self) -> Session:
+        """Its state while it is open.
+
+        Raises:
+            UsageError: It was opened before this process was forked.
+        """
+        return self._session.here()
 
     def __repr__(self) -> str:
         return f"<Store {self.directory.place}>"
@@ -394,10 +400,13 @@ class Store:
 
     def close(self) -> None:
         """Repair what questions met, and close files and connections. May be called again."""
-        self.mend()
-        self._close()
+        self._close(mends=True)
 
-    def _close(self) -> None:
+    def _close(self, *, mends: bool) -> None:
+        if self._session.is_inherited:  # its files and connections are the parent's
+            return
+        if mends:
+            self.mend()
         if self._sql is not None:
             self._sql.close()
         self.session.close()
@@ -908,10 +917,11 @@ class Store:
     @property
     def sql_engine(self) -> SqlEngine:
         """Runs SQL; for programs that need several statements in one connection."""
+        session = self.session
         if self._sql is None:
             from hybridlog.sql.engine import SqlEngine
 
-            self._sql = SqlEngine(self.session)
+            self._sql = SqlEngine(session)
         return self._sql
 
     @of_one_moment

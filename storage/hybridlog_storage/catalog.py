@@ -69,7 +69,6 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
-from hybridlog_storage.threads import taken_by_forks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -597,7 +596,7 @@ class Catalog:
         self.locked: Path | None = None
         self._store = store
         self._store_id = store_id
-        self._lock = taken_by_forks(RLock())
+        self._lock = RLock()
         self._folder = folder or MemoryFolder()
         self._parts: dict[int, _Part] = {}
         self._places: dict[str, int] = {}  # number of its part, by id of a recording
