@@ -97,10 +97,10 @@ def _trusted() -> dict[str, list[str]]:
     """URIs by store; empty if the file is missing, damaged, or writable by other users."""
     try:
         path = state_directory() / _NAME
-        about = files.status(path, depth=files.IN_STORE)
+        about = files.status(path)
         if about.st_uid != os.geteuid() or stat.S_IMODE(about.st_mode) & 0o022:
             return {}
-        stores = json.loads(files.read_file(path, _LIMIT, depth=files.IN_STORE))[_STORES]
+        stores = json.loads(files.read_file(path, _LIMIT))[_STORES]
         return {str(store): [str(uri) for uri in uris] for store, uris in stores.items()}
     except (
         OSError,
@@ -121,10 +121,10 @@ def _changing() -> Iterator[dict[str, list[str]]]:
     path = directory / _NAME
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with files.locked_folder(directory, 0):
+        with files.locked_folder(directory):
             trusted = _trusted()
             yield trusted
             content = json.dumps({_STORES: trusted}, indent=2) + "\n"
-            files.write_file(path, content.encode(), 0o600, depth=files.IN_STORE)
+            files.write_file(path, content.encode(), 0o600)
     except OSError as error:
         raise durability.explain(error, path, "remembering trusted servers in") from error

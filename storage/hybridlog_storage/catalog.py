@@ -636,12 +636,12 @@ class Catalog:
 
     def _check_folder(self) -> None:
         try:
-            kind = files.status(self.path, depth=files.IN_STORE).st_mode
+            kind = files.status(self.path).st_mode
             if stat.S_ISLNK(kind):
                 raise StoreError(f"{self.path} is a symlink. Delete it: the catalog is rebuilt.")
             if not stat.S_ISDIR(kind):
                 self.was_damaged = True
-                files.remove_tree(self.path, depth=files.IN_STORE)
+                files.remove_tree(self.path)
         except FileNotFoundError:
             pass  # it is made with the first recording
         except OSError as error:
@@ -772,7 +772,7 @@ class Catalog:
         self.has_changed = True
         if self.locked is not None or not self.is_in_memory:
             with suppress(FileNotFoundError):
-                files.unlink(self.recordings_file, depth=files.IN_FOLDER)
+                files.unlink(self.recordings_file)
 
     def _tidy(self) -> None:
         """Remove files that are not ours, and what is damaged."""

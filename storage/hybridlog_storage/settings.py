@@ -127,7 +127,7 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
             UsageError: The URI is not a MongoDB connection string.
             OSError: They cannot be written.
     """
-    files.write_file(path / NAME, settings_text(settings), depth=files.IN_STORE)
+    files.write_file(path / NAME, settings_text(settings))
 
 
 def settings_text(settings: StoreSettings) -> bytes:
@@ -343,7 +343,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
         StoreError: It cannot be read, or is not TOML.
     """
     try:
-        content = files.read_file(file, _LIMIT, depth=files.IN_STORE)
+        content = files.read_file(file, _LIMIT)
         if len(content) > _LIMIT:
             raise StoreError(f"{file} is too large to be settings.")
         return tomllib.loads(content.decode())
