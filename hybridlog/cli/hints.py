@@ -57,7 +57,6 @@ MOVED: Final = {
     "show": "info RECORDING",
     "topics": "info",
     "trigger --rehearse": "intervals --rehearse EXPRESSION",
-    "trust": "index trust",
     "untag": "tag RECORDING --remove KEY",
     **dict.fromkeys(
         ("diff -r", "diff --tag", "diff --last", "diff --older-than"),
