@@ -218,6 +218,7 @@ def test_what_is_no_file_of_the_recording_is_not_opened(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="ordinary"):
         AppendFile.reopen(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
+    (tmp_path / "hybridlog.toml").touch()
     (tmp_path / "inside").symlink_to(tmp_path / "folder")
     with pytest.raises(OSError, match="inside"):
         AppendFile.create(tmp_path / "inside" / "file")
