@@ -127,8 +127,8 @@ def folder(path: Path) -> Iterator[int]:
         raise OSError(errno.EROFS, "a store in a bucket cannot be changed like this", str(path))
     try:
         fd = os.open(path, _FOLDER | os.O_NOFOLLOW)
-    except NotADirectoryError:
-        if _is_in_store(path):
+    except OSError as error:  # ELOOP in some systems
+        if error.errno not in {errno.ENOTDIR, errno.ELOOP} or _is_in_store(path):
             raise
         fd = os.open(path, _FOLDER)
     try:
