@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
+from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import journal
@@ -204,7 +204,7 @@ def _find_joined(inventory: Inventory, folder: Path) -> None:
 
     for path in there.keys() - listed.keys():
         with suppress(StoreError, FileNotFoundError, LookupError, ValueError, TypeError):
-            file = ColumnFile(folder / path, depth=IN_PAYLOADS)
+            file = ColumnFile(folder / path)
             (section,) = file.about.recordings
             ((topic, counts),) = section.topics.items()
             replaced = {*file.about.payloads["replaces"]} & listed.keys()

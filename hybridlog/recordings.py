@@ -53,11 +53,11 @@ class Recordings(Sequence["RecordingEntry"]):
             index = self.labels.index(index)
         if isinstance(index, slice):
             return Recordings(self._session, self.summaries[index], self._problem)
-        return self._session.entry_of(self.summaries[index])
+        return self._session.here().entry_of(self.summaries[index])
 
     def __iter__(self) -> Iterator[RecordingEntry]:
         """The entries, without those of recordings that were removed meanwhile."""
-        return self._session.entries(self.summaries)
+        return self._session.here().entries(self.summaries)
 
     def __eq__(self, other: object) -> bool:
         """True for the same recordings, also as a list of entries."""

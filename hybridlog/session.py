@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections.abc import (
@@ -48,11 +49,11 @@ from hybridlog_storage.errors import (
     SegmentError,
     StoreError,
     TopicError,
+    UsageError,
 )
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader, place_of
-from hybridlog_storage.threads import begins_anew
 from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
@@ -181,9 +182,10 @@ class Session:
         mongo: str | None,
         progress: Progress | None,
         cache_mb: int | None = None,
-        recover: bool = True,  # noqa: FBT001, FBT002 - `begins_anew` takes positions
+        *,
+        recover: bool = True,
     ) -> None:
-        begins_anew(self, directory, mongo, progress, cache_mb, recover)
+        self._process = os.getpid()
         self.directory = directory
         self._progress = progress
         self.connection = Connection(directory, mongo, cache_mb)
@@ -220,6 +222,24 @@ class Session:
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._lock = threading.Lock()
         self._reset_meanings()
+
+    @property
+    def is_inherited(self) -> bool:
+        """True in a child of the process that opened the store."""
+        return os.getpid() != self._process
+
+    def here(self) -> Session:
+        """This session, in the process that opened the store.
+
+        Raises:
+            UsageError: This is a forked process.
+        """
+        if self.is_inherited:
+            raise UsageError(
+                f"The store {self.directory.place} was opened before this process was forked: open "
+                "it here, in the child."
+            )
+        return self
 
     # The index.
 

@@ -114,7 +114,6 @@ def open_store(
     *,
     mongo: str | None = None,
     create: bool = False,
-    shared: bool = False,
     require_database: bool = False,
     progress: Progress | None = None,
     cache_mb: int | None = None,
@@ -130,7 +129,6 @@ def open_store(
         mongo: URI of the MongoDB that holds the index, `embedded`, or `none` for no index; by
             default `HYBRIDLOG_MONGO_URI`, the store's own setting, or the embedded MongoDB.
         create: Create the store if it does not exist.
-        shared: Let the group write a new store.
         require_database: Connect to MongoDB now, and fail if it is unavailable.
         progress: Called while an index is brought up to date.
         cache_mb: Size of the embedded MongoDB's cache in MiB, from 256; by default
@@ -150,7 +148,7 @@ def open_store(
     wanted = NONE if read_only else mongo or os.environ.get("HYBRIDLOG_MONGO_URI")
     if address_of(where) is not None:
         directory = directory_of(where, read_only=read_only)
-        if create or shared:
+        if create:
             directory.check_writable()
         if mongo not in {None, NONE}:
             raise UsageError("A store in a bucket is asked without MongoDB: leave out --mongo.")
@@ -166,7 +164,7 @@ def open_store(
     if create:
         own = None if mongo in {None, EMBEDDED} else mongo
         is_new = not os.path.lexists(where / NAME)
-        directory = StoreDirectory.create(where, mongo=own, shared=shared, cache_mb=cache_mb)
+        directory = StoreDirectory.create(where, mongo=own, cache_mb=cache_mb)
         directory.check_writable()
         if is_new and is_uri(own):
             with suppress(StoreError):  # without a home directory, each command must name it again
@@ -277,7 +275,6 @@ class Store:
         recover: False to leave what a crash has cut to another opening.
 
     Attributes:
-        session: Its state while it is open.
         directory: The store's directory.
         catalog: Recordings, channels, chunks and schemas, in a local file.
     """
@@ -292,12 +289,12 @@ class Store:
         recover: bool = True,
     ) -> None:
         self.directory = directory
-        self.session = Session(directory, mongo, progress, cache_mb, recover)
+        self._session = Session(directory, mongo, progress, cache_mb, recover=recover)
         self._sql: SqlEngine | None = None
         try:
-            self.session.snapshot()
+            self._session.snapshot()
         except BaseException:
-            self.session.catalog.close()
+            self._session.catalog.close()
             raise
 
     def __enter__(self) -> Self:
@@ -306,9 +303,16 @@ class Store:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close; an interruption repairs nothing."""
-        if kind is None or issubclass(kind, Exception):
-            self.mend()
-        self._close()
+        self._close(mends=kind is None or issubclass(kind, Exception))
+
+    @property
+    def session(self) -> Session:
+        """Its state while it is open.
+
+        Raises:
+            UsageError: It was opened before this process was forked.
+        """
+        return self._session.here()
 
     def __repr__(self) -> str:
         return f"<Store {self.directory.place}>"
@@ -385,10 +389,13 @@ class Store:
 
     def close(self) -> None:
         """Repair what questions met, and close files and connections. May be called again."""
-        self.mend()
-        self._close()
+        self._close(mends=True)
 
-    def _close(self) -> None:
+    def _close(self, *, mends: bool) -> None:
+        if self._session.is_inherited:  # its files and connections are the parent's
+            return
+        if mends:
+            self.mend()
         if self._sql is not None:
             self._sql.close()
         self.session.close()
@@ -822,10 +829,11 @@ class Store:
     @property
     def sql_engine(self) -> SqlEngine:
         """Runs SQL; for programs that need several statements in one connection."""
+        session = self.session
         if self._sql is None:
             from hybridlog.sql.engine import SqlEngine
 
-            self._sql = SqlEngine(self.session)
+            self._sql = SqlEngine(session)
         return self._sql
 
     @of_one_moment

@@ -29,9 +29,9 @@ def stores_at(uri: str) -> Iterator[None]:
     base, _, options = uri.partition("?")
     trusted_uri = consent.trusted_uri
 
-    def chosen(settings: StoreSettings, store: Path | None = None) -> str:
-        found = trusted_uri(settings, store)
-        if found != EMBEDDED or store is None:
+    def chosen(settings: StoreSettings, store: Path, named: str | None = None) -> str:
+        found = trusted_uri(settings, store, named)
+        if found != EMBEDDED or named is not None:
             return found
         # As with the embedded MongoDB, a copy of a store has an index of its own.
         place = f"{settings.store_id} {os.path.realpath(store)}"

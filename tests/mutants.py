@@ -603,13 +603,13 @@ MAINTENANCE = [
         "hybridlog/columns/payload_files.py",
         (
             "columns-move-into-folders-that-are-not-synced",
-            "            files.sync_folder(recording)\n            files.sync_folder(final, depth=files.IN_RECORDING)\n",
+            "            files.sync_folder(recording)\n            files.sync_folder(final)\n",
             "            pass\n",
             POWER,
         ),
         (
             "names-of-columns-are-not-synced",
-            "            files.sync_folder(folder, depth=IN_PAYLOADS - 1)\n",
+            "            files.sync_folder(folder)\n",
             "            pass\n",
             POWER,
         ),
@@ -645,7 +645,7 @@ MAINTENANCE = [
         ),
         (
             "what-an-earlier-import-left-stays",
-            "                files.remove_tree(path / name, depth=files.IN_RECORDING)\n",
+            "                files.remove_tree(path / name)\n",
             "                pass\n",
             f"{IMPORT}::test_what_an_earlier_import_left_is_checked",
         ),

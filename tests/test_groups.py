@@ -11,8 +11,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.demo.write import write_bag
-from hybridlog_storage.disk import files
-from hybridlog_storage.disk.sharing import make_shared
 from hybridlog_storage.settings import StoreSettings, write_settings
 from tests.other_user import User, needs_root, open_place
 from tests.waiting import wait_for
@@ -37,36 +35,11 @@ def everything(store: Path) -> list[Path]:
 # --- modes, as one user ---
 
 
-def test_a_shared_folder_hands_its_openness_on(tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    (store / "recordings").mkdir(parents=True)
-    (store / "hybridlog.toml").touch(0o644)
-    (store / "mongod").mkdir(0o700)
-    make_shared(store)
-    assert (mode(store), mode(store / "recordings")) == (0o2775, 0o2775)
-    assert mode(store / "hybridlog.toml") == 0o664
-    assert mode(store / "mongod") == 0o700
-    make_shared(store)  # once more changes nothing
-    for umask, folder, file in ((0o022, 0o2775, 0o664), (0o077, 0o2770, 0o660)):
-        before = os.umask(umask)
-        try:
-            made = store / "recordings" / f"r{umask}"
-            files.make_folder(made, depth=files.IN_FOLDER)
-            os.close(files.open_file(made / "x", os.O_RDWR | os.O_CREAT))
-            files.write_file(made / "y", b"y")
-            files.make_folder(made / "own", 0o700, depth=files.IN_RECORDING)
-        finally:
-            os.umask(before)
-        assert mode(made) == folder
-        assert (mode(made / "x"), mode(made / "y")) == (file, file)
-        assert mode(made / "own") & 0o077 == 0
-
-
 @pytest.mark.parametrize(("umask", "bits"), [(0o022, 0o755), (0o077, 0o700), (0o002, 0o775)])
 def test_the_umask_decides_in_a_store_of_ones_own(tmp_path: Path, umask: int, bits: int) -> None:
     parent = tmp_path / "lab"
     parent.mkdir()
-    parent.chmod(0o2775)  # of a group; what is made there is not therefore shared
+    parent.chmod(0o2775)
     write_bag(tmp_path / "small.bag", duration_s=5, topics=["/imu/data"])
     before = os.umask(umask)
     try:
@@ -76,17 +49,6 @@ def test_the_umask_decides_in_a_store_of_ones_own(tmp_path: Path, umask: int, bi
         os.umask(before)
     for path in everything(parent / "store"):
         assert mode(path) & 0o777 == (bits if path.is_dir() else bits & 0o666), path
-
-
-def test_sharing_follows_no_symlink(tmp_path: Path) -> None:
-    store, victim = tmp_path / "store", tmp_path / "victim"
-    store.mkdir()
-    victim.touch(0o600)
-    (store / "recordings").symlink_to(tmp_path / "elsewhere")
-    (store / "hybridlog.toml").symlink_to(victim)
-    (tmp_path / "elsewhere").mkdir(0o700)
-    make_shared(store)
-    assert (mode(victim), mode(tmp_path / "elsewhere")) == (0o600, 0o700)
 
 
 # --- as others ---
@@ -109,7 +71,7 @@ CRASH = f"""
 import os, sys, time
 import hybridlog as hl
 from tests.live.speaker import text, text_channel
-store = hl.open(sys.argv[1], create=True, shared=True)
+store = hl.open(sys.argv[1], create=True)
 live = store.start("cut", flush_interval_s=0.1)
 channel = text_channel()
 for number in range({MESSAGES}):
@@ -125,14 +87,13 @@ ASK = (*COUNT, "--where", "header.seq >= 0")
 
 
 @needs_root
-@pytest.mark.parametrize("umask", [0o022, 0o077])
+@pytest.mark.parametrize("umask", [0o002, 0o007])
 def test_two_users_of_a_group_share_a_store(place: Path, umask: int) -> None:
     ann = User(place, 12345, 12345, (LAB,), umask)
     bob = User(place, 12346, 12346, (LAB,), umask)
     store, bag = place / "lab" / "store", place / "small.bag"
     where = ("--store", store)
-    ann.run("record", bag, "--name", "anns", "--shared", "-q", *where)
-    assert "shared = true" in (store / "hybridlog.toml").read_text()
+    ann.run("record", bag, "--name", "anns", "-q", *where)
     expected = ann.run(*ASK, *where).out
     assert int(expected) > 0
     assert bob.run(*ASK, *where).out == expected
@@ -140,12 +101,16 @@ def test_two_users_of_a_group_share_a_store(place: Path, umask: int) -> None:
     for user in (ann, bob):
         assert int(user.run(*ASK, *where).out) == 2 * int(expected)
     bob.run("verify", *where)
+    bob.run("tag", "anns", "weather=rain", *where)
+    assert [r["name"] for r in ann.run("ls", "--tag", "weather=rain", "--json", *where).json] == [
+        "anns"
+    ]
     for path in everything(store):
         about = path.stat()
         assert about.st_gid == LAB, path
         wanted = 0o2770 if path.is_dir() else 0o660
         assert mode(path) & wanted == wanted, path
-        assert bool(mode(path) & 0o007) == (umask == 0o022), path
+        assert bool(mode(path) & 0o007) == (umask == 0o002), path
     assert (store / "mongod").stat().st_uid == ann.uid
     assert (store / f"mongod-{bob.uid}").stat().st_uid == bob.uid
     for own in ("mongod", f"mongod-{bob.uid}"):
@@ -160,8 +125,8 @@ def test_two_users_of_a_group_share_a_store(place: Path, umask: int) -> None:
 
 @needs_root
 def test_a_crash_of_one_is_mended_by_the_other(place: Path) -> None:
-    ann = User(place, 12345, 12345, (LAB,))
-    bob = User(place, 12346, 12346, (LAB,))
+    ann = User(place, 12345, 12345, (LAB,), 0o002)
+    bob = User(place, 12346, 12346, (LAB,), 0o002)
     store = place / "lab" / "store"
     ann.python("-c", CRASH, store, code=9)
     assert list(store.glob("recordings/cut/*.mcap.open"))
@@ -175,11 +140,11 @@ def test_a_crash_of_one_is_mended_by_the_other(place: Path) -> None:
 
 @needs_root
 def test_somebody_outside_of_the_group_changes_nothing(place: Path) -> None:
-    ann = User(place, 12345, 12345, (LAB,))
+    ann = User(place, 12345, 12345, (LAB,), 0o002)
     eve = User(place, 12347, 12347)
     store = place / "lab" / "store"
     where = ("--store", store)
-    ann.run("record", place / "small.bag", "--shared", "-q", *where)
+    ann.run("record", place / "small.bag", "-q", *where)
     wait_for(lambda: not (store / "mongod/mongod.json").exists())
     expected = ann.run(*COUNT, *where).out
     before = {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)}
@@ -206,7 +171,7 @@ def test_a_store_for_its_owner_alone(place: Path) -> None:
 @pytest.mark.embedded
 @needs_root
 def test_root_takes_no_ones_server(place: Path) -> None:
-    ann = User(place, 12345, 12345, (LAB,))
+    ann = User(place, 12345, 12345, (LAB,), 0o002)
     store = place / "lab" / "store"
     ann.run("record", place / "small.bag", "-q", "--store", store)
     with hl.open(store) as opened:
@@ -219,13 +184,14 @@ def test_root_takes_no_ones_server(place: Path) -> None:
 
 @needs_root
 def test_a_name_that_is_taken(place: Path) -> None:
-    ann = User(place, 12345, 12345, (LAB,))
+    ann = User(place, 12345, 12345, (LAB,), 0o002)
     store = place / "lab" / "store"
     (store / "recordings").mkdir(parents=True)
     for name in ("mongod", f"mongod-{ann.uid}"):
         (store / name).mkdir()
     write_settings(store, StoreSettings("x"))
-    make_shared(store)
+    (store / "recordings").chmod(0o2775)
+    store.chmod(0o2775)
     done = ann.run("verify", "--store", store, code=6)
     assert "belongs to another user" in done.err
     assert "Remove it" in done.err

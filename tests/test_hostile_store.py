@@ -261,6 +261,7 @@ def test_tables_that_lead_out(
 
 
 def hostile_mongod(tmp_path: Path, name: str, target: Path) -> Path:
+    (tmp_path / "hybridlog.toml").touch()
     directory = tmp_path / "mongod"
     place = directory / name if name else directory
     place.parent.mkdir(parents=True, exist_ok=True)

@@ -410,10 +410,10 @@ class Exchange:
         self.is_over = False
 
     @contextmanager
-    def folder(self, path: Path, depth: int) -> Iterator[int]:
+    def folder(self, path: Path) -> Iterator[int]:
         if not self.after:
             self.take()
-        with FOLDER(path, depth) as fd:
+        with FOLDER(path) as fd:
             if self.after:
                 self.take()
             yield fd

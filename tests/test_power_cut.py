@@ -183,7 +183,7 @@ def test_the_model_loses_what_is_not_synced(tmp_path: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     power = PowerCut(root)
-    with files.folder(root, 0) as fd:
+    with files.folder(root) as fd:
         one = power.open("one", 0o102, folder=fd)
         power.writev(one, [memoryview(b"x" * 1000)])
         power.sync(one)

@@ -139,9 +139,6 @@ def test_the_ways_to_say_so(
     assert not (path / "mongod").exists()
     assert read_settings(path).mongo == NONE
     done = answer("index", "list", *words, store=path, code=6)
-    assert answer("index", "trust", store=path).out == (
-        "the store names no MongoDB: there is nothing to trust\n"
-    )
 
 
 def test_no_mongod_is_none(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

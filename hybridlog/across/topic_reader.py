@@ -5,6 +5,7 @@ Other processes can use a data set over an open store, see `OpensAgain`.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -241,7 +242,7 @@ class OpenedStore(Protocol):
 
 
 class OpensAgain:
-    """A data set that can be pickled: each process opens the store for itself.
+    """A data set for several processes, forked or pickled: each opens the store for itself.
 
     Attributes:
         counters: What reading has cost in this process.
@@ -250,16 +251,17 @@ class OpensAgain:
     def __init__(self, session: Session, open_again: Callable[[], OpenedStore]) -> None:
         self.counters = Counters()
         self._open_again = open_again
-        self._session: Session | None = session
+        self._sessions: dict[int, Session] = {os.getpid(): session}  # by process
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the open store."""
         state = vars(self).copy()
-        state.update(_session=None, counters=Counters())
+        state.update(_sessions={}, counters=Counters())
         return state
 
     def _opened(self) -> Session:
         """The store, opened by this process."""
-        if self._session is None:
-            self._session = self._open_again().session
-        return self._session
+        process = os.getpid()
+        if process not in self._sessions:  # the parent's stays: closing it is not the child's
+            self._sessions[process] = self._open_again().session
+        return self._sessions[process]

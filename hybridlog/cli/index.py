@@ -1,4 +1,4 @@
-"""`hybridlog index`: what the index has, and whose MongoDB is used."""
+"""`hybridlog index`: what the index has, and where it is."""
 
 from __future__ import annotations
 
@@ -201,33 +201,6 @@ def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
                 output.say(f"{label}  {output.counted(chunks, 'chunk')}")
     for label, problem in sorted(repairs.unreadable.items()):
         yield StoreError(f"Recording {label} cannot be read: {problem}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Trust(InStore):
-    forget: bool = option("Do not trust this store's server any more.")
-
-
-@command(_Trust, to=index_command)
-def trust(given: _Trust) -> None:
-    """Trust the MongoDB server that another user's store names.
-
-    Until then, commands do not connect to it: a user's own stores only are trusted. The store
-    does not contain the password: see HYBRIDLOG_MONGO_PASSWORD.
-    """
-    from hybridlog.index import consent
-    from hybridlog.store import store_path
-    from hybridlog_storage.settings import is_uri, read_settings
-
-    settings = read_settings(store_path(given.store))
-    if given.forget:
-        found = consent.revoke(settings.store_id)
-        output.say("forgotten" if found else "nothing was trusted")
-    elif not is_uri(settings.mongo):
-        output.say("the store names no MongoDB: there is nothing to trust")
-    else:
-        consent.trust(settings.store_id, settings.mongo)
-        output.say(f"trusted {settings.mongo}")
 
 
 def _print(found: list[FieldIndex], given: _Shared) -> None:

@@ -33,7 +33,6 @@ def opened_store(
     mongo: str | None,
     *,
     create: bool = False,
-    shared: bool = False,
     needs_database: bool = False,
     cache_mb: int | None = None,
     quiet: bool = False,
@@ -47,7 +46,6 @@ def opened_store(
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
         create: Make it if there is none.
-        shared: If it is made: for the group of its directory.
         needs_database: Fail when MongoDB is unavailable.
         cache_mb: Size of the embedded MongoDB's cache in MiB.
         quiet: No progress while the index is brought up to date.
@@ -71,7 +69,6 @@ def opened_store(
             path,
             mongo=mongo,
             create=create,
-            shared=shared,
             require_database=needs_database,
             progress=bar,
             cache_mb=cache_mb,

@@ -161,7 +161,6 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "COMMAND",
         kind=LiveOption,
     )
-    shared: bool = option("If this makes the store: let the group of its directory write it.")
     set_tag: tuple[str, ...] = option("Store KEY=VALUE with it.", "K=V")
     cache_size: int | None = cache_size()
     live_options: tuple[str, ...] = ()
@@ -267,7 +266,6 @@ def opened_to_record(
     """The store, which is made if there is none; see `opened_store`."""
     return choices.opened(
         create=True,
-        shared=choices.shared,
         cache_mb=choices.cache_size,
         quiet=choices.quiet,
         is_lasting=True,

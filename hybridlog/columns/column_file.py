@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from hybridlog.columns.fields import SUMMARY_FIELDS
-from hybridlog.columns.layout import IN_PAYLOADS, Section, TopicCounts
+from hybridlog.columns.layout import Section, TopicCounts
 from hybridlog.columns.parquet_file import Leaf, ParquetFileReader, leaves
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.disk import files
@@ -256,7 +256,7 @@ class ChunkFile(ColumnFile):
         self.cache = cache or Cache()
         path = folder / listed.file
         try:
-            super().__init__(path, depth=IN_PAYLOADS)
+            super().__init__(path)
         except FileNotFoundError as error:
             raise StoreError(f"The payload file {path} is missing.{RESTORE}") from error
         if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):

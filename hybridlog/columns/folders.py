@@ -25,8 +25,6 @@ from typing import Any, Final
 import pyarrow as pa
 
 from hybridlog.columns.layout import (
-    IN_TABLES,
-    IN_TYPE,
     SHARED,
     SUFFIX,
     TABLES,
@@ -108,12 +106,13 @@ class TableFolders:
         Raises:
             OSError: a file cannot be written.
         """
-        files.make_folders(self._root / TABLES, depth=1)
+        with suppress(FileExistsError):
+            files.make_folder(self._root / TABLES)
         with locked(self._root):
             others = [name for name in _folders(self._root) if name.startswith(tuple(prefixes))]
             for name in dict.fromkeys([*additions, *others]):
                 if name in additions:
-                    files.make_folders(self._root / TABLES / name, depth=IN_TABLES)
+                    files.make_folders(self._root / TABLES / name)
                 try:
                     addition = additions.get(name, Addition())
                     self._change(name, addition, replaced.__contains__ if prefixes else None)
@@ -145,7 +144,7 @@ class TableFolders:
             goes: Returns whether older rows of a topic go; None if there are none.
         """
         place = self._root / TABLES / folder
-        names = [n for n in files.names(place, depth=IN_TABLES) if n.endswith(SUFFIX)]
+        names = [n for n in files.names(place) if n.endswith(SUFFIX)]
         shared = sorted(name for name in names if name.startswith(SHARED))
         is_new = goes is None  # and in no file yet
         listed = None if is_new else shared_files(self._root, folder, self._recording)
@@ -162,7 +161,7 @@ class TableFolders:
         elif addition.files and not self._is_listed:
             self._list(place)
         self._publish(place, addition.files, [name for name in names if name not in old], old)
-        with suppress(OSError), files.folder(place.parent, IN_TABLES - 1) as fd:
+        with suppress(OSError), files.folder(place.parent) as fd:
             files.system.rmdir(folder, folder=fd)
             files.system.unlink(_list_of(place).name, folder=fd)
 
@@ -186,7 +185,7 @@ class TableFolders:
         self._shared.update(names)
         line = " ".join([self._recording, *sorted(self._shared)]).encode()
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-        fd = files.open_file(_list_of(place), flags, depth=IN_TABLES)
+        fd = files.open_file(_list_of(place), flags)
         try:
             # A line before it may have been cut by a crash.
             durability.write_all(fd, [b"\n%b %b\n" % (line, _checksum(line))])
@@ -243,7 +242,7 @@ class TableFolders:
         except StoreError as error:
             # Its other recordings get their tables again when they are asked about.
             _log.info("%s", error)
-            files.unlink(path, depth=IN_TYPE)
+            files.unlink(path)
             if addition.section is not None:
                 self._write(path, [(addition.section, addition.rows)])
             return
@@ -268,7 +267,7 @@ class TableFolders:
         if pieces:
             self._write(path, pieces, reader)
         else:
-            files.unlink(path, depth=IN_TYPE)
+            files.unlink(path)
 
     def _write(
         self, path: Path, pieces: Iterable[_Piece], before: ParquetFileReader | None = None
@@ -306,21 +305,20 @@ class TableFolders:
             part = self._part(found, table, reused, in_front=False)
         if self._recording in sections and not (self._is_listed and path.name in self._shared):
             self._list(path.parent, path.name)
-        files.rename(part, path, depth=files.IN_RECORDING, new_depth=IN_TYPE)
+        files.rename(part, path)
 
     def _part(
         self, sections: Sequence[Section], table: Any, reused: ReusedBytes | None, *, in_front: bool
     ) -> Path:
         """A finished file without its name."""
         parts = parts_folder(self._root, self._recording)
-        files.make_folders(parts, depth=files.IN_FOLDER)
+        files.make_folders(parts)
         self._numbers += 1
         part = parts / f"{SHARED}{self._numbers}{SUFFIX}"
-        files.remove_tree(part, depth=files.IN_RECORDING)
+        files.remove_tree(part)
         writer = ParquetFileWriter(
             part,
             table,
-            depth=files.IN_RECORDING,
             is_all=True,
             reused=reused,
             in_front=in_front,
@@ -345,10 +343,9 @@ class TableFolders:
                 while (name := f"{self._recording}-{number}{SUFFIX}") in taken:
                     number += 1
             taken.add(name)
-            depth = len(part.parts) - len(self._root.parts)
-            files.rename(part, place / name, depth=depth, new_depth=IN_TYPE)
+            files.rename(part, place / name)
         for name in free:
-            files.remove_tree(place / name, depth=IN_TYPE)
+            files.remove_tree(place / name)
 
 
 @contextmanager
@@ -358,13 +355,13 @@ def locked(root: Path) -> Iterator[None]:
     Raises:
         FileNotFoundError: there are none.
     """
-    with files.locked_folder(root / TABLES, 1):
+    with files.locked_folder(root / TABLES):
         yield
 
 
 def _folders(root: Path) -> list[str]:
     """Names of the folders of tables."""
-    found = files.names(root / TABLES, depth=1).items()
+    found = files.names(root / TABLES).items()
     return sorted(name for name, about in found if "~" in name and S_ISDIR(about.st_mode))
 
 
@@ -381,7 +378,7 @@ def shared_files(root: Path, folder: str, recording: str = "") -> dict[str, set[
     found: dict[str, set[str]] = {}
     path, wanted = _list_of(root / TABLES / folder), recording.encode()
     with suppress(OSError):
-        for line in files.read_file(path, _MAX_LIST_BYTES, depth=IN_TABLES).splitlines():
+        for line in files.read_file(path, _MAX_LIST_BYTES).splitlines():
             content, _, checksum = line.rpartition(b" ")
             if line.startswith(wanted) and checksum == _checksum(content):
                 known, *names = content.decode().split(" ")
@@ -392,7 +389,7 @@ def shared_files(root: Path, folder: str, recording: str = "") -> dict[str, set[
 def list_bytes(folder: Path) -> int:
     """Bytes of the list beside a folder; 0 without one."""
     try:
-        return files.status(_list_of(folder), depth=IN_TABLES).st_size
+        return files.status(_list_of(folder)).st_size
     except OSError:
         return 0
 
@@ -410,16 +407,14 @@ class Listing:
 
     Args:
         path: The folder.
-        depth: Parts of its path that lie inside the store.
 
     Attributes:
         names: The status of each entry, by name; empty without the folder.
     """
 
-    def __init__(self, path: Path, depth: int) -> None:
+    def __init__(self, path: Path) -> None:
         self.names: dict[str, os.stat_result] = {}
         self._path = path
-        self._depth = depth
         self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
 
     def look(self) -> bool:
@@ -429,7 +424,7 @@ class Listing:
             StoreError: they cannot be read.
         """
         try:
-            now, names = files.changed_names(self._path, self._read_at, depth=self._depth)
+            now, names = files.changed_names(self._path, self._read_at)
             if names is None:
                 return False
             self.names = names
@@ -449,7 +444,7 @@ def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ParquetF
     with suppress(OSError):
         for folder in _folders(root):
             if folder.startswith(tuple(prefixes)):
-                for name in sorted(files.names(root / TABLES / folder, depth=IN_TABLES)):
+                for name in sorted(files.names(root / TABLES / folder)):
                     with suppress(OSError, StoreError):
                         yield ParquetFileReader(root / TABLES / folder / name)
 
@@ -472,7 +467,7 @@ def _reader(path: Path) -> ParquetFileReader | None:
         if isinstance(error.__cause__, PermissionError):
             raise error.__cause__ from error
         _log.info("%s", error)
-        files.remove_tree(path, depth=IN_TYPE)
+        files.remove_tree(path)
         return None
 
 

@@ -73,7 +73,7 @@ def _join(
     old: Sequence[PayloadFile],
 ) -> int:
     folder = path / PAYLOAD_PARTS
-    files.remove_tree(folder, depth=files.IN_RECORDING)
+    files.remove_tree(folder)
     readers = _readers(RecordingPayloads(path, old), old)
     columns.replaces = sorted({f.file for f in old}.union(*(r.replaces for r in readers)))
     numbers = partial(next, count(next_number(state)))

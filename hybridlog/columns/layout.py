@@ -39,12 +39,6 @@ PARTS: Final = "tables.part"
 SUFFIX: Final = ".parquet"
 SHARED: Final = "shared-"
 """Beginning of the names of files that recordings share."""
-IN_TABLES: Final = 2
-"""Depth of a folder of tables below the store."""
-IN_TYPE: Final = 3
-"""Depth of a file of tables below the store."""
-IN_PARTS: Final = 4
-"""Depth of a table of a sealed segment below the store."""
 OWN_COLUMNS: Final = (
     "recording",
     "topic",
@@ -72,8 +66,6 @@ RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
 PAYLOAD_PARTS: Final = "payloads.part"
 """Folder of a recording that holds unfinished files of payloads."""
-IN_PAYLOADS: Final = 5
-"""Depth of a file of payloads below the store."""
 RECIPE: Final = "recipe"
 """Column with what the original bytes need besides the arrays."""
 POINTS: Final = "points"

@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hybridlog.columns.fields import has_summaries, original_name
-from hybridlog.columns.layout import ABOUT, IN_TYPE, OWN, OWN_COLUMNS, About, Section
+from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
 from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
@@ -73,7 +73,6 @@ class ParquetFileWriter:
     Args:
         path: The file, in the folder of a recording's unfinished tables.
         sample: Example rows; their schema is the file's.
-        depth: Parts of the path that lie inside the store.
         encodings: Encoding of columns, by their dotted paths: `dictionary` or a name of
             Parquet's. Those of the other columns follow from the example rows.
         level: Level of zstd.
@@ -91,7 +90,6 @@ class ParquetFileWriter:
         path: Path,
         sample: pa.Table,
         *,
-        depth: int,
         encodings: Mapping[str, str] | None = None,
         level: int = 1,
         is_all: bool = False,
@@ -102,8 +100,7 @@ class ParquetFileWriter:
         self.is_ordered = True
         """True if rows are in order of time and arrival."""
         self._bounds: list[tuple[int, int, int, int, int]] = []
-        self._depth = depth
-        self._sink = _Sink(path, depth)
+        self._sink = _Sink(path)
         kinds = {leaf.path: leaf.kind for leaf in leaves(sample.schema)}
         chosen = dict(encodings or {})
         for leaf, kind in kinds.items():
@@ -200,16 +197,16 @@ class ParquetFileWriter:
         """Delete the unfinished file."""
         self._sink.abandon()
         with suppress(OSError):
-            files.unlink(self.path, depth=self._depth)
+            files.unlink(self.path)
 
 
 class _Sink:
     """Receives Parquet's bytes: the body goes to the disk, the footer to memory until sealed."""
 
-    def __init__(self, path: Path, depth: int) -> None:
+    def __init__(self, path: Path) -> None:
         self.closed = False
         self._is_abandoned = False
-        self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, depth=depth)
+        self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._waiting = bytearray()
         self._position = 0
         self._checksums: list[str] = []
@@ -286,20 +283,19 @@ class ParquetFileReader:
 
     Args:
         path: The file.
-        depth: Parts of the path that lie inside the store.
 
     Raises:
         FileNotFoundError: the file does not exist.
         StoreError: the file cannot be read, or is damaged.
     """
 
-    def __init__(self, path: Path, *, depth: int = IN_TYPE) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.number = next(_NUMBERS)
         """Unique number of this reader."""
         self._lock = threading.Lock()
         try:
-            self._source = _Source(path, depth)
+            self._source = _Source(path)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
             self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
             self._source.trust(self.about)
@@ -424,10 +420,9 @@ class ParquetFileReader:
 class _Source:
     """Provides Parquet's bytes, after verifying the checksum of each block."""
 
-    def __init__(self, path: Path, depth: int) -> None:
+    def __init__(self, path: Path) -> None:
         self.closed = False
         self._path = path
-        self._depth = depth
         self._lock = threading.Lock()
         self._fd = -1
         self._position = 0
@@ -511,7 +506,7 @@ class _Source:
             self._fd = -1
 
     def _open(self) -> None:
-        self._fd = files.open_file(self._path, os.O_RDONLY | os.O_NONBLOCK, depth=self._depth)
+        self._fd = files.open_file(self._path, os.O_RDONLY | os.O_NONBLOCK)
         same = files.identity(self._fd)
         if self._same is not None and same != self._same:
             os.close(self._fd)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS
+from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog_storage import journal
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.disk import durability, files
@@ -56,8 +56,8 @@ def announce(
     """
     parts = recording / PAYLOAD_PARTS
     for folder in {(parts / file.file).parent for file in made}:
-        files.sync_folder(folder, depth=IN_PAYLOADS - 1)
-    files.sync_folder(parts, depth=files.IN_RECORDING)
+        files.sync_folder(folder)
+    files.sync_folder(parts)
     files.sync_folder(recording)
     gone = {"deleted": deleted} if deleted else {}
     log.append(journal.event(event, files=[asdict(file) for file in made], **gone))
@@ -68,7 +68,7 @@ def take_back(recording: Path, before: JournalState) -> None:
     with suppress(StoreError, OSError):
         state = journal.read(recording)
         if state is not None and state.payloads.keys() == before.payloads.keys():
-            files.remove_tree(recording / PAYLOAD_PARTS, depth=files.IN_RECORDING)
+            files.remove_tree(recording / PAYLOAD_PARTS)
 
 
 def publish(recording: Path, state: JournalState | None) -> None:
@@ -87,18 +87,18 @@ def publish(recording: Path, state: JournalState | None) -> None:
         moved = [name for name in names if state is not None and name in state.payloads]
         folders = {(final / name).parent for name in moved}
         for folder in folders:
-            files.make_folders(folder, depth=IN_PAYLOADS - 1)
+            files.make_folders(folder)
         if moved:  # folders are on the disk before anything moves into them
             files.sync_folder(recording)
-            files.sync_folder(final, depth=files.IN_RECORDING)
+            files.sync_folder(final)
         for name in moved:
-            files.rename(parts / name, final / name, depth=IN_PAYLOADS, new_depth=IN_PAYLOADS)
+            files.rename(parts / name, final / name)
         for folder in folders:
-            files.sync_folder(folder, depth=IN_PAYLOADS - 1)
-        files.remove_tree(parts, depth=files.IN_RECORDING)
+            files.sync_folder(folder)
+        files.remove_tree(parts)
         deleted = set() if state is None else state.deleted & payload_names(recording).keys()
         for name in sorted(deleted):
-            files.unlink(final / name, depth=IN_PAYLOADS)
+            files.unlink(final / name)
     except OSError as error:
         raise durability.explain(error, final, "moving payloads to") from error
 

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hybridlog.columns.layout import (
-    IN_PAYLOADS,
     OWN_COLUMNS,
     RECIPE,
     Section,
@@ -151,9 +150,9 @@ class TopicWriter:
         path = self._folder / file.name
         try:
             if file.writer is None:
-                files.make_folders(path.parent, depth=IN_PAYLOADS - 1)
+                files.make_folders(path.parent)
                 file.writer = ParquetFileWriter(
-                    path, table, depth=IN_PAYLOADS, encodings=encodings_of(table), level=LEVEL
+                    path, table, encodings=encodings_of(table), level=LEVEL
                 )
             file.writer.write(table)
         except OSError as error:

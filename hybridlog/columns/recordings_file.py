@@ -7,12 +7,12 @@ removes it before it changes an ended recording, so it is right wherever it exis
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hybridlog.columns.layout import IN_TABLES
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.disk import files
 
@@ -99,5 +99,6 @@ def write_recordings_file(catalog: Catalog, present: set[str]) -> None:
             write_page_checksum=True,
         )
         path = catalog.recordings_file
-        files.make_folders(path.parent, depth=IN_TABLES - 1)
-        files.write_file(path, sink.getvalue().to_pybytes(), depth=IN_TABLES, sync=False)
+        with suppress(FileExistsError):
+            files.make_folder(path.parent)
+        files.write_file(path, sink.getvalue().to_pybytes(), sync=False)

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.columns.layout import (
-    IN_PARTS,
     SUFFIX,
     Section,
     TopicCounts,
@@ -211,9 +210,7 @@ class _File:
         table = self._topic.table(pieces, self._has_publish_time)
         if self._writer is None:
             self.schema = table.schema
-            self._writer = ParquetFileWriter(
-                self.path, table, depth=files.IN_RECORDING, is_all=is_all
-            )
+            self._writer = ParquetFileWriter(self.path, table, is_all=is_all)
         elif table.schema != self.schema:
             table = self._fitting(table)
         step = _rows_of_group(table)
@@ -348,7 +345,7 @@ class TableWriter:
         self._arena = None
         if self._has_parts:
             with suppress(OSError):
-                files.remove_tree(self._parts, depth=files.IN_FOLDER)
+                files.remove_tree(self._parts)
         self._has_parts = False
 
     @contextmanager
@@ -534,8 +531,8 @@ class TableWriter:
     def _new_part(self) -> Path:
         if not self._has_parts:
             with suppress(FileNotFoundError):
-                files.remove_tree(self._parts, depth=files.IN_FOLDER)  # left from a crash
-            files.make_folders(self._parts, depth=files.IN_FOLDER)
+                files.remove_tree(self._parts)  # left from a crash
+            files.make_folders(self._parts)
             self._has_parts = True
         self._numbers += 1
         return self._parts / f"{self._numbers}{SUFFIX}"
@@ -578,8 +575,8 @@ class TableWriter:
                 file.close(self._cut)
                 folder = shape_folder(topic.type, file.schema)
                 place = self._parts / folder / file.path.name
-                files.make_folders(place.parent, depth=IN_PARTS - 1)
-                files.rename(file.path, place, depth=files.IN_RECORDING, new_depth=IN_PARTS)
+                files.make_folders(place.parent)
+                files.rename(file.path, place)
                 topic.finished.append((folder, place))
 
     def _close(self, entry: RecordingEntry) -> None:

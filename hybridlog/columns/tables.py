@@ -25,8 +25,6 @@ from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
 from hybridlog.columns.fields import UnfitError
 from hybridlog.columns.folders import Listing, shared_files
 from hybridlog.columns.layout import (
-    IN_PARTS,
-    IN_TABLES,
     SHARED,
     SUFFIX,
     TABLES,
@@ -79,15 +77,13 @@ class _Folder:
 
     Args:
         path: The folder.
-        depth: Parts of its path that lie inside the store.
         opened: Knows the open files.
     """
 
-    def __init__(self, path: Path, depth: int, opened: OpenFiles) -> None:
+    def __init__(self, path: Path, opened: OpenFiles) -> None:
         self._path = path
-        self._depth = depth
         self._opened = opened
-        self._listing = Listing(path, depth)
+        self._listing = Listing(path)
         self._shared: list[str] = []
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
         self._listed: Mapping[str, Collection[str]] = {}
@@ -151,7 +147,7 @@ class _Folder:
             return
         file: ColumnFile | None = None
         with suppress(FileNotFoundError, StoreError):
-            file = ColumnFile(self._path / name, depth=self._depth + 1)
+            file = ColumnFile(self._path / name)
             self._opened.opened(file)
         if file is not None and not is_of_folder(self._path.name, file.schema):
             file = None
@@ -173,15 +169,13 @@ class _Folders:
 
     Args:
         place: Where they are.
-        depth: Parts of its path that lie inside the store.
         opened: Knows the open files.
     """
 
-    def __init__(self, place: Path, depth: int, opened: OpenFiles) -> None:
+    def __init__(self, place: Path, opened: OpenFiles) -> None:
         self._place = place
-        self._depth = depth
         self._opened = opened
-        self._listing = Listing(place, depth)
+        self._listing = Listing(place)
         self._known: dict[str, _Folder] = {}
         self._by_type: dict[str, list[_Folder]] = {}
 
@@ -191,7 +185,7 @@ class _Folders:
             return
         before = self._known
         self._known = {
-            name: before.get(name) or _Folder(self._place / name, self._depth + 1, self._opened)
+            name: before.get(name) or _Folder(self._place / name, self._opened)
             for name, about in sorted(self._listing.names.items())
             if S_ISDIR(about.st_mode)
         }
@@ -216,7 +210,7 @@ class Tables:
         self._root = root
         self.opened = OpenFiles(cache or Cache())
         self._found: OrderedDict[tuple[str, str], TopicTable | None] = OrderedDict()
-        self._folders = _Folders(root / TABLES, IN_TABLES - 1, self.opened)
+        self._folders = _Folders(root / TABLES, self.opened)
         self._looked_at: set[str] = set()  # types whose folders were looked at
         self._sealed: OrderedDict[str, _Folders] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
@@ -229,7 +223,7 @@ class Tables:
             self._generation += 1
             self._found.clear()
             self._looked_at.clear()
-            self._folders = _Folders(self._root / TABLES, IN_TABLES - 1, self.opened)
+            self._folders = _Folders(self._root / TABLES, self.opened)
             self._sealed.clear()
             self._channels = None
         self.opened.clear()
@@ -418,9 +412,7 @@ class Tables:
             return None
         with self._lock:
             place = parts_folder(self._root, recording.id)
-            known = self._sealed.setdefault(
-                recording.id, _Folders(place, IN_PARTS - 2, self.opened)
-            )
+            known = self._sealed.setdefault(recording.id, _Folders(place, self.opened))
             known.look()
             folders = known.of(self._types_of(recording, topic))
             for folder in folders:

@@ -135,8 +135,8 @@ class Connection:
         from hybridlog.index import consent
 
         if self._uri is None:
-            self._uri = self.wanted or consent.trusted_uri(
-                self._directory.settings, self._directory.path
+            self._uri = consent.trusted_uri(
+                self._directory.settings, self._directory.path, self.wanted
             )
         uri = self._uri
         if uri == NONE:

@@ -88,7 +88,7 @@ class ControlServer:
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         with suppress(OSError):
-            files.unlink(self._socket_file, depth=files.IN_FOLDER)
+            files.unlink(self._socket_file)
         with suppress(OSError):
             self._path.unlink()
         with suppress(OSError):
@@ -96,9 +96,9 @@ class ControlServer:
 
     def _write_socket_file(self) -> None:
         with suppress(FileExistsError):
-            files.make_folder(self._socket_file.parent, depth=files.IN_STORE)
+            files.make_folder(self._socket_file.parent)
         content = json.dumps({"socket": str(self._path), "pid": os.getpid()}) + "\n"
-        files.write_file(self._socket_file, content.encode(), depth=files.IN_FOLDER, sync=False)
+        files.write_file(self._socket_file, content.encode(), sync=False)
 
     def _serve(self) -> None:
         while True:
@@ -138,7 +138,7 @@ def running(store: Path) -> list[str]:
     """Names of the recorders that run on a store, in the order of their start."""
     found: list[tuple[float, str]] = []
     try:
-        socket_files = files.names(store / _SOCKET_FILES, depth=files.IN_STORE)
+        socket_files = files.names(store / _SOCKET_FILES)
     except OSError:
         return []
     for file_name, about in socket_files.items():
@@ -193,7 +193,7 @@ def _connect(store: Path, name: str) -> socket.socket:
         OSError: The recorder does not answer.
     """
     try:
-        text = files.read_file(_socket_file(store, name), _MAX_SOCKET_FILE, depth=files.IN_FOLDER)
+        text = files.read_file(_socket_file(store, name), _MAX_SOCKET_FILE)
         path = json.loads(text)["socket"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreError(_gone(name)) from error

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.folders import Addition, TableFolders, files_of
-from hybridlog.columns.layout import IN_TYPE, SHARED, SUFFIX
+from hybridlog.columns.layout import SHARED, SUFFIX
 from hybridlog.entries import describe, put_entry, take_inventory
 from hybridlog.maintenance.copying import at_work
 from hybridlog.maintenance.keep import pin_of
@@ -395,10 +395,10 @@ class BucketPlace:
 
     def _sent(self, path: Path, name: str) -> Object:
         try:
-            size = files.status(path, depth=IN_TYPE).st_size
+            size = files.status(path).st_size
         except OSError as error:
             raise unreadable(error, path) from error
-        pieces = pieces_of(path, 0, size, _PIECE, depth=IN_TYPE)
+        pieces = pieces_of(path, 0, size, _PIECE)
         return self._target.source.bucket.send(name, size, pieces)
 
     def _fields(self, entry: RecordingEntry, root: Path) -> Mapping[str, Sequence[Path]]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.columns import payload_files
-from hybridlog.columns.layout import IN_PAYLOADS, PAYLOAD_PARTS, table_schema_of, topic_folder
+from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of, topic_folder
 from hybridlog.columns.payload_files import RecordingPayloads, walk
 from hybridlog.entries import put_entry, take_inventory
 from hybridlog.maintenance import thinning
@@ -206,7 +206,7 @@ class _Compaction:
         """Write the files; what does not fit its definition stays where it is."""
         from hybridlog.columns.payload_writer import TopicWriter
 
-        files.remove_tree(self.path / PAYLOAD_PARTS, depth=files.IN_RECORDING)
+        files.remove_tree(self.path / PAYLOAD_PARTS)
         numbers: defaultdict[str, count[int]] = defaultdict(count)
         for topic in chosen:
             topic.report.messages = 0
@@ -275,7 +275,7 @@ class _Compaction:
         topic.exclude(report.messages, problem)
         report.messages = report.payload_bytes = report.column_bytes = 0
         for file in topic.files:
-            files.unlink(self.path / PAYLOAD_PARTS / file.file, depth=IN_PAYLOADS)
+            files.unlink(self.path / PAYLOAD_PARTS / file.file)
         topic.files = []
 
     def _chunks(

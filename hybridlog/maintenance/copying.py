@@ -226,12 +226,12 @@ class _Copying:
             path = self._source.recording(mark)
             try:
                 flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-                os.close(files.open_file(path, flags, depth=files.IN_FOLDER))
+                os.close(files.open_file(path, flags))
                 try:
                     is_seen = self._place.sees(mark)
                 finally:
                     is_removed = not self._source.has(mark)
-                    files.remove_tree(path, depth=files.IN_FOLDER)
+                    files.remove_tree(path)
             except OSError as error:
                 if not self._options.then_expire:  # a full disk can be copied from
                     return False
@@ -484,7 +484,7 @@ class _Sent:
             RefusedError: It cannot be read.
         """
         try:
-            yield from pieces_of(file.below(self.path), at, end, piece, depth=file.depth)
+            yield from pieces_of(file.below(self.path), at, end, piece)
         except StoreError as error:
             raise RefusedError(str(error)) from error
 
@@ -510,11 +510,11 @@ def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory
     with at_work(source) as folder:
         scratch = StoreDirectory.create(folder / "store")
         path = scratch.recording(sent.label)
-        files.make_folder(path, depth=files.IN_FOLDER)
+        files.make_folder(path)
         for file in sent.files:
             target = file.below(path)
-            files.make_folders(target.parent, depth=file.depth - 1)
-            files.link(file.below(sent.path), target, depth=file.depth, new_depth=file.depth)
+            files.make_folders(target.parent)
+            files.link(file.below(sent.path), target)
         files.write_file(path / JOURNAL, sent.lines)
         expire(scratch, sent.label, sent.segments, record=not_copied_record)
         yield scratch
@@ -530,14 +530,14 @@ def at_work(source: StoreDirectory) -> Iterator[Path]:
     folder, held = source.path / f"{SENDING}{secrets.token_hex(4)}", ExitStack()
     try:
         clear_stopped(source)
-        while folder.name not in files.names(source.path, depth=0):
+        while folder.name not in files.names(source.path):
             held.close()
-            files.make_folder(folder, depth=files.IN_STORE)
+            files.make_folder(folder)
             with suppress(FileNotFoundError):  # another process has just opened the store
-                held.enter_context(files.locked_folder(folder, files.IN_STORE))
+                held.enter_context(files.locked_folder(folder))
         yield folder
     except OSError as error:
         raise durability.explain(error, folder, "copying from") from error
     finally:
         with held, suppress(OSError):
-            files.remove_tree(folder, depth=files.IN_STORE)
+            files.remove_tree(folder)

@@ -222,7 +222,7 @@ class _Expiry:
     def _write(self, report: Callable[[int], None]) -> list[PayloadFile]:
         """Write what is left of the chosen messages, and compare it with them."""
         folder = self._path / PAYLOAD_PARTS
-        files.remove_tree(folder, depth=files.IN_RECORDING)
+        files.remove_tree(folder)
         for segment, chunk in self._chunks(report):
             self._add(chunk, segment.summary)
         self._chosen = {number: chosen for number, chosen in self._chosen.items() if chosen}

@@ -469,17 +469,17 @@ def clear_stopped(directory: StoreDirectory) -> None:
     Raises:
         OSError: They cannot be removed.
     """
-    for name in files.names(directory.path, depth=0):
+    for name in files.names(directory.path):
         path = directory.path / name
         if name.startswith(SENDING):
-            with suppress(BlockingIOError), files.locked_folder(path, files.IN_STORE, 0):
-                files.remove_tree(path, depth=files.IN_STORE)
+            with suppress(BlockingIOError), files.locked_folder(path, 0):
+                files.remove_tree(path)
 
 
 def is_at_work(source: StoreDirectory, name: str) -> bool:
     """True if a hidden folder of a copy is locked: the copy goes on."""
     try:
-        with files.locked_folder(source.path / name, files.IN_STORE, 0):
+        with files.locked_folder(source.path / name, 0):
             return False
     except OSError as error:
         return isinstance(error, BlockingIOError)

@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
-from hybridlog.columns.layout import IN_PAYLOADS
 from hybridlog.columns.payload_files import open_file
 from hybridlog.entries import take_inventory
 from hybridlog_storage import journal
@@ -92,11 +91,6 @@ class CopiedFile(journal.PayloadFile):
     def is_segment(self) -> bool:
         """True for a segment."""
         return "/" not in self.file
-
-    @property
-    def depth(self) -> int:
-        """As for `files.open_file`."""
-        return files.IN_RECORDING if self.is_segment else IN_PAYLOADS
 
     def below(self, recording: Path) -> Path:
         """Its path in the directory of its recording."""
@@ -318,7 +312,7 @@ class DirectoryPlace:
         hidden = self._path.name
         while True:
             try:
-                files.make_folder(self._path, depth=files.IN_FOLDER)
+                files.make_folder(self._path)
             except FileExistsError:
                 pass  # a copy was interrupted, or another process copies it
             except OSError as error:
@@ -343,7 +337,7 @@ class DirectoryPlace:
 
     def _sizes(self) -> Iterator[tuple[str, int]]:
         try:
-            found = files.names(self._path, depth=files.IN_FOLDER)
+            found = files.names(self._path)
             segments = {name: about for name, about in found.items() if _SEGMENT.fullmatch(name)}
             for name, about in {**segments, **payload_names(self._path)}.items():
                 if stat.S_ISREG(about.st_mode):
@@ -354,7 +348,7 @@ class DirectoryPlace:
     def digest(self, file: CopiedFile, length: int) -> str:
         """As of `Place`."""
         path = file.below(self._path)
-        return digest_like("", pieces_of(path, 0, length, _PIECE, depth=file.depth))
+        return digest_like("", pieces_of(path, 0, length, _PIECE))
 
     def append(self, file: CopiedFile, at: int, data: Buffer) -> None:
         """As of `Place`."""
@@ -376,9 +370,9 @@ class DirectoryPlace:
         """The handle of a file, with `at` bytes."""
         self._close()
         path = file.below(self._path)
-        files.make_folders(path.parent, depth=file.depth - 1)
+        files.make_folders(path.parent)
         flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK
-        fd = files.open_file(path, flags, depth=file.depth)
+        fd = files.open_file(path, flags)
         self._opened = "", fd, 0
         about = os.fstat(fd)
         if not stat.S_ISREG(about.st_mode) or about.st_size < at:
@@ -402,7 +396,7 @@ class DirectoryPlace:
             return False
         try:
             # An earlier copy may have written it; it is forced to the disk by its content.
-            fd = files.open_file(path, os.O_RDWR | os.O_NONBLOCK, depth=file.depth)
+            fd = files.open_file(path, os.O_RDWR | os.O_NONBLOCK)
             try:
                 durability.sync_file(fd)
             finally:
@@ -427,7 +421,7 @@ class DirectoryPlace:
                 label = held.enter_context(writing)
                 added += self._edits(label, state)
             content = lines + b"".join(map(journal.encode, added))
-            durability.write_new(path / JOURNAL, content, depth=files.IN_RECORDING)
+            durability.write_new(path / JOURNAL, content)
             inventory = take_inventory(self._directory, path.name)
             if inventory.misfits or not inventory.is_proven:
                 files.unlink(path / JOURNAL)
@@ -443,15 +437,15 @@ class DirectoryPlace:
         path = self._path
         keep = {LOCK, PAYLOADS, *map(sealed_name, state.sealed)}
         try:
-            for name in files.names(path, depth=files.IN_FOLDER).keys() - keep:
-                files.remove_tree(path / name, depth=files.IN_RECORDING)
+            for name in files.names(path).keys() - keep:
+                files.remove_tree(path / name)
             for name in payload_names(path).keys() - state.payloads.keys():
-                files.remove_tree(path / PAYLOADS / name, depth=IN_PAYLOADS)
+                files.remove_tree(path / PAYLOADS / name)
             folders = {(path / PAYLOADS / name).parent for name in state.payloads}
             for folder in folders:
-                files.sync_folder(folder, depth=IN_PAYLOADS - 1)
+                files.sync_folder(folder)
             if folders:
-                files.sync_folder(path / PAYLOADS, depth=files.IN_RECORDING)
+                files.sync_folder(path / PAYLOADS)
             files.sync_folder(path)
         except OSError as error:
             raise durability.explain(error, path, "copying into") from error
@@ -463,7 +457,7 @@ class DirectoryPlace:
         found, marks = edits_of(data, state, self.name)
         for name in marks:
             with suppress(FileExistsError):
-                files.link(old / name, self._path / name, new_depth=files.IN_RECORDING)
+                files.link(old / name, self._path / name)
         files.sync_folder(self._path)
         return found
 
@@ -623,14 +617,14 @@ def files_of(inventory: Any) -> list[CopiedFile]:
     return sorted(listed, key=lambda file: (not file.is_segment, file.file))
 
 
-def pieces_of(path: Path, at: int, end: int, piece: int, *, depth: int) -> Iterator[bytes]:
+def pieces_of(path: Path, at: int, end: int, piece: int) -> Iterator[bytes]:
     """The bytes of a file, a piece at a time.
 
     Raises:
         StoreError: It cannot be read.
     """
     try:
-        fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
+        fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK)
         try:
             fetched = at
             while at < end:

@@ -29,7 +29,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.threads import Threads, taken_by_forks
+from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.places import DirectoryPlace
@@ -120,7 +120,7 @@ class Server:
         self.name = name
         self._requests = requests
         self._answers = answers
-        self._sending = taken_by_forks(Lock())
+        self._sending = Lock()
         self._ahead = 0  # requests without an answer
         self._is_cut = self._is_met = False
         if self._receive().get("hybridlog") != _PROTOCOL:

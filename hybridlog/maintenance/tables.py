@@ -215,7 +215,7 @@ class TableChecker:
 def announce_removal(directory: StoreDirectory, recording: str) -> None:
     """Make a folder that is there until all tables of a recording are gone."""
     with suppress(OSError):
-        files.make_folders(parts_folder(directory.path, recording), depth=files.IN_FOLDER)
+        files.make_folders(parts_folder(directory.path, recording))
 
 
 def remove(directory: StoreDirectory, recording: str, types: Collection[str] | None = None) -> None:
@@ -230,7 +230,7 @@ def remove(directory: StoreDirectory, recording: str, types: Collection[str] | N
     prefixes = [""] if types is None else [type_prefix(one) for one in types]
     TableFolders(directory.path, recording).remove(prefixes)
     with suppress(FileNotFoundError):
-        files.remove_tree(parts_folder(directory.path, recording), depth=files.IN_FOLDER)
+        files.remove_tree(parts_folder(directory.path, recording))
 
 
 def unfinished(directory: StoreDirectory) -> set[str]:
@@ -253,7 +253,7 @@ def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
             continue
         one = snapshot.summaries[place]
         with suppress(OSError, StoreError, TopicError), directory.writing(one.label, one.id):
-            files.remove_tree(directory.path / PARTS / name, depth=files.IN_FOLDER)
+            files.remove_tree(directory.path / PARTS / name)
 
 
 def are_left(directory: StoreDirectory, snapshot: Snapshot) -> bool:
@@ -271,7 +271,7 @@ def remove_orphans(directory: StoreDirectory, present: Collection[str]) -> None:
 
 def _names(directory: StoreDirectory, top: str) -> list[str]:
     try:
-        with files.folder(directory.path / top, files.IN_STORE) as fd:
+        with files.folder(directory.path / top) as fd:
             return os.listdir(fd)  # noqa: PTH208 - of a handle
     except OSError:
         return []

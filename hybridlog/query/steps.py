@@ -51,17 +51,26 @@ class Steps:
         self.question = question
         self.counters = Counters()
         self.conditions = conditions
-        self.session = session
+        self._session = session
+
+    @property
+    def session(self) -> Session:
+        """The open store.
+
+        Raises:
+            UsageError: It was opened before this process was forked.
+        """
+        return self._session.here()
 
     def __eq__(self, other: object) -> bool:
         """True if both are the same question to the same open store."""
         if not isinstance(other, Steps):
             return NotImplemented
-        return self.session is other.session and self.question == other.question
+        return self._session is other._session and self.question == other.question
 
     def __hash__(self) -> int:
         """Hash of the question."""
-        return hash((id(self.session), self.question))
+        return hash((id(self._session), self.question))
 
     @property
     def topics(self) -> tuple[str, ...]:

@@ -23,7 +23,6 @@ from hybridlog.schema.definition import (
 from hybridlog.schema.wire import WireReader
 from hybridlog.schema.wire_scan import MisfitError
 from hybridlog_storage.errors import DefinitionError, PayloadError
-from hybridlog_storage.threads import taken_by_forks
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -41,7 +40,7 @@ _MAX_UNROLLED = 10_000
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*\Z")
 
 # rosbags uses one module name for generated classes while it registers them.
-_REGISTERING = taken_by_forks(threading.Lock())
+_REGISTERING = threading.Lock()
 
 
 class RosCodec:

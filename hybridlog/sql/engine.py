@@ -28,7 +28,6 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.threads import begins_anew
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,7 +63,6 @@ class SqlEngine:
     """Runs SQL on an open store. Thread safe."""
 
     def __init__(self, session: Session) -> None:
-        begins_anew(self, session)
         self.session = session
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None

@@ -268,4 +268,4 @@ class _Video:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file that is whole or not there."""
-    write_new(path, text.encode(), depth=1)
+    write_new(path, text.encode())

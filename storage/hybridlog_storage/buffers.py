@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.threads import taken_by_forks
-
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -41,7 +39,7 @@ class Buffers:
     """
 
     def __init__(self) -> None:
-        self._lock = taken_by_forks(threading.Lock())
+        self._lock = threading.Lock()
         # Returned buffers. The garbage collector may return one at any point, on a thread that
         # already holds the lock.
         self._returned: deque[tuple[_Slab, int]] = deque()

@@ -69,7 +69,6 @@ from hybridlog_storage.summary import (
     topics_from_json,
     topics_to_json,
 )
-from hybridlog_storage.threads import taken_by_forks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -597,7 +596,7 @@ class Catalog:
         self.locked: Path | None = None
         self._store = store
         self._store_id = store_id
-        self._lock = taken_by_forks(RLock())
+        self._lock = RLock()
         self._folder = folder or MemoryFolder()
         self._parts: dict[int, _Part] = {}
         self._places: dict[str, int] = {}  # number of its part, by id of a recording
@@ -637,12 +636,12 @@ class Catalog:
 
     def _check_folder(self) -> None:
         try:
-            kind = files.status(self.path, depth=files.IN_STORE).st_mode
+            kind = files.status(self.path).st_mode
             if stat.S_ISLNK(kind):
                 raise StoreError(f"{self.path} is a symlink. Delete it: the catalog is rebuilt.")
             if not stat.S_ISDIR(kind):
                 self.was_damaged = True
-                files.remove_tree(self.path, depth=files.IN_STORE)
+                files.remove_tree(self.path)
         except FileNotFoundError:
             pass  # it is made with the first recording
         except OSError as error:
@@ -773,7 +772,7 @@ class Catalog:
         self.has_changed = True
         if self.locked is not None or not self.is_in_memory:
             with suppress(FileNotFoundError):
-                files.unlink(self.recordings_file, depth=files.IN_FOLDER)
+                files.unlink(self.recordings_file)
 
     def _tidy(self) -> None:
         """Remove files that are not ours, and what is damaged."""

@@ -200,7 +200,7 @@ class DiskFolder(MemoryFolder):
         return True
 
     def _look(self) -> Version:
-        about = files.status(self.path, depth=files.IN_STORE)
+        about = files.status(self.path)
         return about.st_ino, about.st_mtime_ns
 
     def versions(self) -> dict[str, Version]:
@@ -212,7 +212,7 @@ class DiskFolder(MemoryFolder):
         self._seen = None
         try:
             before = self._look()
-            found = files.names(self.path, depth=files.IN_STORE)
+            found = files.names(self.path)
         except FileNotFoundError:
             return {}
         # Within a tick of the clock another change would show the same time.
@@ -230,7 +230,7 @@ class DiskFolder(MemoryFolder):
         Raises:
             OSError: It cannot be read, or is not an ordinary file.
         """
-        return files.read_file(self.path / name, _MAX_BYTES, depth=files.IN_FOLDER)
+        return files.read_file(self.path / name, _MAX_BYTES)
 
     def write(self, name: str, data: bytes) -> None:
         """Create or replace a file. It is derived, so it is not forced to the disk.
@@ -238,7 +238,7 @@ class DiskFolder(MemoryFolder):
         Raises:
             OSError: It cannot be written.
         """
-        files.write_file(self.path / name, data, depth=files.IN_FOLDER, sync=False)
+        files.write_file(self.path / name, data, sync=False)
 
     def remove(self, name: str) -> None:
         """Remove a file, if it exists.
@@ -246,7 +246,7 @@ class DiskFolder(MemoryFolder):
         Raises:
             OSError: It cannot be removed.
         """
-        files.remove_tree(self.path / name, depth=files.IN_FOLDER)
+        files.remove_tree(self.path / name)
 
     @contextmanager
     def lock(self, wait_s: float) -> Iterator[None]:
@@ -257,6 +257,6 @@ class DiskFolder(MemoryFolder):
             OSError: The folder cannot be made, or opened.
         """
         with suppress(FileExistsError):
-            files.make_folder(self.path, depth=files.IN_STORE)
-        with files.locked_folder(self.path, files.IN_STORE, wait_s):
+            files.make_folder(self.path)
+        with files.locked_folder(self.path, wait_s):
             yield

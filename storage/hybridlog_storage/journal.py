@@ -454,7 +454,7 @@ class Journal:
         data = b"".join(map(encode, lines))
         flags = os.O_RDWR | os.O_CREAT
         try:
-            fd = files.open_file(self.path, flags, depth=files.IN_RECORDING)
+            fd = files.open_file(self.path, flags)
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX)
                 size = os.lseek(fd, 0, os.SEEK_END)
@@ -494,9 +494,9 @@ class Journal:
             raise durability.explain(error, self.path, "reading") from error
         if old:
             old_path = self.path.with_name(f"{JOURNAL}.old")
-            durability.write_new(old_path, old, depth=files.IN_RECORDING)
+            durability.write_new(old_path, old)
         content = b"".join(map(encode, lines))
-        durability.write_new(self.path, content, depth=files.IN_RECORDING)
+        durability.write_new(self.path, content)
 
 
 def _whole(fd: int, size: int) -> int:

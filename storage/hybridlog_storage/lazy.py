@@ -1,6 +1,6 @@
 """Objects made at their first use: attributes, types of rows, and the import of numpy.
 
-The attribute has no lock: before Python 3.12, the one of functools can outlive a fork.
+The attribute has no lock: before Python 3.12, the one of functools is one for all objects.
 """
 
 from __future__ import annotations

@@ -57,7 +57,6 @@ class StoreSettings:
         store_id: Random id of the store.
         mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None
             for the embedded one.
-        shared: Whether a group shares the store (`hybridlog_storage.disk.sharing`).
         requires: Features that a reader must know to read the store.
         optional: Features that a reader may ignore.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
@@ -67,7 +66,6 @@ class StoreSettings:
 
     store_id: str
     mongo: str | None = None
-    shared: bool = False
     requires: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
     cache_mb: int | None = None
@@ -100,11 +98,9 @@ def read_settings(path: Path) -> StoreSettings:
             f"The store {path} requires {names}, which this hybridlog does not know. Install a "
             "newer hybridlog."
         )
-    store_id, shared = values.get("store_id"), values.get("shared", False)
+    store_id = values.get("store_id")
     if not isinstance(store_id, str) or not store_id:
         raise StoreError(f"{file} names no store_id.")
-    if not isinstance(shared, bool):
-        raise StoreError(f"{file}: shared must be true or false.")
     mongo = _stored_uri(file, values.get("mongo"))
     cache_mb = values.get("cache_mb")
     if cache_mb is not None:
@@ -114,9 +110,7 @@ def read_settings(path: Path) -> StoreSettings:
             raise StoreError(str(error)) from None
     optional = _names(file, values, "optional")
     retention, remote = _table(file, values, "retention"), _table(file, values, "remote")
-    return StoreSettings(
-        store_id, mongo, shared, requires, optional, cache_mb, retention or {}, remote
-    )
+    return StoreSettings(store_id, mongo, requires, optional, cache_mb, retention or {}, remote)
 
 
 def _table(file: Path, values: Mapping[str, Any], name: str) -> dict[str, Any] | None:
@@ -133,7 +127,7 @@ def write_settings(path: Path, settings: StoreSettings) -> None:
             UsageError: The URI is not a MongoDB connection string.
             OSError: They cannot be written.
     """
-    files.write_file(path / NAME, settings_text(settings), depth=files.IN_STORE)
+    files.write_file(path / NAME, settings_text(settings))
 
 
 def settings_text(settings: StoreSettings) -> bytes:
@@ -146,8 +140,6 @@ def settings_text(settings: StoreSettings) -> bytes:
     if settings.mongo is not None:
         mongo = without_password(settings.mongo) if is_uri(settings.mongo) else settings.mongo
         lines.append(f"mongo = {_quoted(mongo)}")
-    if settings.shared:
-        lines.append("shared = true")
     if settings.cache_mb is not None:
         lines.append(f"cache_mb = {settings.cache_mb}")
     for name, features in (("requires", settings.requires), ("optional", settings.optional)):
@@ -351,7 +343,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
         StoreError: It cannot be read, or is not TOML.
     """
     try:
-        content = files.read_file(file, _LIMIT, depth=files.IN_STORE)
+        content = files.read_file(file, _LIMIT)
         if len(content) > _LIMIT:
             raise StoreError(f"{file} is too large to be settings.")
         return tomllib.loads(content.decode())

@@ -61,11 +61,11 @@ def import_again(path: Path, stores: Path) -> None:
     """After an import that the disk has stopped."""
     real, failed = files.sync_folder, []
 
-    def fail(folder: Path, **depth: Any) -> None:
+    def fail(folder: Path) -> None:
         if folder.name.startswith("topic=") and len(failed) < 2:
             failed.append(folder)
             raise OSError(5, "no sync")
-        real(folder, **depth)
+        real(folder)
 
     with hl.open(path, mongo=NOWHERE) as store, pytest.MonkeyPatch.context() as patch:
         patch.setattr(files, "sync_folder", fail)

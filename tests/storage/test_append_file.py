@@ -218,6 +218,7 @@ def test_what_is_no_file_of_the_recording_is_not_opened(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="ordinary"):
         AppendFile.reopen(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
+    (tmp_path / "hybridlog.toml").touch()
     (tmp_path / "inside").symlink_to(tmp_path / "folder")
     with pytest.raises(OSError, match="inside"):
         AppendFile.create(tmp_path / "inside" / "file")
@@ -230,7 +231,7 @@ def test_the_umask_decides_who_may_read_a_file(tmp_path: Path, mask: int, mode: 
     before = os.umask(mask)
     try:
         AppendFile.create(tmp_path / "file").close()
-        durability.write_new(tmp_path / "small", b"x", depth=files.IN_STORE)
+        durability.write_new(tmp_path / "small", b"x")
     finally:
         os.umask(before)
     assert (tmp_path / "file").stat().st_mode & 0o777 == mode
@@ -241,13 +242,13 @@ def test_a_small_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     """At each step that fails; and nothing else is left."""
     steps = Steps()
     with through(steps):
-        durability.write_new(tmp_path / "f", b"old", depth=1)
+        durability.write_new(tmp_path / "f", b"old")
     assert [what for what, _ in steps.log] == ["create", "write", "sync", "rename", "sync"]
     assert [name for _, name in steps.log][3:] == ["f", tmp_path.name]
     for number in range(len(steps.log)):
         failing = Steps(fail_from=number, fail_until=number + 1)
         with through(failing), pytest.raises(DiskFullError):
-            durability.write_new(tmp_path / "f", b"new", depth=1)
+            durability.write_new(tmp_path / "f", b"new")
         want = b"new" if number == 4 else b"old"
         assert (tmp_path / "f").read_bytes() == want
         assert [path.name for path in tmp_path.iterdir()] == ["f"]

@@ -1176,6 +1176,7 @@ def test_no_symlink_is_followed_to_a_segment(tmp_path: Path) -> None:
     outside.mkdir()
     (outside / "000000.mcap").write_bytes(whole)
     (outside / "000001.mcap.open").write_bytes(whole[:-9])
+    (tmp_path / "hybridlog.toml").touch()
     recordings = tmp_path / "recordings"
     (recordings / "r").mkdir(parents=True)
     (recordings / "r" / "000000.mcap").symlink_to(outside / "000000.mcap")

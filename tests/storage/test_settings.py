@@ -37,7 +37,7 @@ def write(store: Path, text: str | bytes) -> Path:
             retention={"quota": "2GB", "topic": {"/c/**": "7d", "/b": "1h"}, "never-tag": ["a=b"]},
             remote={"segment-size": "64MiB"},
         ),
-        StoreSettings("ab12", shared=True, optional=("colours", "Größe \U0001f600 \x7f\"'\\")),
+        StoreSettings("ab12", optional=("colours", "Größe \U0001f600 \x7f\"'\\")),
     ],
 )
 def test_what_is_written_is_read(tmp_path: Path, settings: StoreSettings) -> None:
@@ -72,7 +72,6 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = 3\nstore_id = 5", "store_id"),
         (b"format = 3\nstore_id = 'x'\nmongo = 1", "mongo"),
         (b"format = 3\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
-        (b"format = 3\nstore_id = 'x'\nshared = 1", "shared"),
         (b"format = 3\nstore_id = 'x'\nrequires = 'a'", "requires"),
         (b"format = 3\nstore_id = 'x'\noptional = [1]", "optional"),
         (b"format = 3\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),

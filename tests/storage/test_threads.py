@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from hybridlog_storage.lazy import lazy
 from hybridlog_storage.threads import Threads
 
 
@@ -52,3 +53,23 @@ def test_what_waits_is_not_begun_when_it_is_cancelled() -> None:
     with pytest.raises(RuntimeError):
         threads.submit(done.append, True)
     threads.shutdown()
+
+
+def test_threads_get_one_value_of_a_lazy_attribute() -> None:
+    both = threading.Barrier(2)
+
+    class Made:
+        @lazy
+        def value(self) -> object:
+            """Another object each time."""
+            both.wait(60)
+            return object()
+
+    made, found = Made(), []
+    threads = [threading.Thread(target=lambda: found.append(made.value)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [made.value] * 2
+    assert Made.value.__doc__ == "Another object each time."

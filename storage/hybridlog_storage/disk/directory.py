@@ -32,7 +32,6 @@ from typing import Any, ClassVar, Final
 from hybridlog_storage import journal
 from hybridlog_storage.catalog_parts import MemoryFolder
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.sharing import make_shared
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
@@ -122,7 +121,6 @@ class StoreDirectory:
         path: Path,
         *,
         mongo: str | None = None,
-        shared: bool = False,
         cache_mb: int | None = None,
     ) -> StoreDirectory:
         """Create a store, or open an existing one.
@@ -130,7 +128,6 @@ class StoreDirectory:
         Args:
             path: The directory.
             mongo: URI of the MongoDB to use instead of the embedded one; without a password.
-            shared: Whether a group may write it; for a new store only.
             cache_mb: Size of the embedded MongoDB's cache in MiB; for a new store only.
 
         Raises:
@@ -142,18 +139,16 @@ class StoreDirectory:
             if not (path / SETTINGS).exists():
                 path.mkdir(parents=True, exist_ok=True)
                 # Of several processes, one creates the store and the others open it.
-                with files.locked_folder(path, 0):
-                    settings = StoreSettings(
-                        secrets.token_hex(16), mongo=mongo, shared=shared, cache_mb=cache_mb
-                    )
+                with files.locked_folder(path):
+                    settings = StoreSettings(secrets.token_hex(16), mongo=mongo, cache_mb=cache_mb)
                     cls._make(path, settings)
             store = cls(path)
             try:
-                files.make_folder(path / _RECORDINGS, depth=files.IN_STORE)
+                files.make_folder(path / _RECORDINGS)
             except FileExistsError:
                 pass
             else:
-                files.sync_folder(path, depth=0)
+                files.sync_folder(path)
         except OSError as error:
             raise durability.explain(error, path, "making the store") from error
         return store
@@ -170,8 +165,6 @@ class StoreDirectory:
                 "Choose an empty or a new directory with --store."
             )
         write_settings(path, settings)
-        if settings.shared:
-            make_shared(path)
 
     @property
     def is_writable(self) -> bool:
@@ -242,7 +235,7 @@ class StoreDirectory:
             StoreError: It cannot be read.
         """
         try:
-            with files.folder(self.recordings, files.IN_STORE) as fd:
+            with files.folder(self.recordings) as fd:
                 return sorted(os.listdir(fd))  # noqa: PTH208 - of a handle
         except FileNotFoundError:
             return []
@@ -255,7 +248,7 @@ class StoreDirectory:
         Within a tick of the file system's clock another change would show the same time.
         """
         try:
-            changed = files.status(self.recordings, depth=files.IN_STORE).st_mtime_ns
+            changed = files.status(self.recordings).st_mtime_ns
         except OSError:
             return 0, False
         return changed, _is_a_tick_ago(changed)
@@ -274,7 +267,7 @@ class StoreDirectory:
         """
         found: dict[str, str] = {}
         try:
-            with files.folder(self.recordings, files.IN_STORE) as fd:
+            with files.folder(self.recordings) as fd:
                 for name in names:
                     if not name.startswith("."):
                         with suppress(OSError):
@@ -289,7 +282,7 @@ class StoreDirectory:
 
     def _look_of(self, label: str) -> str:
         """The look of one recording."""
-        with files.folder(self.recording(label), files.IN_FOLDER) as fd:
+        with files.folder(self.recording(label)) as fd:
             return _look(os.fstat(fd), JOURNAL, fd)
 
     @property
@@ -327,7 +320,7 @@ class StoreDirectory:
     def has(self, label: str) -> bool:
         """True if this name exists below `recordings`."""
         try:
-            files.status(self.recording(label), depth=files.IN_FOLDER)
+            files.status(self.recording(label))
         except FileNotFoundError:
             return False
         except OSError:
@@ -336,7 +329,7 @@ class StoreDirectory:
 
     def _folders(self) -> list[str]:
         try:
-            found = files.names(self.recordings, depth=files.IN_STORE)
+            found = files.names(self.recordings)
         except FileNotFoundError:
             return []
         except OSError as error:
@@ -361,7 +354,7 @@ class StoreDirectory:
         look, found, payloads = "", {}, {}
         try:
             look = self._look_of(label)
-            found = files.names(path, depth=files.IN_FOLDER)
+            found = files.names(path)
             if PAYLOADS in found:
                 payloads = payload_names(path)
         except FileNotFoundError:
@@ -419,7 +412,7 @@ class StoreDirectory:
         while True:
             label = _numbered_label(base, number)
             try:
-                files.make_folder(self.recording(label), depth=files.IN_FOLDER)
+                files.make_folder(self.recording(label))
             except FileExistsError:
                 number = self._free_number(base, number)
             except OSError as error:
@@ -448,7 +441,7 @@ class StoreDirectory:
         locked. Without that lock, an empty recording is left from a crash.
         """
         try:
-            with files.locked_folder(self.recordings, files.IN_STORE, 0):
+            with files.locked_folder(self.recordings, 0):
                 return False
         except OSError:
             return True
@@ -465,7 +458,7 @@ class StoreDirectory:
     def move(self, old: str, new: str) -> None:
         """Durably rename a directory below `recordings`."""
         try:
-            files.rename(self.recording(old), self.recording(new), depth=files.IN_FOLDER)
+            files.rename(self.recording(old), self.recording(new))
             self._sync()
         except OSError as error:
             raise durability.explain(error, self.recording(old), "renaming") from error
@@ -484,19 +477,19 @@ class StoreDirectory:
         """Delete a hidden directory below `recordings`."""
         path = self.recording(name)
         try:
-            files.remove_tree(path, depth=files.IN_FOLDER)
+            files.remove_tree(path)
             self._sync()
         except OSError as error:
             raise durability.explain(error, path, "removing") from error
 
     def _sync(self) -> None:
-        files.sync_folder(self.recordings, depth=files.IN_STORE)
+        files.sync_folder(self.recordings)
 
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Lock `recordings`, so that no other process starts a recording; for moments only."""
         try:
-            with files.locked_folder(self.recordings, files.IN_STORE):
+            with files.locked_folder(self.recordings):
                 yield
         except OSError as error:
             raise durability.explain(error, self.path, "locking") from error
@@ -506,7 +499,7 @@ class StoreDirectory:
         """Lock out other passes of retention; yields False if another process makes one."""
         with ExitStack() as held:
             try:
-                held.enter_context(files.locked_folder(self.path, 0, 0))
+                held.enter_context(files.locked_folder(self.path, 0))
             except BlockingIOError:
                 yield False
                 return
@@ -720,11 +713,11 @@ def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_
     """
     found: dict[str, os.stat_result] = {}
     with suppress(FileNotFoundError):
-        for topic, about in files.names(recording / folder, depth=files.IN_RECORDING).items():
+        for topic, about in files.names(recording / folder).items():
             if not stat.S_ISDIR(about.st_mode):
                 found[topic] = about
                 continue
-            inside = files.names(recording / folder / topic, depth=files.IN_RECORDING + 1)
+            inside = files.names(recording / folder / topic)
             found.update({f"{topic}/{name}": status for name, status in inside.items()})
     return found
 

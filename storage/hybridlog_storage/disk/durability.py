@@ -65,28 +65,27 @@ def sync_file(fd: int) -> None:
     files.system.sync(fd)
 
 
-def publish(temporary: Path, final: Path, *, depth: int) -> None:
+def publish(temporary: Path, final: Path) -> None:
     """Durably give a synced file its final name.
 
     Args:
         temporary: The file; in the folder of `final`.
         final: Its new name; a file of that name is replaced.
-        depth: As for `files.open_file`; 1 for a file outside of stores.
 
     Raises:
         OSError: It cannot be renamed, or the folder cannot be synced.
     """
-    files.rename(temporary, final, depth=depth)
-    files.sync_folder(final.parent, depth=depth - 1)
+    files.rename(temporary, final)
+    files.sync_folder(final.parent)
 
 
-def write_new(final: Path, content: bytes, *, depth: int) -> None:
+def write_new(final: Path, content: bytes) -> None:
     """Write a small file atomically.
 
     Raises:
         HybridlogError: It cannot be written.
     """
     try:
-        files.write_file(final, content, depth=depth)
+        files.write_file(final, content)
     except OSError as error:
         raise explain(error, final, "writing") from error

@@ -1,12 +1,7 @@
 """File operations on a store, without following symlinks.
 
-A store may come from another user. So everything inside it is opened part by part,
-relative to the handle of its folder, and a symlink on the way is an error. The path to the
-store itself may contain symlinks: only the last `depth` parts of a path lie inside the
-store.
-
-A folder that is setgid and group-writable is shared: new files in it are group-writable,
-too, whatever the umask is.
+A store may come from another user. So a symlink in the place of a file or folder in it is an
+error. The path to the store itself may contain symlinks.
 
 A store in a bucket is read by the same functions: `mounted` knows who answers for its path, and
 nothing in it can be changed here. What is read of its files goes through `pread` and `preadv`,
@@ -34,16 +29,9 @@ from typing import Final, Protocol, cast
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.stopping import pause
 
-IN_STORE: Final = 1
-"""Depth of a file in the store's own folder."""
-IN_FOLDER: Final = 2
-"""Depth of a file in a folder of the store, or of a recording's folder."""
-IN_RECORDING: Final = 3
-"""Depth of a file of a recording."""
-
+_STORE = "hybridlog.toml"
+_LEVELS = 5  # of folders in a store
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-_SHARED = stat.S_ISGID | stat.S_IWGRP
-_GROUP = stat.S_IRWXG
 _POLL_S = 0.005  # between two looks at a lock
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 Identity = tuple[int, int]
@@ -123,78 +111,64 @@ class System:
         """Remove an empty folder."""
         os.rmdir(name, dir_fd=folder)
 
-    def chmod(self, fd: int, mode: int) -> None:
-        """Change the permissions of a file."""
-        os.fchmod(fd, mode)
-
 
 system: System = System()
 """The calls used by all functions here; looked up on each use."""
 
 
 @contextmanager
-def folder(path: Path, depth: int) -> Iterator[int]:
-    """The handle of a folder; the last `depth` parts of its path must not be symlinks.
-
-    Args:
-        path: The folder.
-        depth: Parts of the path that lie inside the store; 0 for the store's own folder.
+def folder(path: Path) -> Iterator[int]:
+    """The handle of a folder, which must be no symlink if it lies in a store.
 
     Raises:
         OSError: It does not exist, is not a folder, or is a symlink.
     """
-    outer, inner = _split(path, depth)
-    if outer in mounted:
+    if _mounted(path) is not None:
         raise OSError(errno.EROFS, "a store in a bucket cannot be changed like this", str(path))
-    fd = os.open(outer, _FOLDER)
     try:
-        for part in inner:
-            inside = os.open(part, _FOLDER | os.O_NOFOLLOW, dir_fd=fd)
-            os.close(fd)
-            fd = inside
+        fd = os.open(path, _FOLDER | os.O_NOFOLLOW)
+    except OSError as error:  # ELOOP in some systems
+        if error.errno not in {errno.ENOTDIR, errno.ELOOP} or _is_in_store(path):
+            raise
+        fd = os.open(path, _FOLDER)
+    try:
         yield fd
     finally:
         os.close(fd)
 
 
-def open_file(path: Path, flags: int, mode: int = 0o666, *, depth: int = IN_RECORDING) -> int:
+def _is_in_store(path: Path) -> bool:
+    return any(os.path.lexists(outer / _STORE) for outer in path.parents[:_LEVELS])
+
+
+def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
     """Open a file of a store without following symlinks.
 
     Args:
         path: The file.
         flags: As of `os.open`.
         mode: Permissions of a new file; the umask applies.
-        depth: Parts of the path that lie inside the store, including the file's name.
 
     Raises:
         OSError: As `os.open`; ELOOP or ENOTDIR for a symlink.
     """
-    outer, inner = _split(path, depth)
-    if outer in mounted and not flags & _WRITES:
-        return mounted[outer].open(inner)
-    with folder(path.parent, depth - 1) as fd:
-        opened = system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
-        try:
-            if flags & os.O_CREAT:
-                _let_group_in(fd, opened, mode)
-        except BaseException:
-            os.close(opened)
-            raise
-        return opened
+    if not flags & _WRITES and (found := _mounted(path)) is not None:
+        return found[0].open(found[1])
+    with folder(path.parent) as fd:
+        return system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
 
 
-def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
+def read_file(path: Path, most: int) -> bytes:
     """Read a small ordinary file.
 
     Args:
         path: The file.
         most: Largest expected size; one more byte is read to notice larger files.
-        depth: As for `open_file`.
 
     Raises:
         OSError: It cannot be read, or is not an ordinary file.
     """
-    fd = open_file(path, os.O_RDONLY | os.O_NONBLOCK, depth=depth)
+    fd = open_file(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file", str(path))
@@ -209,16 +183,14 @@ def read_file(path: Path, most: int, *, depth: int = IN_RECORDING) -> bytes:
         os.close(fd)
 
 
-def write_file(
-    path: Path, content: bytes, mode: int = 0o666, *, depth: int = IN_RECORDING, sync: bool = True
-) -> None:
+def write_file(path: Path, content: bytes, mode: int = 0o666, *, sync: bool = True) -> None:
     """Write a small file atomically. It replaces a file or symlink of its name.
 
     Raises:
         OSError: It cannot be written; no part of it remains.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode, depth=depth)
+    fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
         try:
             left = memoryview(content)
@@ -228,22 +200,21 @@ def write_file(
                 system.sync(fd)
         finally:
             os.close(fd)
-        rename(temporary, path, depth=depth)
+        rename(temporary, path)
     except BaseException:
         with suppress(OSError):
-            unlink(temporary, depth=depth)
+            unlink(temporary)
         raise
     if sync:
-        sync_folder(path.parent, depth=depth - 1)
+        sync_folder(path.parent)
 
 
 @contextmanager
-def locked_folder(path: Path, depth: int, wait_s: float = math.inf) -> Iterator[None]:
+def locked_folder(path: Path, wait_s: float = math.inf) -> Iterator[None]:
     """Lock a folder against other processes.
 
     Args:
         path: The folder.
-        depth: As for `folder`.
         wait_s: Seconds to wait for them; without end if not given.
 
     Raises:
@@ -251,7 +222,7 @@ def locked_folder(path: Path, depth: int, wait_s: float = math.inf) -> Iterator[
         OSError: The folder cannot be opened.
     """
     begun = time.monotonic()
-    with folder(path, depth) as fd:
+    with folder(path) as fd:
         while True:
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait_s == math.inf else fcntl.LOCK_NB))
@@ -263,41 +234,38 @@ def locked_folder(path: Path, depth: int, wait_s: float = math.inf) -> Iterator[
         yield
 
 
-def status(path: Path, *, depth: int = IN_RECORDING) -> os.stat_result:
+def status(path: Path) -> os.stat_result:
     """The status of a file or folder; of a symlink, that of the link itself.
 
     Raises:
         OSError: It does not exist.
     """
-    outer, inner = _split(path, depth)
-    if outer in mounted:
-        return mounted[outer].status(inner)
-    with folder(path.parent, depth - 1) as fd:
+    if (found := _mounted(path)) is not None:
+        return found[0].status(found[1])
+    with folder(path.parent) as fd:
         return os.stat(path.name, dir_fd=fd, follow_symlinks=False)
 
 
-def names(path: Path, *, depth: int) -> dict[str, os.stat_result]:
+def names(path: Path) -> dict[str, os.stat_result]:
     """The status of each entry of a folder, by name.
 
     Raises:
         OSError: It cannot be read.
     """
-    outer, inner = _split(path, depth)
-    if outer in mounted:
-        return mounted[outer].names(inner)
-    with folder(path, depth) as fd:
+    if (found := _mounted(path)) is not None:
+        return found[0].names(found[1])
+    with folder(path) as fd:
         return names_in(fd)
 
 
 def changed_names(
-    path: Path, before: Identity | None, *, depth: int
+    path: Path, before: Identity | None
 ) -> tuple[Identity, dict[str, os.stat_result] | None]:
     """The status of each entry of a folder, by name, if it may have changed.
 
     Args:
         path: The folder.
         before: What this returned first when it was read; None if it never was.
-        depth: As for `names`.
 
     Returns:
         Inode of the folder and time of its last change, ns, and None for entries as before.
@@ -305,12 +273,11 @@ def changed_names(
     Raises:
         OSError: It cannot be read.
     """
-    outer, inner = _split(path, depth)
-    if outer in mounted:
-        about = mounted[outer].status(inner)
+    if (found := _mounted(path)) is not None:
+        about = found[0].status(found[1])
         now = about.st_ino, about.st_mtime_ns
-        return now, None if now == before else mounted[outer].names(inner)
-    with folder(path, depth) as fd:
+        return now, None if now == before else found[0].names(found[1])
+    with folder(path) as fd:
         about = os.fstat(fd)
         now = about.st_ino, about.st_mtime_ns
         return now, None if now == before else names_in(fd)
@@ -374,99 +341,71 @@ def most_open(most: int) -> int:
     return most if allowed < 0 else max(min(most, allowed // 8), 4)
 
 
-def make_folder(path: Path, mode: int = 0o777, *, depth: int) -> None:
+def make_folder(path: Path, mode: int = 0o777) -> None:
     """Create a folder; the umask applies.
 
     Raises:
         OSError: It exists, or cannot be created.
     """
-    with folder(path.parent, depth - 1) as fd:
+    with folder(path.parent) as fd:
         system.mkdir(path.name, mode, folder=fd)
-        made = os.open(path.name, _FOLDER | os.O_NOFOLLOW, dir_fd=fd)
-        try:
-            _let_group_in(fd, made, mode)
-        finally:
-            os.close(made)
 
 
-def rename(
-    old: Path, new: Path, *, depth: int = IN_RECORDING, new_depth: int | None = None
-) -> None:
-    """Give a file or a folder of the store another name.
-
-    Args:
-        old: Its name.
-        new: The name it gets; in another folder, too, if `new_depth` is given.
-        depth: As for `open_file`.
-        new_depth: The same of `new`.
+def rename(old: Path, new: Path) -> None:
+    """Give a file or a folder of the store another name, in another folder, too.
 
     Raises:
         OSError: It does not exist, or cannot be renamed.
     """
-    with folder(old.parent, depth - 1) as fd:
-        if new_depth is None:
-            system.rename(old.name, new.name, folder=fd, new_folder=fd)
-            return
-        with folder(new.parent, new_depth - 1) as new_fd:
-            system.rename(old.name, new.name, folder=fd, new_folder=new_fd)
+    with folder(old.parent) as fd, folder(new.parent) as new_fd:
+        system.rename(old.name, new.name, folder=fd, new_folder=new_fd)
 
 
-def link(old: Path, new: Path, *, depth: int = IN_RECORDING, new_depth: int) -> None:
+def link(old: Path, new: Path) -> None:
     """Give a file of the store a second name.
 
     Raises:
         OSError: It does not exist, or the file system has no links.
     """
-    with folder(old.parent, depth - 1) as fd, folder(new.parent, new_depth - 1) as new_fd:
+    with folder(old.parent) as fd, folder(new.parent) as new_fd:
         system.link(old.name, new.name, folder=fd, new_folder=new_fd)
 
 
-def unlink(path: Path, *, depth: int = IN_RECORDING) -> None:
+def unlink(path: Path) -> None:
     """Remove a file.
 
     Raises:
         OSError: It does not exist, or cannot be removed.
     """
-    with folder(path.parent, depth - 1) as fd:
+    with folder(path.parent) as fd:
         system.unlink(path.name, folder=fd)
 
 
-def sync_folder(path: Path, *, depth: int = IN_FOLDER) -> None:
+def sync_folder(path: Path) -> None:
     """Force renames, new names and removals in a folder to the disk."""
-    with folder(path, depth) as fd:
+    with folder(path) as fd:
         system.sync(fd)
 
 
-def make_folders(path: Path, *, depth: int) -> None:
-    """Make a folder and those above it, as far as they are missing.
+def make_folders(path: Path) -> None:
+    """Make a folder and the one above it, as far as they are missing.
 
     Raises:
         OSError: One cannot be made.
     """
-    for level in range(depth):
-        place = Path(*path.parts[: len(path.parts) - depth + level + 1])
+    for place in (path.parent, path):
         with suppress(FileExistsError):
-            make_folder(place, depth=level + 1)
+            make_folder(place)
 
 
-def remove_tree(path: Path, *, depth: int) -> None:
+def remove_tree(path: Path) -> None:
     """Remove a folder and its content; ignore what does not exist.
 
     Raises:
         OSError: Something cannot be removed.
     """
-    with folder(path.parent, depth - 1) as fd:
+    with folder(path.parent) as fd:
         _remove(fd, path.name)
-
-
-def _let_group_in(parent: int, fd: int, mode: int) -> None:
-    """In a shared folder, give the group the requested permissions of this user's file."""
-    if os.fstat(parent).st_mode & _SHARED != _SHARED:
-        return
-    about = os.fstat(fd)
-    wanted = about.st_mode | (mode & _GROUP)
-    if wanted != about.st_mode and about.st_uid == os.geteuid():
-        system.chmod(fd, stat.S_IMODE(wanted))
 
 
 def _remove(parent: int, name: str) -> None:
@@ -487,11 +426,13 @@ def _remove(parent: int, name: str) -> None:
         system.rmdir(name, folder=parent)
 
 
-def _split(path: Path, depth: int) -> tuple[Path, tuple[str, ...]]:
-    """Split a path into the part outside of the store and the names inside."""
-    if depth <= 0:
-        return path, ()
-    return Path(*path.parts[:-depth]), path.parts[-depth:]
+def _mounted(path: Path) -> tuple[Mounted, tuple[str, ...]] | None:
+    """The store that is no directory and has a path, and the names on the way in it."""
+    if mounted:
+        for outer in (path, *path.parents):
+            if outer in mounted:
+                return mounted[outer], path.parts[len(outer.parts) :]
+    return None
 
 
 def user_directory(variable: str, below_home: str, purpose: str) -> Path:

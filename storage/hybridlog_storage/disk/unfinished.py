@@ -46,7 +46,7 @@ class Unfinished:
         """
         from hybridlog_storage.disk.durability import publish
 
-        publish(self.path, final, depth=1)
+        publish(self.path, final)
         _published.add(final)
         self.remove()
 

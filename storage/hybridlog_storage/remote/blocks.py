@@ -24,7 +24,6 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import ObjectChangedError, ResourceError
 from hybridlog_storage.remote.bucket import Bucket, Object, joined_ranges
-from hybridlog_storage.threads import taken_by_forks
 
 MAX_CACHED: Final = 16 << 30
 """Bytes that the cached blocks of a user may take."""
@@ -66,7 +65,7 @@ class Blocks:
         self.about = about
         named = "\n".join([bucket.address, about.name, about.version, str(about.size)])
         self._path = cache.path / hashlib.sha256(named.encode()).hexdigest()[:40]
-        self._lock = taken_by_forks(threading.Lock())
+        self._lock = threading.Lock()
         self._proved: set[int] = set()
         self._inode = -1
         self._next = -1  # the block behind the last one that was fetched
@@ -184,7 +183,7 @@ class BlockCache:
         self._most = most
         self._since_check = _CHECK_EVERY
         self._known: WeakValueDictionary[tuple[str, Object], Blocks] = WeakValueDictionary()
-        self._lock = taken_by_forks(threading.Lock())
+        self._lock = threading.Lock()
 
     def open(self, bucket: Bucket, about: Object) -> CachedFile:
         """A handle of the cached file of an object.

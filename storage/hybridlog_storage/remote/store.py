@@ -46,7 +46,6 @@ from hybridlog_storage.remote.lists import (
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.settings import EXPIRED, NONE, StoreSettings, read_settings, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
-from hybridlog_storage.threads import taken_by_forks
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for a newer list, unless this process changes something."""
@@ -80,7 +79,7 @@ class BucketFiles:
         self._looked_at = 0.0
         self._tables: tuple[Any, _Node] = None, {}  # of what list, and as folders
         self._compared: set[str] = set()
-        self.lock = taken_by_forks(threading.RLock())
+        self.lock = threading.RLock()
         self.is_changing = False
 
     # Lists.
@@ -285,7 +284,7 @@ class BucketFiles:
         return "/".join([self.bucket.address, *inner])
 
 
-_mounting = taken_by_forks(threading.Lock())
+_mounting = threading.Lock()
 
 
 def mount(address: str, cache: BlockCache | None = None) -> BucketFiles:

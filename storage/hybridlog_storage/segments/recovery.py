@@ -464,7 +464,7 @@ def recover_segment(
         if found is None:
             return _rebuild(path, number, on_sealed, recording)
         on_sealed(found)
-        durability.publish(path, final, depth=files.IN_RECORDING)
+        durability.publish(path, final)
         return Recovered(final, sum(channel.messages for channel in found.channels))
     except OSError as error:
         raise durability.explain(error, path, "recovering") from error
@@ -556,7 +556,7 @@ def rebuild_summary(path: Path, digest: str) -> bool:
         try:
             if not _is_rebuilt(copy, number, digest):
                 return False
-            durability.publish(copy, path, depth=files.IN_RECORDING)
+            durability.publish(copy, path)
             return True
         finally:
             with suppress(FileNotFoundError):

@@ -24,14 +24,6 @@ from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Offer
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
-from hybridlog.live.sources.ros2.child.publication_gaps import (
-    MAX_GAPS,
-    RECOVERED_AFTER,
-    SUSPICIOUS_NS,
-    Loss,
-    MiddlewareLossCounter,
-    PublicationGapDetector,
-)
 from hybridlog.live.sources.ros2.child.qos import (
     BEST_EFFORT,
     DEPTH,
@@ -55,160 +47,10 @@ from tests.imports import ROOT, imports_of
 from tests.limits import Limit
 from tests.live.sources.ros2_peers import Memory
 
+GAPS = "hybridlog.live.sources.sequence_gaps"
 CHILD = "hybridlog.live.sources.ros2.child"
 FOLDER = ROOT.joinpath(*CHILD.split("."))
 A, B = b"a" * 16, b"b" * 16
-
-
-# PublicationGapDetector.
-
-
-def seen(numbers: PublicationGapDetector, *sent: int, publisher: bytes = A) -> list[bool]:
-    return [numbers.see(publisher, number, 100 * number) for number in sent]
-
-
-def test_a_gap_is_told_at_the_second_look() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 5, 6, 9, 10)
-    assert numbers.losses() == []
-    assert numbers.losses() == [Loss(A, 2, 600, 900)]
-    assert numbers.losses() == []
-
-
-def test_the_last_look_does_not_wait() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 1, 4)
-    assert numbers.losses(final=True) == [Loss(A, 2, 100, 400)]
-
-
-def test_publishers_are_told_apart() -> None:
-    numbers = PublicationGapDetector()
-    for number in range(1, 6):
-        seen(numbers, number)
-        seen(numbers, number + 1000, publisher=B)
-    seen(numbers, 1007, publisher=B)
-    assert numbers.losses(final=True) == [Loss(B, 1, 100500, 100700)]
-
-
-@pytest.mark.parametrize("late", [2, 3, 4])
-def test_a_late_message_fills_its_gap(late: int) -> None:
-    numbers = PublicationGapDetector()
-    assert all(seen(numbers, 1, 5, late, 6))
-    numbers.losses()
-    assert [loss.missing for loss in numbers.losses()] == [2]
-
-
-def test_numbers_that_begin_anew_are_no_loss() -> None:
-    numbers = PublicationGapDetector()
-    assert all(seen(numbers, 500, 501, 1, 2, 3))
-    assert numbers.losses(final=True) == []
-
-
-def test_what_comes_twice_is_taken_once_while_two_subscriptions_run() -> None:
-    numbers = PublicationGapDetector()
-    assert all(seen(numbers, 1, 2, 3))
-    numbers.is_doubled = True
-    assert seen(numbers, 2, 3, 4, 4, 6, 5) == [False, False, True, False, True, True]
-    assert numbers.losses(final=True) == []
-
-
-def test_a_jump_that_no_robot_makes_is_no_count() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 1, 2**60)
-    assert numbers.losses() == [Loss(A, None, 100, 100 * 2**60)]
-
-
-def test_gaps_that_wait_are_bounded_and_none_is_forgotten() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, *range(0, 6 * MAX_GAPS, 2))
-    assert len(numbers._gaps) <= MAX_GAPS
-    lost = sum(loss.missing or 0 for loss in numbers.losses(final=True))
-    assert lost == 3 * MAX_GAPS - 1
-
-
-def test_unsure_gaps_are_dropped_when_numbers_begin_anew() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 1, 5)
-    numbers.reset()
-    assert numbers.losses(final=True) == []
-
-
-def test_times_of_a_gap_are_in_order_when_those_of_messages_are_not() -> None:
-    numbers = PublicationGapDetector()
-    numbers.see(A, 1, 500)
-    numbers.see(A, 4, 300)
-    assert numbers.losses(final=True) == [Loss(A, 2, 300, 500)]
-
-
-def test_who_goes_while_messages_are_lost_may_have_lost_the_last() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 1, 5, 6)
-    seen(numbers, 1, 2, publisher=B)
-    loss = numbers.suspect(A, 10_000)
-    assert loss is not None
-    assert loss[:4] == (A, None, 600, 10_000)
-    assert numbers.suspect(A, 10_000) is None
-    assert numbers.suspect(B, 10_000) is None
-    assert numbers.suspect(b"nobody", 10_000) is None
-
-
-def test_who_was_heard_well_at_the_end_is_not_suspected() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 1, 5, *range(6, 6 + RECOVERED_AFTER))
-    assert numbers.suspect(A, 10_000) is None
-    numbers.see(B, 1, 0)
-    numbers.see(B, 3, 1)
-    numbers.see(B, 4, 2 + SUSPICIOUS_NS)
-    assert numbers.suspect(B, 10**18) is None
-    seen(numbers, 50, 100)
-    assert numbers.suspect(A, 100 * 100) is None
-
-
-def test_who_speaks_out_of_order_is_not_suspected() -> None:
-    numbers = PublicationGapDetector()
-    seen(numbers, 1, 3, 2)
-    assert numbers.suspect(A, 10_000) is None
-
-
-# What the middleware says.
-
-
-def test_what_the_middleware_says_of_gaps_is_not_told_twice() -> None:
-    told = MiddlewareLossCounter()
-    told.add(5)
-    assert told.unexplained(5, final=False) == 0
-    assert told.unreported(5) == 5
-    assert [told.unexplained(0, final=False) for _ in range(9)] == [0] * 9
-    assert told.unexplained(0, final=True) == 0
-
-
-def test_losses_before_the_first_message_are_told() -> None:
-    told = MiddlewareLossCounter()
-    told.add(3)
-    assert told.before_first(2) == 2
-    assert told.unexplained(0, final=True) == 1
-    told = MiddlewareLossCounter()
-    told.add(3)
-    assert told.before_first(100) == 3
-    assert told.unexplained(0, final=True) == 0
-
-
-def test_losses_after_the_last_message_are_told_after_a_while_and_once() -> None:
-    told = MiddlewareLossCounter()
-    told.add(2)
-    assert [told.unexplained(0, final=False) for _ in range(8)] == [0, 0, 0, 2, 0, 0, 0, 0]
-    # Now one comes, and shows the gap.
-    told.add(1)
-    assert told.unreported(3) == 1
-    assert told.unexplained(0, final=True) == 0
-
-
-def test_gaps_that_the_middleware_does_not_know_of_excuse_no_later_loss() -> None:
-    told = MiddlewareLossCounter()
-    assert told.unreported(10) == 10
-    assert told.unexplained(0, final=False) == 0
-    told.add(4)
-    assert told.unexplained(0, final=True) == 4
 
 
 # The profile.
@@ -501,16 +343,10 @@ class FakeSubscription:
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
         self.queue: list[tuple[bytes, dict[str, Any]]] = []
-        self.told = 0
-        self.tells_losses = self.tells_all = True
         self.is_closed = False
 
     def take(self) -> tuple[bytes, dict[str, Any]] | None:
         return self.queue.pop(0) if self.queue else None
-
-    def losses(self) -> int:
-        told, self.told = self.told, 0
-        return told
 
     def close(self) -> None:
         self.is_closed = True
@@ -579,7 +415,7 @@ class Rig:
                 "a/msg/Bad.msg": "",
             },
         )
-        self.topics = Topics(self.ros, self.sender, found, overrides or {})
+        self.topics = Topics(self.ros, self.box, self.sender, found, overrides or {})
         self.child = Child(self.ros, self.topics, self.box, self.sender)
 
     def told(self, kind: str) -> list[dict[str, Any]]:
@@ -650,44 +486,31 @@ def test_a_publisher_that_offers_less_is_heard_too(tmp_path: Path) -> None:
     rig.ros.graph = {("/t", "a/msg/T"): [offer()]}
     rig.topics.look()
     rig.topics.subscribe("/t", "a/msg/T")
+    rig.ros.made[0].queue = [(b"1", info(1)), (b"2", info(2))]
     rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, reliability=BEST_EFFORT)]}
     rig.topics.look()
     old, new = rig.ros.made
     assert new.profile.reliability == BEST_EFFORT
-    assert not old.is_closed
-    old.queue = [(b"1", info(1)), (b"2", info(2))]
-    new.queue = [(b"2", info(2)), (b"x", info(1, B)), (b"3", info(3))]
+    assert old.is_closed
+    # What the old one held was taken before; what came between is counted.
+    new.queue = [(b"x", info(1, B)), (b"5", info(5)), (b"6", info(6))]
     rig.child._take(0.0)
-    old.queue = [(b"3", info(3)), (b"4", info(4))]
-    new.queue = [(b"4", info(4))]
-    rig.child._take(0.0)
-    assert [message[1] for message in rig.messages] == [b"1", b"2", b"x", b"3", b"4"]
+    assert [message[1] for message in rig.messages] == [b"1", b"2", b"x", b"5", b"6"]
     assert len(rig.told("channel")) == 2
-    assert rig.messages[-1][0] == 1
-    rig.topics.doubled[0].stream._old_until = 0.0  # type: ignore[union-attr]
-    rig.child._take(0.0)
-    assert old.is_closed
-    # What the new one has of the time before may come late.
-    new.queue = [(b"2", info(2)), (b"5", info(5))]
-    rig.child._take(0.0)
-    assert [message[1] for message in rig.messages[5:]] == [b"5"]
     rig.topics.account(final=True)
-    assert not rig.told("lost")
+    assert [(lost["topic"], lost["count"]) for lost in rig.told("lost")] == [("/t", 2)]
 
 
-def test_without_names_the_old_subscription_is_emptied_and_closed(tmp_path: Path) -> None:
+def test_a_topic_that_cannot_be_subscribed_to_again_is_said_to_be_lost(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
-    unnamed(rig, 1)
-    rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, durability=3, reliability=BEST_EFFORT)]}
+    rig.ros.subscribe = lambda *_: 1 / 0
+    rig.ros.graph = {("/t", "a/msg/T"): [offer(), offer(B, reliability=BEST_EFFORT)]}
     rig.topics.look()
-    old, new = rig.ros.made
-    old.queue = [(b"2", info(2, None))]
-    new.queue = [(b"3", info(3, None))]
-    rig.child._take(0.0)
-    assert old.is_closed
     rig.topics.look()
-    assert not rig.topics.doubled
-    assert [message[1] for message in rig.messages] == [b"", b"2", b"3"]
+    rig.topics.account(final=True)
+    assert "cannot subscribe again" in rig.told("say")[0]["text"]
+    [lost] = rig.told("lost")
+    assert (lost["topic"], lost["cause"], lost["count"]) == ("/t", "unreadable", None)
 
 
 def test_what_overrides_exclude_is_said(tmp_path: Path) -> None:
@@ -753,87 +576,25 @@ def test_losses_name_the_publisher(tmp_path: Path) -> None:
     ]
 
 
-def test_the_last_messages_of_who_goes_in_an_overload_are_feared_for(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer(node="/one"), offer(B, node="/two"))
-    rig.ros.made[0].queue = [
-        *((b"", info(number, A)) for number in (1, 5, 6)),
-        *((b"", info(number, B)) for number in (1, 2, 3)),
-    ]
+@pytest.mark.parametrize("late", [[3], [3, 4], [2, 1]])
+def test_a_late_message_is_stored_and_no_loss(tmp_path: Path, late: list[int]) -> None:
+    rig = live_topic(tmp_path, offer())
+    rig.ros.made[0].queue = [(b"", info(number)) for number in (1, 2, 5, *late, 6, 7)]
     rig.child._take(0.0)
-    rig.topics.look()
-    rig.ros.graph = {("/t", "a/msg/T"): [offer(B, node="/two")]}
-    rig.topics.look()
-    rig.topics.account(final=True)
-    rows = [(lost["count"], lost["detail"]) for lost in rig.told("lost")]
-    assert rows == [
-        (None, "from /one, after its last message, probably"),
-        (3, "from /one"),
-    ]
-
-
-@pytest.mark.parametrize("gid", [A, None])
-@pytest.mark.parametrize(
-    ("reliability", "ago", "feared"),
-    [(RELIABLE, 1, True), (RELIABLE, 5, False), (BEST_EFFORT, 5, True)],
-)
-def test_what_a_silent_publisher_sent_last_at_the_end(
-    tmp_path: Path, gid: bytes | None, reliability: int, ago: int, feared: bool
-) -> None:
-    rig = live_topic(tmp_path, offer(reliability=reliability))
-    at = time.time_ns() - ago * 10**9
-    rig.ros.made[0].queue = [(b"", info(n, gid, received_timestamp=at)) for n in (1, 5)]
-    rig.child._take(0.0)
-    rig.topics.end()
-    rig.topics.account(final=True)
-    counts = [lost["count"] for lost in rig.told("lost")]
-    assert counts == ([None, 3] if feared else [3])
-
-
-def test_the_end_waits_for_those_that_spoke_a_moment_ago(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer(), offer(B))
-    assert rig.topics.has_caught_up()
-    old = time.time_ns() - 2 * 10**9
-    rig.ros.made[0].queue = [(b"", info(1)), (b"", info(1, B, received_timestamp=old))]
-    rig.child._take(0.0)
-    rig.topics.end()
-    assert not rig.topics.has_caught_up()
-    rig.ros.made[0].queue = [(b"", info(4))]
-    rig.child._take(0.0)
-    assert rig.topics.has_caught_up()
     rig.topics.account(final=True)
     assert [lost["count"] for lost in rig.told("lost")] == [2]
+    assert len(rig.messages) == 5 + len(late)
 
 
-def test_what_the_middleware_lost_before_and_after_is_told(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer(node="/one"))
-    made = rig.ros.made[0]
-    made.told = 2
-    # Of the nine before the first, seven were sent before anybody listened.
-    made.queue = [(b"", info(number)) for number in (10, 11, 14)]
-    rig.child._take(0.0)
-    made.told = 2 + 5
-    rig.topics.look()
-    rig.topics.look()
-    rig.topics.account(final=True)
-    assert [(lost["count"], lost["detail"].partition(", ")[2]) for lost in rig.told("lost")] == [
-        (2, "before the first message that came"),
-        (2, ""),
-        (None, "after its last message, probably"),
-        (5, "before the first message that came or after the last, as the middleware counts"),
-    ]
-    assert all(lost["detail"].startswith("from /one") for lost in rig.told("lost"))
-
-
-def test_other_middlewares_are_believed_where_there_are_no_numbers_only(tmp_path: Path) -> None:
+def test_times_of_a_gap_are_in_order_when_those_of_messages_are_not(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
-    made = rig.ros.made[0]
-    made.tells_all = False
-    made.told = 9
-    made.queue = [(b"", info(number)) for number in range(10, 30)]
+    now = time.time_ns()
+    times = [(1, now), (4, now - 200)]
+    rig.ros.made[0].queue = [(b"", info(n, received_timestamp=at)) for n, at in times]
     rig.child._take(0.0)
-    made.told = 9
-    rig.topics.account(final=True)
-    assert not rig.told("lost")
+    rig.topics.look()
+    [lost] = rig.told("lost")
+    assert (lost["count"], lost["first"], lost["last"]) == (2, now - 200, now)
 
 
 def unnamed(rig: Rig, *numbers: int) -> None:
@@ -867,27 +628,13 @@ def test_without_names_nobody_is_accused_when_publishers_change(tmp_path: Path) 
     assert len(rig.messages) == 8
 
 
-def test_without_names_the_middleware_is_believed_of_several(tmp_path: Path) -> None:
-    rig = live_topic(tmp_path, offer(), offer(B))
-    unnamed(rig, 1, 500, 4, 502)
-    rig.ros.made[0].told = 3
-    rig.topics.account(final=True)
-    [lost] = rig.told("lost")
-    assert (lost["count"], lost["detail"]) == (3, "as the middleware counts")
-
-
-def test_without_numbers_the_middleware_is_believed(tmp_path: Path) -> None:
+def test_without_numbers_nothing_is_counted(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer())
     rig.ros.made[0].queue = [(b"", info(None))]
     rig.child._take(0.0)
-    rig.ros.made[0].told = 4
     rig.topics.look()
-    [lost] = rig.told("lost")
-    assert (lost["cause"], lost["count"]) == ("transport", 4)
+    assert not rig.told("lost")
     assert rig.messages[0][4] == -1
-    assert not rig.told("say")
-    rig.ros.made[0].tells_losses = False
-    rig.topics.look()
     assert "does not number messages" in rig.told("say")[0]["text"]
 
 
@@ -1045,14 +792,15 @@ def test_the_child_runs_under_older_pythons_and_with_nothing_installed() -> None
     assert sorted(modules) == sorted(
         path.stem for path in FOLDER.glob("*.py") if path.stem != "__init__"
     )
-    for name in modules:
-        path = FOLDER / f"{name}.py"
+    gaps = ROOT.joinpath(*GAPS.split(".")).with_suffix(".py")
+    for name in [*modules, GAPS]:
+        path = gaps if name == GAPS else FOLDER / f"{name}.py"
         ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 10))
         for used in imports_of(path, f"{CHILD}.{name}"):
             top = used.module.partition(".")[0]
             assert (
                 used.typing
                 or top in sys.stdlib_module_names
-                or used.module.startswith(f"{CHILD}.")
+                or used.module.startswith((f"{CHILD}.", GAPS))
                 or (name, top) == ("middleware", "rclpy")
             ), f"{name} imports {used.module}"

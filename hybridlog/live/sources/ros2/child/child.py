@@ -32,7 +32,7 @@ _SMALL_COUNT = 64
 _SMALL_BYTES = 1 << 20
 _SEND_BYTES = 1 << 20
 _SHORT_WAIT_S = 0.01
-_CATCH_UP_S = 0.5
+_DRAIN_S = 0.5
 _FLUSH_S = 2.0
 
 
@@ -85,7 +85,7 @@ class Child:
                 # A new recorder needs the existing topics at once.
                 next_look = now + (_FIRST_LOOKS_S if now - began < _EAGER_S else _LOOK_S)
             wait = 0.0
-            if self._outbox.send() and not self._topics.doubled:
+            if self._outbox.send():
                 wait = max(0.0, min(_IDLE_S, next_look - time.monotonic()))
             count, size = self._take(wait)
             if not self._outbox.send():
@@ -104,8 +104,7 @@ class Child:
         ready = self._middleware.wait(wait)
         owners = self._topics.owners
         count = size = 0
-        # Topics with two subscriptions are always visited, to close one in time.
-        for topic in dict.fromkeys([*(owners[found] for found in ready), *self._topics.doubled]):
+        for topic in [owners[found] for found in ready]:
             assert topic.stream is not None
             try:
                 taken, taken_size = topic.stream.take(self._outbox)
@@ -124,11 +123,8 @@ class Child:
 
     def _finish(self, writable: select.poll) -> None:
         """Passes on the messages received so far, for a limited time."""
-        self._topics.end()
-        deadline = time.monotonic() + _CATCH_UP_S
-        while self._take(_SHORT_WAIT_S)[0] >= _SMALL_COUNT or not self._topics.has_caught_up():
-            if time.monotonic() >= deadline:
-                break
+        deadline = time.monotonic() + _DRAIN_S
+        while self._take(_SHORT_WAIT_S)[0] >= _SMALL_COUNT and time.monotonic() < deadline:
             if not self._outbox.send():
                 writable.poll(2)
         self._topics.account(final=True)
@@ -162,7 +158,7 @@ def run(number: int) -> int:
         outbox.send()
         return 1
     overrides = settings.get("overrides", {})
-    topics = Topics(middleware, events, Definitions(share_folders()), overrides)
+    topics = Topics(middleware, outbox, events, Definitions(share_folders()), overrides)
     child = Child(middleware, topics, outbox, events)
     events.hello(middleware.implementation)
     signal.signal(signal.SIGTERM, lambda _number, _frame: child.stop())

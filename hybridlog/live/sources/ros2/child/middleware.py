@@ -50,8 +50,6 @@ class Subscription:
         profile: Requested quality of service.
         node: The rclpy node that it belongs to.
         topic_and_type: Its topic and type.
-        tells_all: The middleware also counts losses before the first message and after the
-            last, but no message from before the subscription.
         take: Returns the next message and its information, None if there is none.
     """
 
@@ -67,27 +65,9 @@ class Subscription:
         self.handle = handle.handle
         self._middleware = middleware
         self._subscription = handle
-        self._losses = middleware.losses_of(self.handle)
-        # Other middlewares may count differently.
-        self.tells_all = middleware.implementation.startswith("rmw_fastrtps")
-
-    @property
-    def tells_losses(self) -> bool:
-        """True if the middleware counts losses."""
-        return self._losses is not None
-
-    def losses(self) -> int:
-        """Messages lost since the last call, as the middleware counts them."""
-        if self._losses is None:
-            return 0
-        status = self._losses.take_event()
-        return 0 if status is None else int(status.total_count_change)
 
     def close(self) -> None:
         """Ends the subscription; messages that were not taken are gone."""
-        if self._losses is not None:
-            self._losses.destroy_when_not_in_use()
-            self._losses = None
         self._middleware.remove(self, self._subscription)
 
 
@@ -222,16 +202,6 @@ class Middleware:
         self._open = [other for other in self._open if other is not subscription]
         self._wait_set = None
         subscription.node.destroy_subscription(inner)
-
-    def losses_of(self, handle: Any) -> Any:
-        """The rclpy event of lost messages, None if it is not supported."""
-        if not hasattr(self._native, "EventHandle"):
-            return None  # Humble
-        kinds = self._native.rcl_subscription_event_type_t
-        try:
-            return self._native.EventHandle(handle, kinds.RCL_SUBSCRIPTION_MESSAGE_LOST)
-        except self._native.UnsupportedEventTypeError:
-            return None
 
     def wait(self, seconds: float) -> list[Subscription]:
         """Waits until some subscriptions have messages, with a time limit.

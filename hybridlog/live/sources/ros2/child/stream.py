@@ -1,7 +1,9 @@
 """The messages of one recorded topic and type: subscription, channel, lost messages.
 
-A new publisher may be incompatible with the subscription. Then a second subscription is
-made that is compatible with all. For a while both run, and repeated messages are dropped.
+The middleware of each publisher numbers its messages one by one. A number that is passed over is
+a message that was lost in transport or in a queue; the first number of a publisher begins its
+count. If messages do not name their publisher, numbers count only while the topic has had the
+same single publisher.
 """
 
 from __future__ import annotations
@@ -10,13 +12,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.middleware import publisher_id
-from hybridlog.live.sources.ros2.child.publication_gaps import (
-    MAX_PUBLISHERS,
-    Loss,
-    MiddlewareLossCounter,
-    PublicationGapDetector,
+from hybridlog.live.sources.sequence_gaps import (
+    MODULUS,
+    SequenceGap,
+    SequenceGapDetector,
+    joined_gap,
 )
-from hybridlog.live.sources.ros2.child.qos import RELIABLE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,22 +25,14 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros2.child.middleware import Offer, Subscription
     from hybridlog.live.sources.ros2.child.outbox import Outbox
 
+MAX_PUBLISHERS = 1024
+"""Maximum number of publishers of a topic whose numbers are remembered after they are gone."""
+
+MAX_GAP = MODULUS // 2
+"""Largest number of missing messages; a number that is further on is one that went back."""
+
 _MAX_MESSAGES = 1000
 _BYTES_AT_ONCE = 8 << 20
-
-_UNSURE_S = 30.0
-"""Time after a new subscription in which durable messages may come again, seconds."""
-
-_REPAIR_NS = 4_000_000_000
-"""Time in which a reliable publisher announces the number of its messages, ns.
-
-Fast DDS does so every three seconds.
-"""
-
-_COUNTED = "as the middleware counts"
-_HEAD = "before the first message that came"
-_OUTSIDE = "before the first message that came or after the last, as the middleware counts"
-
 _OLDEST = 60_000_000_000
 _NEWEST = 1_000_000_000
 _MAX_INT = 2**63 - 1
@@ -55,6 +48,7 @@ class Stream:
         look_again: Updates `channels`: a publisher is not among them.
 
     Attributes:
+        subscription: The subscription; the owner closes it, and puts another in its place.
         named: Messages name their publisher; True until one does not.
         numbered: Messages have numbers; True until one does not.
         alone: The topic has had the same single publisher since its count began.
@@ -77,52 +71,9 @@ class Stream:
         self.named = True
         self.numbered = True
         self.alone = len(offers) == 1
-        self._old: Subscription | None = None
-        self._old_until = 0.0
-        self._unsure_until = 0.0
-        self._gaps = PublicationGapDetector()
-        self._middleware_losses = MiddlewareLossCounter()
-        self._heads: list[Loss] = []
+        self._gaps: dict[bytes, SequenceGapDetector] = {}
+        self._unsure: list[tuple[bytes, SequenceGap]] = []  # they wait for a look at the graph
         self._publishers = frozenset(offer.publisher for offer in offers)
-        self._reliable = _reliable(offers)
-
-    @property
-    def subscriptions(self) -> list[Subscription]:
-        """Open subscriptions, the older one first: its messages are taken first."""
-        return [sub for sub in (self._old, self.subscription) if sub is not None]
-
-    def replace(self, subscription: Subscription, seconds: float) -> None:
-        """Changes to another subscription.
-
-        Args:
-            subscription: The new, open subscription.
-            seconds: Time for which the old one runs beside it. If messages lack publisher
-                or number, repetitions cannot be detected; then the old one is closed as
-                soon as it is empty.
-        """
-        self.close_old()
-        self._count_losses()
-        self._old, self.subscription = self.subscription, subscription
-        now = time.monotonic()
-        tells_twice = self.named and self.numbered
-        self._gaps.is_doubled = tells_twice
-        self._old_until = now + seconds if tells_twice else now
-        self._unsure_until = now + _UNSURE_S
-
-    def close_old(self) -> None:
-        """Closes the old subscription."""
-        if self._old is not None:
-            self._count_losses()
-            self._old.close()
-            self._old = None
-
-    def _count_losses(self) -> int:
-        """Adds the losses that the middleware counts; returns those since the last call."""
-        counted = self.subscription.losses()
-        # A message that one of two subscriptions lost may have come through the other.
-        if self._old is None and self.subscription.tells_all:
-            self._middleware_losses.add(counted)
-        return counted
 
     def take(self, outbox: Outbox) -> tuple[int, int]:
         """Takes available messages, up to a limit for the sake of other topics.
@@ -133,16 +84,7 @@ class Stream:
         Raises:
             Exception: Any error of rclpy.
         """
-        if self._old is not None:
-            count, size = self._take(self._old, outbox)
-            if count < _MAX_MESSAGES and time.monotonic() >= self._old_until:
-                self.close_old()
-            more, more_size = self._take(self.subscription, outbox)
-            return count + more, size + more_size
-        return self._take(self.subscription, outbox)
-
-    def _take(self, subscription: Subscription, outbox: Outbox) -> tuple[int, int]:
-        take, put, gaps = subscription.take, outbox.message, self._gaps
+        take, put = self.subscription.take, outbox.message
         count = size = 0
         while count < _MAX_MESSAGES and size < _BYTES_AT_ONCE:
             got = take()
@@ -162,12 +104,20 @@ class Stream:
                 publisher, is_usable = publisher_id(gid["data"]), number >= 0
                 found = self.channels.get(publisher)
                 channel = self._meet(publisher) if found is None else found
-            if is_usable and publisher not in gaps:
-                self._begin(publisher, number, received)
-            if not is_usable or gaps.see(publisher, number, received):
-                sent = info["source_timestamp"]
-                put(channel, payload, received, sent if 0 < sent <= _MAX_INT else 0, number)
+            if is_usable:
+                self._count(publisher, number, received)
+            sent = info["source_timestamp"]
+            put(channel, payload, received, sent if 0 < sent <= _MAX_INT else 0, number)
         return count, size
+
+    def _count(self, publisher: bytes, number: int, received: int) -> None:
+        gaps = self._gaps.get(publisher)
+        if gaps is None:
+            gaps = SequenceGapDetector(trust_after=0, confirm_after=0, max_gap=MAX_GAP)
+            self._gaps[publisher] = gaps
+        # A number that goes back is a late message, which is no loss.
+        if gaps.expected < 0 or (number - gaps.expected) % MODULUS <= MAX_GAP:
+            gaps.see(number % MODULUS, received)
 
     def _meet(self, publisher: bytes) -> int:
         """The channel of a publisher that came after the last look at the graph."""
@@ -178,14 +128,6 @@ class Stream:
             self._look_again()
         return self.channels.get(publisher, self.channel)
 
-    def _begin(self, publisher: bytes, number: int, received: int) -> None:
-        """Counts losses before the first message of a publisher."""
-        self._count_losses()
-        if number > 1 and self._gaps.is_empty:
-            lost = self._middleware_losses.before_first(number - 1)
-            if lost:
-                self._heads.append(Loss(publisher, lost, received, received, _HEAD))
-
     def _number(self, info: dict[str, Any]) -> int:
         """The sequence number of a message, -1 without one."""
         number = info.get("publication_sequence_number")
@@ -194,90 +136,35 @@ class Stream:
             return -1
         return int(number)
 
-    def has_caught_up(self, since: int) -> bool:
-        """Tells whether all publishers that were active just before a time have sent after it."""
-        return self._gaps.has_caught_up(since)
-
-    def look(self, offers: list[Offer], *, final: int | None = None) -> list[Loss]:
-        """Confirmed losses since the last call; call it at each look at the graph.
+    def look(
+        self, offers: Sequence[Offer], *, final: bool = False
+    ) -> list[tuple[bytes, SequenceGap]]:
+        """Losses since the last call, by publisher; call it at each look at the graph.
 
         Args:
             offers: The present publishers.
-            final: End of the recording, ns since the epoch; None while it goes on.
+            final: No further look follows.
         """
-        now = time.time_ns()
-        counted = self._count_losses()
-        if self.numbered:
-            losses = self._losses(offers, now, final)
-        else:
-            losses = [Loss(b"", counted, now, now, _COUNTED)] if counted else []
-        self._follow(offers)
-        return losses
-
-    def _losses(self, offers: list[Offer], now: int, final: int | None) -> list[Loss]:
-        """Losses that the numbers show, and others that the middleware counts."""
-        gaps, is_final = self._gaps, final is not None
-        losses, self._heads = self._heads, []
-        losses += self._suspects(offers, now if final is None else final, is_final=is_final)
-        for gap in gaps.losses(final=is_final):
-            missing = (
-                None if gap.missing is None else self._middleware_losses.unreported(gap.missing)
-            )
-            if missing != 0:
-                losses.append(gap._replace(missing=missing))
-        unexplained = self._middleware_losses.unexplained(gaps.waiting, final=is_final)
-        if unexplained:
-            first = min(now, gaps.last_received or now)
-            # Gaps are found only if the publisher of messages is known.
-            place = _OUTSIDE if self.named or self.alone else _COUNTED
-            losses.append(Loss(b"", unexplained, first, now, place))
-        return losses
-
-    def _suspects(self, offers: list[Offer], silent: int, *, is_final: bool) -> list[Loss]:
-        """Probable losses after the last messages of publishers that have disappeared.
-
-        Args:
-            offers: The present publishers.
-            silent: Time of their end, ns since the epoch.
-            is_final: The subscription ends, so all publishers count as gone.
-        """
-        gaps = self._gaps
-        present = {offer.publisher for offer in offers}
-        if not self.named:
-            gone = [b""] if self.alone and (is_final or not present) else []
-        else:
-            gone = list(self._publishers | present if is_final else self._publishers - present)
-        found = []
-        for publisher in gone:
-            loss = gaps.suspect(publisher, silent)
-            repaired = publisher in self._reliable or (not publisher and self._reliable)
-            if loss and not (repaired and silent - loss.first > _REPAIR_NS):
-                found.append(loss)
-        return found
-
-    def _follow(self, offers: list[Offer]) -> None:
-        """Updates the publishers."""
-        if self._old is None and time.monotonic() >= self._unsure_until:
-            self._gaps.is_doubled = False
+        found = [
+            (publisher, joined_gap(lost))
+            for publisher, gaps in self._gaps.items()
+            if (lost := gaps.confirmed())
+        ]
         publishers = frozenset(offer.publisher for offer in offers)
         if not self.named:
-            same = len(offers) == 1 and publishers == self._publishers
-            if not same:
-                self._gaps.reset()
-            self.alone = same
+            self.alone = len(offers) == 1 and publishers == self._publishers
+            if not self.alone:
+                self._gaps.clear()
+                found = self._unsure = []
+            elif not final:
+                # Another publisher may have sent before the graph shows it.
+                found, self._unsure = self._unsure, found
+            else:
+                found = self._unsure + found
         self._publishers = publishers
-        self._reliable = _reliable(offers)
-        self._gaps.retain(publishers)
-
-    def close(self) -> None:
-        """Closes the subscriptions."""
-        self.close_old()
-        self.subscription.close()
-
-
-def _reliable(offers: Sequence[Offer]) -> frozenset[bytes]:
-    """Reliable publishers, which repeat lost messages or announce them as lost."""
-    return frozenset(o.publisher for o in offers if o.profile.reliability == RELIABLE)
+        if len(self._gaps) > MAX_PUBLISHERS:
+            self._gaps = {key: gaps for key, gaps in self._gaps.items() if key in publishers}
+        return found
 
 
 def _received(info: dict[str, Any]) -> int:

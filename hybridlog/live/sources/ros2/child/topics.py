@@ -7,7 +7,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.live.sources.ros2.child.definitions import UnknownTypeError, parse_type
-from hybridlog.live.sources.ros2.child.publication_gaps import MAX_PUBLISHERS
 from hybridlog.live.sources.ros2.child.qos import (
     DEPTH,
     DEPTH_OF_ARRAYS,
@@ -17,7 +16,7 @@ from hybridlog.live.sources.ros2.child.qos import (
     offered_text,
     request,
 )
-from hybridlog.live.sources.ros2.child.stream import Stream
+from hybridlog.live.sources.ros2.child.stream import MAX_PUBLISHERS, Stream
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -25,11 +24,11 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions
     from hybridlog.live.sources.ros2.child.event_sender import EventSender
     from hybridlog.live.sources.ros2.child.middleware import Middleware, Offer, Subscription
+    from hybridlog.live.sources.ros2.child.outbox import Outbox
 
 MAX_TOPICS = 10_000
 """Maximum number of topics and types; further ones are ignored."""
 
-_OVERLAP_S = 1.0
 _REPORT_S = 10.0
 
 
@@ -67,44 +66,31 @@ class Topics:
 
     Args:
         middleware: ROS.
+        outbox: Takes the messages of a subscription that is made anew.
         events: Sends events to the recorder.
         definitions: Definitions of types.
         overrides: Fields of `Profile` by topic that the user has set.
 
     Attributes:
         owners: Topic of each subscription.
-        doubled: Topics with two subscriptions.
     """
 
     def __init__(
         self,
         middleware: Middleware,
+        outbox: Outbox,
         events: EventSender,
         definitions: Definitions,
         overrides: Mapping[str, Mapping[str, Any]],
     ) -> None:
         self.owners: dict[Subscription, Topic] = {}
-        self.doubled: list[Topic] = []
         self._live: list[Topic] = []
         self._middleware = middleware
+        self._outbox = outbox
         self._events = events
         self._definitions = definitions
         self._overrides = overrides
         self._topics: dict[tuple[str, str], Topic] = {}
-        self._ended: int | None = None
-
-    def end(self) -> None:
-        """Ends the recording: later messages do not matter."""
-        self._ended = time.time_ns()
-
-    def has_caught_up(self) -> bool:
-        """Tells whether each publisher that was active at the end has sent once more.
-
-        Only the next message shows a gap before it.
-        """
-        since = self._ended
-        streams = [topic.stream for topic in self._live if topic.stream is not None]
-        return since is None or all(stream.has_caught_up(since) for stream in streams)
 
     def look(self) -> None:
         """Looks at the graph, follows its changes, and reports losses."""
@@ -148,6 +134,8 @@ class Topics:
         known = {offer.publisher for offer in before}
         if any(offer.publisher not in known for offer in topic.offers):
             self._adapt(topic, stream, is_first=not before)
+            if topic.stream is None:
+                return
         self._set_channels(topic, stream, topic.offers)
         self._check(topic, stream, known)
 
@@ -159,13 +147,21 @@ class Topics:
             self._resubscribe(topic, stream, wanted)
 
     def _resubscribe(self, topic: Topic, stream: Stream, wanted: Profile) -> None:
-        """Subscribes again, with a profile that is compatible with all publishers."""
+        """Subscribes again, with a profile that is compatible with all publishers.
+
+        What comes between the two subscriptions is missing in the numbers of the messages.
+        """
         try:
-            found = self._middleware.subscribe(topic.name, parse_type(topic.kind), wanted)
+            stream.take(self._outbox)
+            stream.subscription.close()
+            stream.subscription = self._middleware.subscribe(
+                topic.name, parse_type(topic.kind), wanted
+            )
         except Exception as error:
-            self._events.say(f"{topic.name}: cannot subscribe to new publishers: {error}")
-            return
-        stream.replace(found, _OVERLAP_S)
+            # rclpy raises errors of many kinds; each concerns only this topic.
+            topic.stream = None
+            self._live.remove(topic)
+            self._refuse(topic, f"rclpy cannot subscribe again: {error or type(error).__name__}")
         self._list()
 
     def _check(self, topic: Topic, stream: Stream, known: Collection[bytes]) -> None:
@@ -230,15 +226,8 @@ class Topics:
         self._list()
 
     def _list(self) -> None:
-        """Updates `owners` and `doubled`."""
-        self.owners.clear()
-        self.doubled.clear()
-        for topic in self._live:
-            assert topic.stream is not None
-            subscriptions = topic.stream.subscriptions
-            self.owners.update((subscription, topic) for subscription in subscriptions)
-            if len(subscriptions) > 1:
-                self.doubled.append(topic)
+        """Updates `owners`."""
+        self.owners = {t.stream.subscription: t for t in self._live if t.stream is not None}
 
     def _look_again(self, topic: Topic) -> None:
         """Looks at the publishers of a topic: a message of a new one has come."""
@@ -295,25 +284,24 @@ class Topics:
 
     def account(self, *, final: bool = False) -> None:
         """Reports losses in transport and in the outbox."""
-        self._list()
-        ended = (self._ended or time.time_ns()) if final else None
         for topic in self._live:
             assert topic.stream is not None
-            self._account(topic, topic.stream, ended)
+            self._account(topic, topic.stream, final=final)
         self._events.refusals()
 
-    def _account(self, topic: Topic, stream: Stream, ended: int | None) -> None:
+    def _account(self, topic: Topic, stream: Stream, *, final: bool) -> None:
         if len(topic.nodes) > MAX_PUBLISHERS:
             topic.nodes.clear()
         topic.nodes.update((offer.publisher, offer.node) for offer in topic.offers if offer.node)
-        for loss in stream.look(topic.offers, final=ended):
-            node = topic.nodes.get(loss.publisher, "")
-            if (not stream.named or not loss.publisher) and len(topic.offers) == 1:
+        for publisher, gap in stream.look(topic.offers, final=final):
+            node = topic.nodes.get(publisher, "")
+            if not stream.named and len(topic.offers) == 1:
                 node = topic.offers[0].node
-            times = loss.first, loss.last
-            detail = ", ".join(filter(None, (f"from {node}" if node else "", loss.place)))
-            self._events.lost(topic.name, "transport", loss.missing, times=times, detail=detail)
-        if not (stream.numbered or stream.subscription.tells_losses):
+            # A message in fragments has the time of the first one, and others may come between.
+            times = min(gap.first, gap.last), max(gap.first, gap.last)
+            detail = f"from {node}" if node else ""
+            self._events.lost(topic.name, "transport", gap.missing, times=times, detail=detail)
+        if not stream.numbered:
             self._events.say(
                 "this ROS does not number messages, so losses in transport cannot be counted"
             )
