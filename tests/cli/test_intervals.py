@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,32 +34,6 @@ def decoded(seen: list[Seen], topic: str, kind: str) -> list[tuple[int, Any]]:
     types = get_typestore(Stores.ROS1_NOETIC)
     mine = [m for m in seen if m.topic == topic]
     return [(m.log_time, types.deserialize_ros1(m.payload, kind)) for m in mine]
-
-
-@pytest.fixture(scope="module")
-def speeds(seen: list[Seen]) -> list[tuple[int, float]]:
-    odometry = decoded(seen, "/odom", "nav_msgs/msg/Odometry")
-    return [(time, message.twist.twist.linear.x) for time, message in odometry]
-
-
-def test_intervals_as_json(store: Path, seen: list[Seen], speeds: list[tuple[int, float]]) -> None:
-    done = run(
-        "intervals", "-t", "odom", "-r", "robot", "--where", "twist.twist.linear.x > 0.5",
-        "--json", "-v", store=store,
-    )  # fmt: skip
-    want: list[list[int]] = []
-    ends = [*[time for time, _ in speeds][1:], seen[-1].log_time + 1]
-    for (time, speed), end in zip(speeds, ends, strict=True):
-        if speed > 0.5:
-            if want and want[-1][1] == time:
-                want[-1] = [want[-1][0], end, want[-1][2] + 1]
-            else:
-                want.append([time, end, 1])
-    assert want
-    assert [[r["begin_ns"], r["end_ns"], r["messages"]] for r in done.json] == want
-    assert {r["recording"] for r in done.json} == {"robot"}
-    assert done.err.endswith(" s\n")
-    assert re.fullmatch(r"[\d.]+ k?B read from disk, \d\.\d{3} s\n", done.err)
 
 
 def test_intervals_as_a_table(store: Path) -> None:
@@ -109,29 +82,6 @@ def test_long_answers_are_printed_some_rows_at_a_time(
                 writer.write([json.dumps(value)])
                 writer.write([iter(json.dumps(value))])
         assert json.loads(target.getvalue()) == [one for one in values for _ in range(2)]
-
-
-def test_changes(store: Path, seen: list[Seen]) -> None:
-    topic, kind = "/rviz_camera_publisher/camera_pose", "geometry_msgs/msg/Pose"
-    poses = decoded(seen, topic, kind)
-    steps = [
-        time
-        for (time, now), (_, last) in zip(poses[1:], poses, strict=False)
-        if (now.position, now.orientation) != (last.position, last.orientation)
-    ]
-    want: list[list[int]] = []
-    for time in steps:
-        if want and time - want[-1][1] + 1 <= SECOND // 2:
-            want[-1] = [want[-1][0], time + 1, want[-1][2] + 1]
-        else:
-            want.append([time, time + 1, 1])
-    asked = ("intervals", "camera_pose", "-r", "robot", "--changes", "position, orientation")
-    done = run(*asked, "--pause", "500ms", "--json", store=store)
-    assert want
-    assert [[r["begin_ns"], r["end_ns"], r["messages"]] for r in done.json] == want
-    assert run(*asked, "--pause", "500ms", "--count", "-q", store=store).out == f"{len(want)}\n"
-    assert run(*asked, "--tolerance", "1e9", "--count", "-q", store=store).out == "0\n"
-    assert run(*asked, "--at-least", "1h", "--count", "-q", store=store).out == "0\n"
 
 
 def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
