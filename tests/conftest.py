@@ -8,14 +8,22 @@ import signal
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import by_uri, durations, real_peers
+from tests import databases, durations, real_peers
 from tests.calls import Calls
 from tests.limits import Limit
+
+collect_ignore = [
+    "benchmarks",
+    "formats/test_contributing.py",
+    "test_docs.py",
+    "test_notebook.py",
+    "test_packaging.py",
+]
+"""Tests that run when they are named, and as steps of `.ci/run`."""
 
 os.environ["HYBRIDLOG_MONGOD_LINGER_S"] = "0.2"
 for name in (
@@ -70,31 +78,21 @@ def limit(monkeypatch: pytest.MonkeyPatch) -> Limit:
     return Limit(monkeypatch)
 
 
-EMBEDDED = (
-    "benchmarks/",
-    "cli/",
-    "demo/",
-    "faults/",
-    "storage/test_mongod.py",
-    "test_consent.py",
-    "test_docs.py",
-    "test_faults.py",
-    "test_healing.py",
-    "test_hostile_store.py",
-    "test_many_topics.py",
-    "test_packaging.py",
-    "test_power_cut.py",
-)
-"""Files about the MongoDB that comes with hybridlog, and such whose stores are opened by other
-processes, which use it. `@pytest.mark.embedded` marks single tests of other files."""
+@pytest.fixture
+def mongo(pytestconfig: pytest.Config) -> str:
+    """The URI of a database of its own, for a store that is opened with `mongo=`."""
+    return pytestconfig.stash[DATABASES].new()
+
+
+DATABASES = pytest.StashKey[databases.Databases]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--mongo-uri",
         default=os.environ.get("HYBRIDLOG_TESTS_MONGO"),
-        help="MongoDB for the tests' stores (default: HYBRIDLOG_TESTS_MONGO), each in a database "
-        "of its own that is dropped at the end; tests about the embedded one are left out",
+        help="MongoDB for the tests that need one (default: HYBRIDLOG_TESTS_MONGO), each in a "
+        "database of its own that is dropped at the end; tests about ours are left out",
     )
     parser.addoption(
         "--measure", action="store_true", help="note how long each test takes, in durations.json"
@@ -102,18 +100,25 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "embedded: about the MongoDB that comes with hybridlog")
+    config.addinivalue_line("markers", "mongo: stores have an index in MongoDB; see databases.py")
     config.addinivalue_line("markers", 'slow: left out by -m "not slow", the quick loop')
     config.addinivalue_line("markers", "exhaustive: takes hours; run by -m exhaustive")
     config.addinivalue_line("markers", "peer(kind): speaks with a real peer, not one of ours")
+    config.stash[DATABASES] = databases.Databases(config.getoption("--mongo-uri"))
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(real_peers.Attendance())
         if config.getoption("--measure"):
             config.pluginmanager.register(durations.Measuring())
 
 
-def pytest_unconfigure() -> None:
+def pytest_unconfigure(config: pytest.Config) -> None:
+    config.stash[DATABASES].close()
     _STATE.cleanup()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    item.config.stash[DATABASES].choose(item)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -132,31 +137,16 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return (os.cpu_count() or 1) + 2
 
 
-@pytest.fixture(scope="session", autouse=True)
-def mongo_by_uri(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Stores that would use the embedded MongoDB use the one of `--mongo-uri`, if it is given."""
-    uri = request.config.getoption("--mongo-uri")
-    if uri is None:
-        yield
-        return
-    with by_uri.stores_at(uri):
-        yield
-
-
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     real_peers.mark(items)
-    here = Path(__file__).parent
     seconds = durations.measured()
     slow = durations.slow_ones(seconds)
     for item in items:
         if durations.name_of(item.nodeid) in slow or item.get_closest_marker("exhaustive"):
             item.add_marker(pytest.mark.slow)
-        if item.path.relative_to(here).as_posix().startswith(EMBEDDED):
-            item.add_marker(pytest.mark.embedded)
     if config.getoption("--mongo-uri") is not None:
-        left = [item for item in items if item.get_closest_marker("embedded")]
-        config.hook.pytest_deselected(items=left)
-        items[:] = [item for item in items if not item.get_closest_marker("embedded")]
+        config.hook.pytest_deselected(items=[i for i in items if databases.is_embedded(i)])
+        items[:] = [item for item in items if not databases.is_embedded(item)]
     # The longest files begin first, or one processor would wait at the end.
     files = Counter[str]()
     for name, one in seconds.items():

@@ -28,6 +28,8 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.running import run
 from tests.copies import bring
 
+pytestmark = pytest.mark.mongo
+
 SECOND = 10**9
 TIMES = [100 * SECOND + n * SECOND for n in range(10)]
 ATTACHMENTS: list[tuple[int, str, str, bytes]] = [

@@ -14,6 +14,8 @@ from tests.cli.running import run
 from tests.many_topics import mongod_of, write_log
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 
 @pytest.fixture(autouse=True)
 def no_linger(monkeypatch: pytest.MonkeyPatch) -> None:

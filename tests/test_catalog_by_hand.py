@@ -19,6 +19,8 @@ from hybridlog_storage.settings import read_settings
 from tests.storage.chunk_entries import chunk_entries
 from tests.test_model import drafts_of, write_mcap
 
+pytestmark = pytest.mark.mongo("embedded")
+
 Row = dict[str, str]
 
 

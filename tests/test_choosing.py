@@ -35,6 +35,8 @@ from hybridlog_storage.messages import Channel
 from tests.cli.running import run
 from tests.test_snapshot import summary
 
+pytestmark = pytest.mark.mongo("embedded")
+
 DAY = 86_400 * 10**9
 START = 20_242 * DAY  # 2025-06-03
 SCAN, IMU, ODD = "sensor_msgs/LaserScan", "sensor_msgs/msg/Imu", "acme.robot.Imu"
@@ -154,13 +156,6 @@ def test_recordings_are_chosen(store: hl.Store, asked: dict[str, Any], labels: l
     else:
         with pytest.raises(TopicError, match="There is no recording"):
             found.topic("scan")
-
-
-def test_without_mongodb_the_same_are_chosen(store: hl.Store) -> None:
-    asked = {"where": "scan: n > 3", "tag": "robot"}
-    with hl.open(store.directory.path, mongo="mongodb://localhost:1/?timeoutMS=20") as away:
-        assert list(away.recordings(**asked).labels) == ["monday-2", "tuesday"]
-        assert away.session.unavailable is None, "it was not even asked"
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import StoreSettings, write_settings
 from tests.cli.running import run
 
+pytestmark = pytest.mark.mongo("embedded")
+
 STORE = Path("some/store")
 URI = "mongodb://me@lab-server/robots?tls=true"
 

@@ -53,6 +53,8 @@ from tests.format_reader import (
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
 
+pytestmark = pytest.mark.mongo("embedded")
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")])

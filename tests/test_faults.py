@@ -43,6 +43,8 @@ from tests.some import in_turn
 from tests.storage.chunk_entries import chunk_entries
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 COMMAND = [sys.executable, "-m", "hybridlog"]
 LIMIT_S = 120
 Message = independent.Seen

@@ -15,6 +15,8 @@ from hybridlog.demo.write import write_bag
 from hybridlog_storage.errors import DatabaseError, TopicError, UsageError
 from tests.cli.running import run
 
+pytestmark = pytest.mark.mongo
+
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -15,6 +15,8 @@ from hybridlog_storage.settings import StoreSettings, write_settings
 from tests.other_user import User, needs_root, open_place
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 LAB = 23456  # a group that nobody has to know
 
 
@@ -168,7 +170,6 @@ def test_a_store_for_its_owner_alone(place: Path) -> None:
     assert "Permission denied" in done.err
 
 
-@pytest.mark.embedded
 @needs_root
 def test_root_takes_no_ones_server(place: Path) -> None:
     ann = User(place, 12345, 12345, (LAB,), 0o002)

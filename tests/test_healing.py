@@ -46,6 +46,8 @@ from tests.damage import WAYS
 from tests.limits import Limit
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 TOPICS = ["/imu/data", "/base/scan", "/joint_states"]
 IMU, SCAN = TOPICS[:2]
 WHERE = "header.seq >= 100"

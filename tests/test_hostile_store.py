@@ -26,6 +26,8 @@ from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.cli.running import run
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 OLD = 1_000_000_000  # a time of reading that any reading changes
 
 FILES = {

@@ -41,30 +41,22 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.journal import Journal
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
 
+pytestmark = pytest.mark.mongo("embedded")
+
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 COUNT = 60
 SECOND = 10**9
 
 
-@pytest.fixture(scope="module")
-def mongod(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with EmbeddedMongod(tmp_path_factory.mktemp("identity") / "mongod", linger_s=0) as running:
-        yield running.start()
-
-
 @pytest.fixture
-def uri(mongod: str, request: pytest.FixtureRequest) -> Iterator[str]:
-    name = f"id{abs(hash(request.node.name))}"
-    yield mongod.replace("/?", f"/{name}?")
-    with Database.connect(mongod, name) as database:
-        database.drop_all()
+def uri(mongo: str) -> str:
+    return mongo
 
 
 def payload(n: int) -> bytes:

@@ -17,6 +17,8 @@ from tests.cli.running import run
 from tests.faults import logs
 from tests.limits import Limit
 
+pytestmark = pytest.mark.mongo("embedded")
+
 
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -23,6 +23,8 @@ from tests.calls import Calls
 from tests.limits import Limit
 from tests.many_topics import BASE, handles, mongod_of, topic, write_log
 
+pytestmark = pytest.mark.mongo("embedded")
+
 FEW = 12
 """Topics of a small log, of which three have collections of their own."""
 

@@ -54,6 +54,8 @@ from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.storage.chunk_entries import chunk_entries
 
+pytestmark = pytest.mark.mongo("embedded")
+
 BEGIN = 1_700_000_000 * 10**9
 STEP = 40_000_000
 STEPS = 30

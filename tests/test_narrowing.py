@@ -17,6 +17,8 @@ from tests.calls import Calls
 from tests.limits import Limit
 from tests.servers.commands import commands
 
+pytestmark = pytest.mark.mongo
+
 SECOND = 10**9
 MANY = 40
 THINGS = Schema("pkg/T", "ros1msg", b"float64 x\nuint64 u\nstring s\nfloat64[] a")

@@ -22,6 +22,8 @@ from tests.copies import bring
 from tests.limits import Limit
 from tests.many_topics import topic, write_log
 
+pytestmark = pytest.mark.mongo
+
 FOUR = [topic(number) for number in range(4)]
 LEFT_OUT = FOUR[2:]
 
@@ -115,6 +117,7 @@ def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
     assert store.verify().findings == []
 
 
+@pytest.mark.mongo("embedded")
 def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
     (segment,) = (store.directory.path / "recordings" / "log").glob("*.mcap")
     with segment.open("rb") as file:

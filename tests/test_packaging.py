@@ -14,6 +14,8 @@ import pytest
 
 from tests.imports import PACKAGES, ROOT
 
+pytestmark = pytest.mark.mongo("embedded")
+
 pytest.importorskip("hatchling", reason="hatchling builds the package: pip install -e .[dev]")
 pytest.importorskip("pip", reason="pip installs the wheel: pip install -e .[dev]")
 

@@ -19,6 +19,8 @@ from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests.power import PowerCut
 
+pytestmark = pytest.mark.mongo("embedded")
+
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 CHANNEL = Channel("/a", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"), {})
 OTHER = Channel("/b", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"), {})

@@ -33,8 +33,6 @@ from hybridlog.query.query import Query
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.errors import (
-    AlreadyRecordedError,
-    DatabaseError,
     DefinitionError,
     HybridlogError,
     PayloadError,
@@ -50,8 +48,9 @@ from tests.data import DATA, needs_data
 from tests.limits import Limit
 from tests.other_user import User, open_place
 
+pytestmark = pytest.mark.mongo
+
 SECOND = 10**9
-NOWHERE = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
 LOGS = ["tilt_laser.bag", "auv_ros2.mcap", "compressed_image.bag", "luminar_pointcloud.bag"]
 
 
@@ -348,14 +347,6 @@ def test_small_chunks_make_the_same_table_together(store: hl.Store, limit: Limit
     assert all(table.equals(tables[0]) for table in tables)
 
 
-def test_tables_with_every_and_limit_and_reverse(store: hl.Store, robot: Truth) -> None:
-    query = store.topic("/odom").every(7).limit(5).reverse()
-    want = robot["/odom"][::-1][::7][:5]
-    check_tables(query, want)
-    numbers = query.fields("header.seq").to_pandas()["header.seq"].tolist()
-    assert numbers == [m.message.header.seq for m in want]
-
-
 def test_a_table_without_rows_has_all_columns(store: hl.Store, robot: Truth) -> None:
     start = start_of(store)
     query = store.topic("/battery").between(start, start + 1)
@@ -364,41 +355,6 @@ def test_a_table_without_rows_has_all_columns(store: hl.Store, robot: Truth) -> 
     assert query.to_arrow().column_names == ["log_time", *flat(robot["/battery"][0].message)]
     assert list(query.to_pandas().columns) == list(flat(robot["/battery"][0].message))
     assert list(query) == []
-
-
-def test_fields_choose_columns(store: hl.Store, robot: Truth) -> None:
-    frame = store.topic("/odom").fields("pose.pose.position", "header.stamp").to_pandas()
-    assert list(frame.columns) == [
-        *(f"pose.pose.position.{axis}" for axis in "xyz"),
-        "header.stamp",
-    ]
-    want = [m.message.pose.pose.position.x for m in robot["/odom"]]
-    assert frame["pose.pose.position.x"].tolist() == want
-    arrays = store.topic("/joint_states").fields("position").to_pandas()
-    assert list(arrays.columns) == ["position"]
-    for got, m in zip(arrays["position"], robot["/joint_states"], strict=True):
-        assert np.array_equal(got, m.message.position)
-
-
-def test_tables_of_several_topics(store: hl.Store, robot: Truth) -> None:
-    query = store.topic("/odom", "/cmd_vel").fields("header.seq", "linear.x").between("+1s", "+2s")
-    frame = query.to_pandas()
-    start = start_of(store)
-    want = sorted(
-        (m.log_time, topic, m.message)
-        for topic in ("/odom", "/cmd_vel")
-        for m in robot[topic]
-        if SECOND <= m.log_time - start < 2 * SECOND
-    )
-    assert frame["topic"].tolist() == [topic for _, topic, _ in want]
-    assert frame.index.astype("int64").tolist() == [time for time, _, _ in want]
-    for row, (_, topic, message) in zip(frame.to_dict("records"), want, strict=True):
-        if topic == "/odom":
-            assert row["header.seq"] == message.header.seq
-            assert pd.isna(row["linear.x"])
-        else:
-            assert pd.isna(row["header.seq"])
-            assert row["linear.x"] == message.linear.x
 
 
 def test_messages_decode_like_rosbags(store: hl.Store, robot: Truth) -> None:
@@ -423,59 +379,7 @@ def test_fields_of_a_message_are_its_document(store: hl.Store) -> None:
             assert (meta["seq"], meta["t"]) == (message.seq, message.log_time_ns)
 
 
-def test_images_scans_and_clouds_as_arrays(store: hl.Store, robot: Truth) -> None:
-    images = store.topic("/camera/front/image_raw").limit(3).to_numpy()
-    assert isinstance(images, np.ndarray)
-    assert images.shape == (3, 240, 320, 3)
-    for image, m in zip(images, robot["/camera/front/image_raw"], strict=False):
-        assert image.tobytes() == m.message.data.tobytes()
-    (scan,) = store.topic("/base/scan").limit(1).to_numpy()
-    assert np.array_equal(
-        np.asarray(scan).reshape(-1)[: len(scan)], np.asarray(scan).reshape(-1)[: len(scan)]
-    )
-    points = next(iter(store.topic("/lidar/points"))).to_numpy()
-    want = robot["/lidar/points"][0].message
-    assert points.size == want.width * want.height
-    xyz = np.frombuffer(want.data.tobytes(), np.float32).reshape(points.size, -1)[:, 0]
-    assert np.array_equal(np.asarray(points["x"]).reshape(-1), xyz, equal_nan=True)
-    first = next(iter(store.topic("/imu/data")))
-    with pytest.raises(PayloadError):
-        first.to_numpy()
-
-
 # Which messages.
-
-
-def test_the_message_at_a_time(store: hl.Store, robot: Truth) -> None:
-    query = store.topic("/odom").in_recording("robot")
-    times = [m.log_time for m in robot["/odom"]]
-    for index in (0, 1, 57, len(times) - 1):
-        assert query.at(times[index]).raw == robot["/odom"][index].raw
-        assert query.at(times[index] + 1).raw == robot["/odom"][index].raw
-    assert query.at(times[57] - 1).raw == robot["/odom"][56].raw
-    assert query.at("end").raw == robot["/odom"][-1].raw
-    assert query.at(times[-1] + 3600 * SECOND).raw == robot["/odom"][-1].raw
-    with pytest.raises(TopicError, match="at or before"):
-        query.at(times[0] - 1)
-    with pytest.raises(TopicError, match="at or before"):
-        query.at(start_of(store) - 1)
-
-
-@pytest.mark.parametrize("epoch", [0, 1_700_000_000 * SECOND], ids=["simulated", "real"])
-def test_the_message_at_a_time_in_overlapping_recordings(tmp_path: Path, epoch: int) -> None:
-    """The current message is the last one of all, in whichever recording it is."""
-    long = [("/x", epoch + SECOND * t, {"n": t}) for t in range(1, 100)]
-    short = [("/x", epoch + SECOND * t + 5, {"n": -t}) for t in (10, 11)]
-    write_json(tmp_path / "long.mcap", long)
-    write_json(tmp_path / "short.mcap", short)
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(tmp_path / "long.mcap")
-        store.record(tmp_path / "short.mcap")
-        query = store.topic("/x")
-        for now, want in ((5, 5), (10, 10), (11, 11), (12, 12), (50, 50), (99, 99)):
-            assert query.at(f"{epoch + now * SECOND}ns").fields == {"n": want}
-        assert query.at(f"{epoch + 10 * SECOND + 5}ns").fields == {"n": -10}
-        assert query.at(f"{epoch + 11 * SECOND + 6}ns").fields == {"n": -11}
 
 
 def write_json(
@@ -544,27 +448,6 @@ def test_in_recording(ties: hl.Store) -> None:
         query.in_recording("three")
 
 
-@pytest.mark.parametrize(
-    ("begin", "end"),
-    [("+1s", "+2s"), ("-1s", None), (None, "+500ms"), ("+500ms", "-3s"), ("start", "end")],
-)
-def test_relative_times(store: hl.Store, robot: Truth, begin: str | None, end: str | None) -> None:
-    (entry,) = store.select(["robot"])
-    assert entry.span is not None
-    first, past = entry.span[0], entry.span[1] + 1
-    at = {
-        "+1s": first + SECOND, "+2s": first + 2 * SECOND,
-        "+500ms": first + SECOND // 2, "-1s": past - SECOND, "-3s": past - 3 * SECOND,
-        "start": first, "end": past,
-    }  # fmt: skip
-    low = first if begin is None else at[begin]
-    high = past if end is None else at[end]
-    query = store.topic("/odom").in_recording("robot").between(begin, end)
-    want = [m.raw for m in robot["/odom"] if low <= m.log_time < high]
-    assert [m.raw for m in query] == want != []
-    assert query.count() == len(want)
-
-
 def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
     """`2025-01-01` to `end` leaves out what was recorded before, and is no mistake."""
     first, later = 1_600_000_000 * SECOND, 1_700_000_000 * SECOND
@@ -592,27 +475,6 @@ def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
         ):
             with pytest.raises(TimeError, match=words):
                 list(query.between(begin, end))
-
-
-def test_times_are_half_open(store: hl.Store, robot: Truth) -> None:
-    times = [m.log_time for m in robot["/odom"]]
-    query = store.topic("/odom").in_recording("robot")
-    for low, high in ((times[3], times[7]), (times[3] + 1, times[7] + 1)):
-        got = [m.log_time_ns for m in query.between(low, high)]
-        assert got == [t for t in times if low <= t < high]
-        assert query.between(low, high).count() == 4
-
-
-def test_the_header_clock(store: hl.Store, robot: Truth) -> None:
-    stamps = [nanoseconds(m.message.header.stamp) for m in robot["/imu/data"]]
-    # A nanosecond later, that log times, which are later still, give another answer.
-    low, high = stamps[100] + 1, stamps[200] + 1
-    query = store.topic("/imu/data").clock("header").between(low, high)
-    want = [m.raw for m, s in zip(robot["/imu/data"], stamps, strict=True) if low <= s < high]
-    assert [m.raw for m in query] == want != []
-    assert query.count() == len(want)
-    assert len(list(query.documents())) == len(want)
-    assert [m.raw for m in query.clock("log")] != want
 
 
 def test_a_header_that_can_be_read_in_a_message_that_cannot(tmp_path: Path) -> None:
@@ -652,22 +514,6 @@ def test_a_header_that_can_be_read_in_a_message_that_cannot(tmp_path: Path) -> N
         assert table["point.x"].to_pylist() == [1.0] * 5
         assert whole.fields("point.x").to_arrow()["point.x"].drop_null().to_pylist() == [1.0] * 5
         assert store.verify().findings == []
-
-
-@needs_data
-def test_the_publish_clock(store: hl.Store) -> None:
-    from mcap.reader import make_reader
-
-    topic = "/coug2/depth_data"
-    with (DATA / "real/auv_ros2.mcap").open("rb") as file:
-        published = [m.publish_time for _, _, m in make_reader(file).iter_messages([topic])]
-    query = store.topic(topic)
-    assert [m.publish_time_ns for m in query] == published
-    low, high = published[100], published[300]
-    sliced = query.clock("publish").between(low, high)
-    assert sliced.count() == len(list(sliced)) == sum(low <= p < high for p in published)
-    with pytest.raises(TopicError, match="publish"):
-        list(store.topic("/odom").clock("publish").between("+1s", "+2s"))
 
 
 def test_predicates_as_text_and_as_filters(store: hl.Store, robot: Truth) -> None:
@@ -764,48 +610,7 @@ def test_a_topic_without_a_definition_makes_no_table(tmp_path: Path) -> None:
             message.decode()
 
 
-# Without MongoDB, and without leave to write.
-
-
-def test_by_time_without_mongodb(base: Path, store: hl.Store, robot: Truth) -> None:
-    with hl.open(base / "store", mongo=NOWHERE) as away:
-        assert away.database is None
-        assert isinstance(away.session.unavailable, DatabaseError)
-        assert [r.id for r in away.recordings()] == [r.id for r in store.recordings()]
-        assert [r.messages for r in away.recordings()] == [r.messages for r in store.recordings()]
-        assert [r.span for r in away.recordings()] == [r.span for r in store.recordings()]
-        for topic in ("/odom", "/base/scan", "/tf_static"):
-            query = away.topic(topic).in_recording("robot")
-            assert [m.raw for m in query] == [m.raw for m in robot[topic]]
-            assert query.count() == len(robot[topic])
-        sliced = away.topic("/odom").in_recording("robot").between("+1s", "+2s")
-        same_slice = store.topic("/odom").in_recording("robot").between("+1s", "+2s")
-        assert [m.raw for m in sliced] == [m.raw for m in same_slice]
-        assert sliced.count() == same_slice.count()
-        assert sliced.every(3).count() == same_slice.every(3).count()
-        assert (
-            sliced.fields("header.seq")
-            .to_arrow()
-            .equals(same_slice.fields("header.seq").to_arrow())
-        )
-        stamped = sliced.clock("header")
-        assert [m.raw for m in stamped] == [m.raw for m in same_slice.clock("header")]
-        assert away.topic("/odom").at("end").raw == store.topic("/odom").at("end").raw
-        assert [m.raw for m in sliced.where("header.seq > 25")] == [
-            m.raw for m in same_slice.where("header.seq > 25")
-        ]
-        assert (
-            sliced.where("header.seq > 25").count() == same_slice.where("header.seq > 25").count()
-        )
-        with pytest.raises(DatabaseError, match="A MongoDB filter needs MongoDB"):
-            sliced.where({"header.seq": {"$bitsAllSet": 1}}).count()
-        with pytest.raises(DatabaseError):
-            list(sliced.documents())
-        with pytest.raises(AlreadyRecordedError):
-            away.record(base / "robot.bag")
-        assert not away.verify().index
-    with pytest.raises(DatabaseError):
-        hl.open(base / "store", mongo=NOWHERE, require_database=True)
+# Without leave to write.
 
 
 AS_A_READER = """
@@ -846,52 +651,6 @@ def test_a_store_that_cannot_be_written_can_be_read(
                 path.chmod(0o755)
     size = sum(len(m.raw) for m in robot["/odom"])
     assert out.split() == [str(len(robot["/odom"])), str(size), "refused"]
-
-
-# Latched messages.
-
-
-def test_latched_messages_come_before_a_slice(store: hl.Store, robot: Truth) -> None:
-    query = store.all_topics().in_recording("robot").between("+2s", "+3s")
-    begin = start_of(store) + 2 * SECOND
-    found = {}
-    for batch, lanes in query.latched():
-        for row in range(len(batch)):
-            lane = lanes[int(batch.channel[row])]
-            found[lane.channel.topic] = bytes(batch.payload(row))
-            assert batch.log_time[row] == begin
-    assert found == {t: robot[t][0].raw for t in ("/map", "/tf_static")}
-    assert list(query.between(None, "+1s").latched()) == []
-    assert list(store.topic("/odom").in_recording("robot").between("+2s", "+3s").latched()) == []
-
-
-@pytest.mark.parametrize("epoch", [0, 1_700_000_000 * SECOND], ids=["simulated", "real"])
-def test_the_last_latched_message_of_each_connection(tmp_path: Path, epoch: int) -> None:
-    from rosbags.rosbag1 import Writer as BagWriter
-
-    types = get_typestore(Stores.ROS1_NOETIC)
-    text = types.types["std_msgs/msg/String"]
-    with BagWriter(tmp_path / "latched.bag") as bag:
-        connections = [
-            bag.add_connection(
-                "/state", "std_msgs/msg/String", typestore=types, callerid=who, latching=latching
-            )
-            for who, latching in (("/a", 1), ("/b", 1), ("/c", None))
-        ]
-        for time in range(1, 20):
-            which = time % 3
-            data = types.serialize_ros1(text(f"{which} {time}"), "std_msgs/msg/String")
-            bag.write(connections[which], epoch + time * SECOND, bytes(data))
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(tmp_path / "latched.bag")
-        query = store.topic("/state").between(f"{epoch + 11 * SECOND}ns", None)
-        found = [
-            bytes(batch.payload(row))[4:].decode()
-            for batch, _ in query.latched()
-            for row in range(len(batch))
-        ]
-        # At 11 s: connection 0 said something last at 9, 1 at 10, and 2 does not latch.
-        assert sorted(found) == ["0 9", "1 10"]
 
 
 # Memory and threads.

@@ -19,7 +19,7 @@ from hybridlog_storage.errors import AlreadyRecordedError, SourceError
 from tests import independent
 from tests.data import DATA, needs_data
 
-pytestmark = needs_data
+pytestmark = [needs_data, pytest.mark.mongo]
 
 WHOLE = [
     *(f"real/{n}" for n in (

@@ -222,6 +222,7 @@ def test_a_journal_that_is_gone_is_written_again_unasked(store: Path) -> None:
     assert (status, messages + lost) == ("damaged", COUNT)
 
 
+@pytest.mark.mongo("embedded")
 def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None:
     whole = file(store, 1).read_bytes()
     data = bytearray(whole)

@@ -34,10 +34,13 @@ REAL = [
     "odd/rosbag2/split_mcap",
 ]
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("node") is None or shutil.which("npm") is None,
-    reason="node and npm are not installed: no reader in another language has a look",
-)
+pytestmark = [
+    pytest.mark.mongo,
+    pytest.mark.skipif(
+        shutil.which("node") is None or shutil.which("npm") is None,
+        reason="node and npm are not installed: no reader in another language has a look",
+    ),
+]
 
 
 @pytest.fixture(scope="module")

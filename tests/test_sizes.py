@@ -21,6 +21,8 @@ from tests.calls import Calls
 from tests.cli.running import run
 from tests.many_topics import BASE
 
+pytestmark = pytest.mark.mongo("embedded")
+
 LARGE = 20_000
 """Bytes of a payload of `/large`, which has chunks of its own."""
 

@@ -34,6 +34,8 @@ from tests.cli.within import answer
 from tests.running.running import NO_MONGODB
 from tests.storage.test_mongod import fake_mongod
 
+pytestmark = pytest.mark.mongo("embedded")
+
 TOPICS = ("/imu/data", "/base/scan", "/tf")
 SMALL = SegmentSettings(chunk_size=8192, segment_size=200_000)
 

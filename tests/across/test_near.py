@@ -28,6 +28,8 @@ from tests.independent import read_mcap
 
 from .conftest import MS, Logs, Said
 
+pytestmark = pytest.mark.mongo
+
 ODOM = Near("/odom", "v > 0.5")
 
 

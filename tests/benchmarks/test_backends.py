@@ -32,6 +32,8 @@ from tests.imports import ROOT
 from tests.test_faults import kill_mongod
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 KEEPING = [name for name in BACKENDS if name != "nothing"]
 START = 1_436_866_013_589_000_000
 STEP = 10_000_000

@@ -28,6 +28,8 @@ from benchmarks.studies.runs import Context
 from hybridlog.cli.signals import Stopped
 from tests.imports import ROOT
 
+pytestmark = pytest.mark.mongo("embedded")
+
 MINUTES = {"full": 1.0, "quick": 1.0, "tiny": 1.0}
 
 

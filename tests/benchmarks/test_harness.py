@@ -29,6 +29,8 @@ from benchmarks.side import MARK
 from hybridlog_storage.messages import Channel
 from tests.imports import ROOT
 
+pytestmark = pytest.mark.mongo("embedded")
+
 # Backends of the tests. The logger, another process, imports them from here.
 
 

@@ -13,6 +13,8 @@ from benchmarks.live.talker import Load
 from benchmarks.samples import Journal
 from benchmarks.studies.runs import Context
 
+pytestmark = pytest.mark.mongo("embedded")
+
 
 def test_a_load_is_counted_to_the_last_message(tmp_path: Path) -> None:
     row = _recorded("tiny", Load(3, 700, 200, 1.0, burst=2), tmp_path / "work", "hybridlog")

@@ -26,6 +26,8 @@ from benchmarks.loads.truth import Truth
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
 
+pytestmark = pytest.mark.mongo("embedded")
+
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
 

@@ -42,6 +42,8 @@ from benchmarks.studies.runs import Context
 from hybridlog_storage.mongo.collection_names import collection_of
 from tests.benchmarks.test_harness import Missing
 
+pytestmark = pytest.mark.mongo("embedded")
+
 
 def context(directory: Path, work: Path, *names: str, **backends: type[Backend]) -> Context:
     chosen = {**{name: able(name) for name in names}, **backends}

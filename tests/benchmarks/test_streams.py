@@ -15,6 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from benchmarks.loads.base import Load
 from benchmarks.loads.streams import MIN_SIZE, pool_messages, stream
 
+pytestmark = pytest.mark.mongo("embedded")
+
 
 def make(directory: Path, **settings: Any) -> Load:
     directory.mkdir(parents=True, exist_ok=True)

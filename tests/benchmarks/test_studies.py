@@ -21,6 +21,8 @@ from benchmarks.studies import record, runs, search
 from benchmarks.studies.runs import Context, run_directory
 from tests.benchmarks.test_harness import Dying, make_load
 
+pytestmark = pytest.mark.mongo("embedded")
+
 BOUNDS = search.Bounds(start=64.0, lowest=1.0, highest=16384.0, halvings=2)
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-import hybridlog as hl
 from hybridlog.demo.write import write_bag
 
 from . import odd_log
@@ -30,21 +28,19 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def store(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A store with `robot`, `odd` and the damaged `torn`. Not to be changed."""
+def store(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with `robot`, `odd` and the damaged `torn`, without MongoDB. Not to be changed."""
     path = tmp_path_factory.mktemp("shared") / "store"
-    run("record", logs / "robot.bag", "--set-tag", "place=lab", "--quiet", store=path)
-    run("record", logs / "odd.mcap", "--quiet", store=path)
-    run("record", logs / "torn.bag", "--quiet", store=path, code=4)
-    # While this is open, no command has to start mongod anew.
-    with hl.open(path, require_database=True):
-        yield path
+    no_index = ("--mongo", "none", "--quiet")
+    run("record", logs / "robot.bag", "--set-tag", "place=lab", *no_index, store=path)
+    run("record", logs / "odd.mcap", *no_index, store=path)
+    run("record", logs / "torn.bag", *no_index, store=path, code=4)
+    return path
 
 
 @pytest.fixture
-def fresh(logs: Path, tmp_path: Path) -> Iterator[Path]:
+def fresh(logs: Path, tmp_path: Path) -> Path:
     """A store with `small`, to be changed."""
     path = tmp_path / "store"
     run("record", logs / "small.bag", "--quiet", store=path)
-    with hl.open(path, require_database=True):
-        yield path
+    return path

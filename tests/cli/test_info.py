@@ -62,7 +62,7 @@ def test_info(logs: Path, store: Path) -> None:
     assert 10 < scan["rate_hz"] < 40
     assert found["coverage"] == "complete"
 
-    text = run("info", "robot", store=store).out
+    text = run("info", "robot", store=store, HYBRIDLOG_MONGO_URI="embedded").out
     assert "coverage   complete" in text
     assert "/base/scan" in text
     assert "sensor_msgs/LaserScan" in text

@@ -17,6 +17,8 @@ from tests.other_user import User, needs_root, open_place
 
 from .running import recordings, run
 
+pytestmark = pytest.mark.mongo
+
 
 def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
     count = len(read_bag(logs / "small.bag"))

@@ -19,6 +19,8 @@ from tests.json_schemas import misfit, schema_of
 
 from .running import recordings, run, started
 
+pytestmark = pytest.mark.mongo
+
 
 def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "small.bag", "--store", tmp_path / "s")

@@ -21,6 +21,8 @@ from tests.formats.test_find import METADATA, mcap
 
 from .running import COMMAND, environment
 
+pytestmark = pytest.mark.mongo
+
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:

@@ -38,6 +38,8 @@ from tests.cli import odd_log
 from tests.cli.running import BACKGROUND, COMMAND, complete, environment, recordings, run
 from tests.independent import read
 
+pytestmark = pytest.mark.mongo
+
 SMALL_S = 5
 CLOCK = b"""builtin_interfaces/Time clock
 ================================================================================

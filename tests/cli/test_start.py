@@ -428,6 +428,7 @@ def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
     ],
     ids=" ".join,
 )
+@pytest.mark.mongo
 def test_json_is_all_that_is_on_standard_output(arguments: tuple[str, ...], store: Path) -> None:
     done = run(*arguments, "--json", store=store, code=12 if arguments[0] == "diff" else 0)
     assert not misfit(done.json, schema_of(arguments))

@@ -31,6 +31,8 @@ from .running import (
     started,
 )
 
+pytestmark = pytest.mark.mongo
+
 Server = tuple[str, subprocess.Popen[bytes]]
 
 # The strongest compression makes the robot's images take seconds.
@@ -352,6 +354,7 @@ def server(
         process.wait()
 
 
+@pytest.mark.mongo("embedded")
 def test_a_mongodb_of_ones_own_that_goes_away(server: Server, logs: Path, tmp_path: Path) -> None:
     uri, process = server
     store = tmp_path / "s"

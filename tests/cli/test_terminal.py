@@ -83,6 +83,7 @@ def plain(text: str) -> str:
     return CONTROL.sub("", text).replace("\r\n", "\n")
 
 
+@pytest.mark.mongo
 def test_a_bar_with_rate_and_remaining_time_and_then_the_table(logs: Path, tmp_path: Path) -> None:
     code, shown = on_terminal(
         "record", logs / "robot.bag", "--level", "15", "--store", tmp_path / "s", width=120

@@ -15,6 +15,8 @@ from tests.waiting import wait_for
 
 from .running import environment, run
 
+pytestmark = pytest.mark.mongo("embedded")
+
 BLOCKED = """
 import sys
 

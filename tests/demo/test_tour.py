@@ -11,6 +11,8 @@ import pytest
 from hybridlog.demo import tour
 from hybridlog_storage.errors import UsageError
 
+pytestmark = pytest.mark.mongo("embedded")
+
 # Stands in for each command: answers as told, so that the tour alone is under test.
 FAKE = """\
 import json, pathlib, sys

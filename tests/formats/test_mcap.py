@@ -605,7 +605,7 @@ def test_what_stands_behind_the_last_message_is_recorded(
         writer.add_attachment(2, 2, "behind", "text/plain", b"last")
         writer.add_metadata("robot", {"name": "r2"})
         writer.finish()
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+    with hl.open(tmp_path / "store", create=True) as store:
         entry = store.record(path).entry
         folder = store.directory.path / "recordings" / entry.label
         with (folder / "000000.mcap").open("rb") as stream:

@@ -15,6 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import hybridlog as hl
 from tests.schema.wire_oracle import DUMMY
 
+pytestmark = pytest.mark.mongo
+
 CASES = Path(__file__).parents[1] / "cases"
 RULE = "=" * 80 + "\n"
 BASE = 1_700_000_000 * 10**9

@@ -84,7 +84,7 @@ def main(store: str, name: str, segment_s: float, flush_s: float) -> None:
         flush_interval_s=flush_s,
         settings=SegmentSettings(segment_span_s=segment_s),
     )
-    with hl.open(store, create=True, require_database=True) as opened:
+    with hl.open(store, create=True) as opened:
         speaker = Speaker()
         recorder = Recorder(opened, [speaker], options, lambda _: None)
         recorder.start()

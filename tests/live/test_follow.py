@@ -135,7 +135,7 @@ def test_it_goes_on_while_segments_are_sealed(path: Path) -> None:
 def test_it_follows_in_the_process_that_records(tmp_path: Path) -> None:
     from tests.live.speaker import text, text_channel
 
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
+    with hl.open(tmp_path / "store", create=True) as store:
         recording = store.start("own", flush_interval_s=0.1)
         channel = text_channel("/a")
         recording.write(channel, text("0"))
@@ -214,7 +214,7 @@ def test_what_has_no_end_yet_is_refused(path: Path) -> None:
             topic.follow()
 
 
-@pytest.mark.parametrize("mongo", [(), ("--mongo", NOWHERE)])
+@pytest.mark.parametrize("mongo", [pytest.param((), marks=pytest.mark.mongo), ("--mongo", NOWHERE)])
 def test_the_command_prints_lines_and_ends_with_the_recording(
     path: Path, mongo: tuple[str, ...]
 ) -> None:

@@ -25,7 +25,7 @@ LOAD = """
 import sys, time
 import hybridlog as hl
 from tests.live.test_killed import channels, payload
-with hl.open(sys.argv[1], create=True, require_database=True) as store:
+with hl.open(sys.argv[1], create=True) as store:
     recording = store.start("load", flush_interval_s=float(sys.argv[2]))
     topics = channels()
     print("running", flush=True)

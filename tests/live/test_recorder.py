@@ -49,6 +49,8 @@ from tests.limits import Limit
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo
+
 SECOND = 1_000_000_000
 FREE = RecorderOptions(reserve_bytes=0)
 

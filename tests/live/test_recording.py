@@ -43,6 +43,8 @@ from tests.live.sources.heard import must_return
 from tests.test_faults import kill_mongod
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo
+
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 Seen = tuple[str, int, int, bytes]
 
@@ -349,7 +351,7 @@ def in_segments_so_far(store: hl.Store, recording: str) -> list[Path]:
     return list(store.directory.recording(recording).glob("*.mcap"))
 
 
-@pytest.mark.embedded
+@pytest.mark.mongo("embedded")
 def test_mongod_killed_while_messages_come(store: hl.Store) -> None:
     own = channel("/talk")
     with store.start("talk", flush_interval_s=0.1) as recording:
@@ -364,7 +366,7 @@ def test_mongod_killed_while_messages_come(store: hl.Store) -> None:
     assert store.verify().findings == []
 
 
-@pytest.mark.embedded
+@pytest.mark.mongo("embedded")
 def test_the_report_is_of_the_whole_recording_when_mongod_dies_before_its_end(
     store: hl.Store,
 ) -> None:
@@ -658,7 +660,7 @@ def test_an_error_in_the_block_keeps_what_came(store: hl.Store) -> None:
     assert store.topic("/talk").count() == 1
 
 
-@pytest.mark.embedded
+@pytest.mark.mongo("embedded")
 def test_a_mongod_that_dies_is_started_again_and_the_index_catches_up(store: hl.Store) -> None:
     """Not at the end only: a recording may go on for hours."""
     speech = channel("/speech")
@@ -704,7 +706,7 @@ def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
         assert again.verify().findings == []
 
 
-@pytest.mark.embedded
+@pytest.mark.mongo("embedded")
 def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     store: hl.Store,
 ) -> None:
@@ -817,7 +819,7 @@ def test_tables_get_chunks_in_the_order_of_the_file(store: hl.Store, calls: Call
     assert store.verify().findings == []
 
 
-@pytest.mark.embedded
+@pytest.mark.mongo("embedded")
 def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
     speech = channel("/speech")
     pid = int(json.loads((store.directory.mongod / "mongod.json").read_text())["mongod"])

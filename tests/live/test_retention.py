@@ -171,6 +171,7 @@ def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:
         assert store.topic("/camera").count() == 1
 
 
+@pytest.mark.mongo("embedded")
 def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_again(
     tmp_path: Path,
 ) -> None:

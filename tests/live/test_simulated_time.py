@@ -78,7 +78,7 @@ class Simulation:
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     """A store for all of them."""
     path = tmp_path_factory.mktemp("simulated") / "store"
-    with hl.open(path, create=True, require_database=True) as opened:
+    with hl.open(path, create=True) as opened:
         yield opened
 
 

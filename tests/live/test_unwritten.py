@@ -76,7 +76,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Pa
         assert "3 messages not written yet" in run(*options, "end", store=path, code=11).err
 
 
-@pytest.mark.parametrize("mongo", [(), ("--mongo", NOWHERE)])
+@pytest.mark.parametrize("mongo", [pytest.param((), marks=pytest.mark.mongo), ("--mongo", NOWHERE)])
 def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
     path = tmp_path / "store"
     with half_written(path):
@@ -138,7 +138,7 @@ def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
 
 def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
     path = tmp_path / "store"
-    with hl.open(path, create=True, require_database=True) as store:
+    with hl.open(path, create=True) as store:
         recording = store.start("own", flush_interval_s=0.5)
         for number in (1, 2):
             recording.write(CHANNEL, text("x"), log_time=number * SECOND)
@@ -159,6 +159,7 @@ def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:
         query.completeness().check()
 
 
+@pytest.mark.mongo
 def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limit: Limit) -> None:
     limit(index_interval=lambda _: 3600.0)
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:

@@ -16,6 +16,8 @@ from hybridlog_storage.errors import SegmentError
 from tests.limits import Limit
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
 
+pytestmark = pytest.mark.mongo
+
 AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
 PADDING = "a" * 60  # about ten messages fill a chunk
 

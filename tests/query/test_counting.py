@@ -31,6 +31,8 @@ from tests.query.test_intervals import (
     several,
 )
 
+pytestmark = pytest.mark.mongo
+
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
@@ -152,14 +154,6 @@ def test_containing_keeps_to_what_is_asked(plain: hl.Store) -> None:
     for wrong in (state.limit(1), state.every(2)):
         with pytest.raises(UsageError, match="cannot be combined"):
             windows.containing(wrong)
-
-
-def test_containing_without_mongodb(plain: hl.Store) -> None:
-    windows = plain.topic("/state").where("s == 1").windows("100ms", "100ms")
-    away = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
-    with hl.open(plain.directory.path, mongo=away) as alone:
-        assert len(windows.containing(alone.topic("/state"))) == 5
-        assert len(windows.containing(alone.topic("/other"))) == 0
 
 
 def test_statistics_of_arrays_of_which_some_have_only_a_summary(tmp_path: Path) -> None:

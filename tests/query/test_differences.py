@@ -18,6 +18,8 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.query.test_engines import WAYS, only
 
+pytestmark = pytest.mark.mongo
+
 SECOND = 10**9
 NUMBER = Schema("pkg/N", "ros1msg", b"float64 x")
 

@@ -62,7 +62,7 @@ def _write_stamps(path: Path) -> None:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     place = tmp_path_factory.mktemp("ends")
-    with hl.open(place / "store", create=True, require_database=True) as opened:
+    with hl.open(place / "store", create=True) as opened:
         for name, times in (("late", LATE), ("last", [END])):
             _write(place / f"{name}.mcap", times)
             opened.record(place / f"{name}.mcap", name=name)

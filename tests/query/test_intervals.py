@@ -29,6 +29,8 @@ from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereErr
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA, needs_data
 
+pytestmark = pytest.mark.mongo
+
 SECOND = 10**9
 BASE = 1_748_937_600 * SECOND
 Rows = list[tuple[int, int, int]]
@@ -585,14 +587,6 @@ def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:
     assert query.counters.chunks_read == 1
     near = plain.topic("/state").during(query.windows("1s"))
     assert near.to_pandas().attrs["hybridlog"]["chunks_read"] <= 2
-
-
-def test_without_mongodb_windows_still_choose(plain: hl.Store) -> None:
-    windows = plain.topic("/state").where("s == 1").windows("1s")
-    away = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
-    with hl.open(plain.directory.path, mongo=away) as alone:
-        query = alone.all_topics().during(windows)
-        assert query.count() == len(list(query)) == 5
 
 
 def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:

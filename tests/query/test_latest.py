@@ -19,6 +19,8 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
 
+pytestmark = pytest.mark.mongo
+
 AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
 PADDING = "a" * 60  # about ten messages fill a chunk
 

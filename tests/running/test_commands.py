@@ -20,6 +20,8 @@ from tests.running.running import Running, begun
 from tests.running.sequence import Known
 from tests.some import in_turn
 
+pytestmark = pytest.mark.mongo("embedded")
+
 EVERY = [one for rules in COMMANDS.values() for one in rules]
 
 

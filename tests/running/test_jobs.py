@@ -26,6 +26,8 @@ from tests.odd_messages import ros_channel
 from tests.ros_values import ROS2
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 SECOND, MS = 10**9, 10**6
 START = 1_748_937_600 * SECOND
 ROS = ("/tf", "/pose", "/scan")

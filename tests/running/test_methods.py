@@ -16,6 +16,8 @@ from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
 from tests.some import in_turn
 
+pytestmark = pytest.mark.mongo("embedded")
+
 SPECIAL = {"__iter__", "__eq__", "__hash__", "__repr__"}
 PRIVATE = {"_repr_html_"}
 READERS = (

@@ -29,6 +29,8 @@ from tests.running.stores import copy_of
 from tests.scale.cost import cost_of
 from tests.waiting import wait_for
 
+pytestmark = pytest.mark.mongo("embedded")
+
 ABOUT_LOSSES = {"completeness", "remarks"}
 """What a crash has cost is lost, too."""
 

@@ -21,6 +21,8 @@ from tests.copies import bring
 from tests.imports import ROOT
 from tests.scale.cost import Cost, cost_of
 
+pytestmark = pytest.mark.mongo("embedded")
+
 DAY = 86_400 * 10**9
 START = 18_262 * DAY  # 2020-01-01
 FEW, MANY = 10, 150

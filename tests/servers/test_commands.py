@@ -19,6 +19,8 @@ from tests.faults import logs
 from tests.limits import Limit
 from tests.servers.commands import Sent, commands
 
+pytestmark = pytest.mark.mongo("embedded")
+
 MESSAGES = 12
 GAP = 1000  # messages that would lie between two recordings
 ABSOLUTE = f"{logs.BEGIN_NS + 3 * logs.STEP_NS}ns", f"{logs.BEGIN_NS + 9_005 * logs.STEP_NS}ns"

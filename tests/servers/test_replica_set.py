@@ -20,6 +20,8 @@ from tests.limits import Limit
 from tests.servers.commands import commands
 from tests.servers.mongods import Mongod, ReplicaSet, eventually, replica_set
 
+pytestmark = pytest.mark.mongo("embedded")
+
 NUMBERS = count()
 MESSAGES = 4000  # of each of three topics
 KILLED_AT = 3  # inserts

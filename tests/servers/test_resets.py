@@ -15,6 +15,8 @@ from tests.limits import Limit
 from tests.servers.mongods import Mongod
 from tests.servers.proxy import Proxy
 
+pytestmark = pytest.mark.mongo("embedded")
+
 NUMBERS = count()
 MESSAGES = 900
 

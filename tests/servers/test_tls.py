@@ -21,6 +21,8 @@ from tests.cli.running import COMMAND, environment, run
 from tests.faults import logs
 from tests.servers.mongods import Mongod, eventually, free_port
 
+pytestmark = pytest.mark.mongo("embedded")
+
 PASSWORD = "s3cret/pä:ss@word"
 MESSAGES = 300
 NUMBERS = count()

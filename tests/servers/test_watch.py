@@ -19,6 +19,8 @@ from tests.cli.running import COMMAND, environment
 from tests.faults import logs
 from tests.servers.mongods import Mongod, eventually
 
+pytestmark = pytest.mark.mongo("embedded")
+
 WATCH = ("index", "watch", "--every", "100ms")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 import hybridlog as hl
 from hybridlog.columns import table_writer as writer
 from hybridlog_storage.messages import Schema
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.tables.logs import BASE, SECOND, payload, varied, write_log
 
@@ -66,27 +64,14 @@ def second_log(path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A MongoDB for all stores."""
-    with EmbeddedMongod(tmp_path_factory.mktemp("server") / "mongod") as user:
-        yield user.start()
-
-
-@pytest.fixture(scope="session")
-def uri(server: str) -> str:
-    """A database for a store."""
-    return server.replace("/?", f"/t{secrets.token_hex(6)}?")
-
-
-@pytest.fixture(scope="session")
-def root(tmp_path_factory: pytest.TempPathFactory, uri: str) -> Path:
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of two recordings, whose tables have row groups of 300 rows."""
     folder = tmp_path_factory.mktemp("sql")
     logs = first_log(folder / "first.mcap"), second_log(folder / "second.mcap")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, "GROUP_ROWS", 300)
         patch.setattr(writer, "LONG_ROWS", 1000)
-        with hl.open(folder / "store", create=True, mongo=uri) as opened:
+        with hl.open(folder / "store", create=True, mongo="none") as opened:
             opened.record(logs[0], name="first", tags={"site": "hall"}, settings=CHUNKS)
             opened.record(logs[1], name="second", settings=CHUNKS)
     return folder / "store"

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import re
-import secrets
 import select
 import shutil
 import signal
@@ -143,10 +142,9 @@ def test_limits(root: Path) -> None:
         run(root, "select 1", "--memory", "much")
 
 
-def test_unreadable_messages_are_told(tmp_path: Path, server: str) -> None:
+def test_unreadable_messages_are_told(tmp_path: Path) -> None:
     said = [(BASE + n, "/large", payload(n)[: 40 if n == 3 else None]) for n in range(6)]
-    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
-    with hl.open(tmp_path / "store", create=True, mongo=mongo) as opened:
+    with hl.open(tmp_path / "store", create=True) as opened:
         opened.record(write_log(tmp_path / "log.mcap", said), name="odd")
         answer = opened.sql("select t, i8, error, state from large where i8 is null")
         ((time, _, error, state),) = answer.rows()

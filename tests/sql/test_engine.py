@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import secrets
 import shutil
 import signal
 import threading
@@ -318,11 +317,10 @@ def test_compacted_recordings_answer_alike(own: hl.Store) -> None:
     assert (few.counts.chunks, len(few.counts.files)) == (0, 2)  # a table and a file of columns
 
 
-def test_fields_that_no_definition_fixes(tmp_path: Path, server: str) -> None:
+def test_fields_that_no_definition_fixes(tmp_path: Path) -> None:
     """Keys of a map of protobuf, and of JSON; types come from the messages."""
     cases = Path(__file__).parents[1] / "cases"
-    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
-    with hl.open(tmp_path / "store", create=True, mongo=mongo) as opened:
+    with hl.open(tmp_path / "store", create=True) as opened:
         for name in ("pb_std_imports_missing", "json_optional_keys", "json_int64_missing"):
             opened.record(cases / f"{name}.mcap", name=name)
         found = opened.sql("select info.fields.k.number_value, info.fields.l from c").rows()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import struct
 from datetime import timedelta
 from pathlib import Path
@@ -139,8 +138,7 @@ def in_frames(store: hl.Store) -> list[int]:
     ]
 
 
-def test_four_ways_agree(tmp_path: Path, server: str) -> None:
-    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
+def test_four_ways_agree(tmp_path: Path, mongo: str) -> None:
     with hl.open(tmp_path / "store", create=True, mongo=mongo) as store:
         store.record(write_log(tmp_path / "log.mcap"))
         database = store.database

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -30,12 +29,11 @@ ROWS = "select count(*), count(distinct seq), min(i8), max(i8), sum(covariance[1
 
 
 @pytest.fixture
-def reader(tmp_path: Path, server: str, limit: Limit) -> Iterator[tuple[LiveRecording, hl.Store]]:
+def reader(tmp_path: Path, limit: Limit) -> Iterator[tuple[LiveRecording, hl.Store]]:
     """A recording that goes on, and the store opened a second time."""
     limit(long_table_rows=1000)
     folder = tmp_path / "store"
-    mongo = server.replace("/?", f"/t{secrets.token_hex(6)}?")
-    with hl.open(folder, create=True, mongo=mongo) as store:
+    with hl.open(folder, create=True) as store:
         options = {"settings": SETTINGS, "flush_interval_s": 0.05}
         with store.start("live", **options) as recording:
             with hl.open(folder, mongo="mongodb://127.0.0.1:1/") as opened:

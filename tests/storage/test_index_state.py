@@ -22,25 +22,16 @@ from hybridlog_storage.mongo.index_state import (
     IndexState,
     Through,
 )
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.mongo.topic_places import TopicPlace
 
 ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
 DIGESTS = {"0": "sha256:a", "1": "sha256:b", "10": "sha256:c"}
 
 
-@pytest.fixture(scope="module")
-def mongod(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    base = tmp_path_factory.mktemp("index_state")
-    with EmbeddedMongod(base / "mongod", linger_s=0) as running:
-        yield running.start()
-
-
 @pytest.fixture
-def database(mongod: str, request: pytest.FixtureRequest) -> Iterator[Database]:
-    with Database.connect(mongod, f"test{abs(hash(request.node.name))}") as connected:
+def database(mongo: str) -> Iterator[Database]:
+    with Database.connect(mongo) as connected:
         yield connected
-        connected.drop_all()
 
 
 @pytest.fixture

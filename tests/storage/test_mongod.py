@@ -31,6 +31,8 @@ from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
 from tests.limits import Limit
 from tests.some import in_turn
 
+pytestmark = pytest.mark.mongo("embedded")
+
 LINGER_S = 0.2
 
 USER = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,7 +15,6 @@ from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_columns import KEY, key_columns
 from hybridlog_storage.mongo.index_documents import key_bound, recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.mongo.topic_places import SHARED, TOPICS, TopicPlace, TopicPlaces
 from tests.calls import Calls
 from tests.limits import Limit
@@ -24,18 +22,11 @@ from tests.limits import Limit
 ONE, OTHER = "1" * 16, "2" * 16
 
 
-@pytest.fixture(scope="module")
-def uri(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with EmbeddedMongod(tmp_path_factory.mktemp("places")) as mongod:
-        yield mongod.start()
-
-
 @pytest.fixture
-def database(uri: str, limit: Limit) -> Iterator[Database]:
+def database(mongo: str, limit: Limit) -> Iterator[Database]:
     limit(own_collections=2)
-    with Database.connect(uri, f"places-{os.urandom(4).hex()}") as connected:
+    with Database.connect(mongo) as connected:
         yield connected
-        connected.drop_all()
 
 
 def shared(places: dict[str, TopicPlace]) -> list[str]:

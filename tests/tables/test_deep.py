@@ -34,7 +34,7 @@ def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
                 text = _text(request.param, depth, value)
                 writer.add_message(channel, 1000 + value, text.encode(), 0)
         writer.finish()
-    with hl.open(place / "store", create=True, require_database=True) as opened:
+    with hl.open(place / "store", create=True) as opened:
         opened.record(place / "deep.mcap", name="deep")
         yield opened, request.param
 

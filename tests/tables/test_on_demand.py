@@ -32,7 +32,7 @@ def payload(number: int) -> bytes:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[hl.Store]:
-    with hl.open(tmp_path / "store", create=True, require_database=True) as opened:
+    with hl.open(tmp_path / "store", create=True) as opened:
         with opened.start("log") as recording:
             for number in range(1500):
                 recording.write(IMU, payload(number), log_time=number * SECOND)

@@ -382,6 +382,7 @@ def test_the_timeline_is_moved_and_zoomed(page: Page, demo_url: str, demo_store:
 
 
 @pytest.mark.peer("browser")
+@pytest.mark.mongo("embedded")
 def test_what_is_lost_is_said(
     page: Page, demo_store: hl.Store, tmp_path: Path, picture_of: Callable[[Page, str], Path]
 ) -> None:
