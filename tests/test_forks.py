@@ -114,7 +114,7 @@ def test_a_child_is_told_to_open_the_store(store: hl.Store) -> None:
             store.refresh,
             store.connect,
             store.mend,
-            lambda: store.tag("run", a="b"),
+            lambda: store.edit("run", note="x"),
             lambda: store.remove("run"),
             lambda: store.start("another"),
             lambda: store.keep(dry_run=True),
